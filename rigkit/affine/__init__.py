@@ -1,1 +1,1 @@
-"""Affine transformations from directions, and what they say of the surface."""
+"""Affine transformations from directions, patches or points, and the surface normals that follow from them."""

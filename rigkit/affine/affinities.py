@@ -1,4 +1,4 @@
-"""What the affine estimators take and give: epipolar normals, direction noise, affinities with their covariance.
+"""Input and output types of the affine estimators: epipolar normals, direction noise, affinities with covariance.
 
 Conventions: A21 = d pixel2 / d pixel1 along the surface, vec(A) = (a11, a12, a21, a22), row by row. Source: L. Hajder,
 "Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations".
@@ -19,7 +19,7 @@ from rigkit.core.printing import brief
 from rigkit.geometry.sampson import epipolar_normals
 
 STEP_OF_DIRECTION = 1e-6
-"""Of its length, for differences: far above rounding, far below where the second order shows."""
+"""Step of the central differences over the length of a direction: rounding and second order are both negligible."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -28,12 +28,12 @@ class EpipolarNormals:
 
     Attributes
     ----------
-    n1, n2 : (N, 2) per px; not normalised, their ratio of lengths carries information. Zero at an epipole.
+    n1, n2 : (N, 2) per px; not normalised, since the ratio of their lengths matters. Zero at an epipole.
 
     Notes
     -----
-    n1 = B1^T E^T f2 and n2 = B2^T E f1 with unit rays f and ray Jacobians B: pinhole images and raw fisheye images are
-    the same here. For pinholes these are, up to one scale a point, (F^T q2)[:2] and (F q1)[:2].
+    n1 = B1^T E^T f2 and n2 = B2^T E f1 with unit rays f and ray Jacobians B, for any central camera. For pinholes these
+    are, up to one scale per point, (F^T q2)[:2] and (F q1)[:2].
     """
 
     n1: FloatArray
@@ -76,8 +76,8 @@ class DirectionNoise:
 
     Attributes
     ----------
-    covariance1, covariance2 : (N, 2K, 2K) px^2, of the stacked vectors (direction 0, direction 1, ...). Directions that
-        share corners are correlated, and the diagonal of a chessboard is the sum of its edges: joint, not K times 2x2.
+    covariance1, covariance2 : (N, 2K, 2K) px^2, joint covariances of the stacked K directions. Directions that share
+        corners are correlated; the diagonal of a chessboard is the sum of its edges.
     """
 
     covariance1: FloatArray
@@ -94,14 +94,14 @@ class DirectionNoise:
 
     @classmethod
     def independent(cls, covariance1: FloatArray, covariance2: FloatArray) -> DirectionNoise:
-        """Build from (N, K, 2, 2) covariances of directions that share nothing."""
+        """Build from (N, K, 2, 2) covariances of independent directions."""
         return cls(_block_diagonal(covariance1), _block_diagonal(covariance2))
 
     @classmethod
     def angular(cls, directions: DirectionPairs, sigma1_rad: ArrayLike, sigma2_rad: ArrayLike) -> DirectionNoise:
-        """Every direction turned by an independent angle, its length kept: the noise of the paper's synthetic study.
+        """Build for independent rotations of all directions, as in the paper's synthetic study.
 
-        `sigma1_rad`, `sigma2_rad` broadcast to (N, K): a scalar, one a direction, or one a corner and direction.
+        `sigma1_rad` and `sigma2_rad`, the standard deviations of the angles, broadcast to (N, K).
         """
 
         def turned(d: FloatArray, sigma: ArrayLike) -> FloatArray:
@@ -112,7 +112,7 @@ class DirectionNoise:
 
     @classmethod
     def isotropic(cls, directions: DirectionPairs, sigma1_px: ArrayLike, sigma2_px: ArrayLike) -> DirectionNoise:
-        """The end of every direction moved by independent noise of `sigma` px per axis; broadcast to (N, K)."""
+        """Build for independent noise of `sigma` px per axis of the end of every direction; broadcasts to (N, K)."""
 
         def round_blob(d: FloatArray, sigma: ArrayLike) -> FloatArray:
             return np.asarray(np.broadcast_to(sigma, d.shape[:2])[..., None, None] ** 2 * np.eye(2))
@@ -131,9 +131,9 @@ class DirectionNoise:
 
         Parameters
         ----------
-        covariance1, covariance2 : (N, 3, 2, 2) px^2, of the three directions of either image. That of the diagonal
-            says what the edges share: cov(d) = cov(h) + cov(v) + cov(h, v) + cov(v, h).
-        shared1, shared2 : (N, 2, 2) px^2, cov(h, v); None: its symmetric part, which is all that cov(d) tells.
+        covariance1, covariance2 : (N, 3, 2, 2) px^2, of the three directions in either image.
+        shared1, shared2 : (N, 2, 2) px^2, cov(h, v). None: its symmetric part, from cov(d) = cov(h) + cov(v) +
+            cov(h, v) + cov(v, h).
         """
         joint = []
         for covariance, shared in ((covariance1, shared1), (covariance2, shared2)):
@@ -147,7 +147,7 @@ class DirectionNoise:
         return cls(*joint).with_sum(0, 1)
 
     def with_sum(self, first: int, second: int) -> DirectionNoise:
-        """Append a direction that is the exact sum of `first` and `second` (a chessboard diagonal)."""
+        """Return the noise with a further direction, the exact sum of `first` and `second` (a chessboard diagonal)."""
         k2 = self.covariance1.shape[1]
         build = np.zeros((k2 + 2, k2))
         build[:k2] = np.eye(k2)
@@ -160,9 +160,9 @@ class DirectionNoise:
 def propagated(
     solve: Callable[[DirectionPairs], Affines], directions: DirectionPairs, noise: DirectionNoise
 ) -> FloatArray:
-    """Return the covariance (N, 4, 4) of vec(A21) to first order, by central differences of an estimator.
+    """Return the first-order covariance (N, 4, 4) of vec(A21), by central differences of the estimator `solve`.
 
-    Directions that are not valid have no influence, though their noise may be NaN.
+    Directions that are not valid are ignored; their noise may be NaN.
     """
     n, k = directions.valid.shape
     unused = np.repeat(~directions.valid, 2, axis=1)
@@ -202,10 +202,10 @@ class Affinities:
     ----------
     A21 : (N, 2, 2), NaN where invalid.
     valid : (N,) bool.
-    conditioning : (N,) smallest singular value of the estimator's system of unit directions: how well they determine A.
-        With two perpendicular directions and an epipolar geometry it is min |unit(d2) . unit(n2)|, 0 where a direction
-        lies along its epipolar line. NaN where there are too few directions.
-    covariance : (N, 4, 4) of vec(A21), row by row, or None where no noise was given; NaN where invalid.
+    conditioning : (N,) smallest singular value of the estimator's system of unit directions. With two perpendicular
+        directions and an epipolar geometry it is min |unit(d2) . unit(n2)|, 0 for a direction along its epipolar line.
+        NaN with too few directions.
+    covariance : (N, 4, 4) of vec(A21), row by row; NaN where invalid. None without noise.
     """
 
     A21: Affines

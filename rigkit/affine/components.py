@@ -1,7 +1,6 @@
-"""Directions as planar components: the layout in which closed forms over a million corners are fast.
+"""Directions as arrays (K, n) of single components, in blocks that fit the processor's cache.
 
-The estimators work on arrays (K, n) of single components, in blocks that fit the processor's cache, so that every step
-is one pass over contiguous memory instead of a stack of small matrices.
+In this layout closed forms for a million corners are passes over contiguous memory, not stacks of small matrices.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from rigkit.core.matches import DirectionPairs
 CORNERS_AT_A_TIME = 8192
 """Corners worked on at a time: about fifty rows of this length fit a second-level cache."""
 MIN_CONDITIONING = 0.05
-"""Below this the directions do not determine the affinity: noise is magnified twentyfold and more."""
+"""Smallest conditioning of a valid affinity: below, noise is magnified more than twentyfold."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlanarDirections:
-    """K directions of n corners; zero where not `use`, so that sums need no mask.
+    """K directions of n corners; components are zero where not `use`.
 
     Attributes
     ----------
@@ -38,14 +37,14 @@ class PlanarDirections:
 
     @classmethod
     def of(cls, directions: DirectionPairs, block: slice) -> PlanarDirections:
-        """Take the corners `block`; directions that are invalid or of length zero in an image are not used."""
+        """Return those of the corners `block`; directions that are invalid or have zero length are not used."""
         d1 = np.ascontiguousarray(directions.image1[block].transpose(2, 1, 0))
         d2 = np.ascontiguousarray(directions.image2[block].transpose(2, 1, 0))
         use = directions.valid[block].T & (d1 != 0.0).any(axis=0) & (d2 != 0.0).any(axis=0)
         return cls(d1[0], d1[1], d2[0], d2[1], use).only(use)
 
     def only(self, use: BoolArray) -> PlanarDirections:
-        """Return the same directions with fewer in use."""
+        """Return the directions with only `use` (K, n) in use."""
         components = (self.x1, self.y1, self.x2, self.y2)
         if not use.all():
             components = tuple(np.where(use, c, 0.0) for c in components)  # type: ignore[assignment]
@@ -59,7 +58,7 @@ def blocks(n: int) -> Iterator[slice]:
 
 
 def finite(array: FloatArray) -> BoolArray:
-    """Return which rows (first axis) of an array are finite throughout, (N,)."""
+    """Return which entries along the first axis of an array are finite in all components, (N,)."""
     return np.asarray(np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
 
 

@@ -1,4 +1,4 @@
-"""Point correspondences of any scene with affinities or directions: what a pair without chessboards offers."""
+"""Point correspondences of any scene, with affinities or directions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs, Matches
 
 DEFAULT_SIGMA_PX = 0.5
-"""Where nobody said how accurate the points are: about what a good feature detector reaches."""
+"""Default standard deviation of points: about that of a good feature detector."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -53,14 +53,13 @@ class Correspondences:
         return len(self.pixels1)
 
     def select(self, which: BoolArray | IntArray) -> Correspondences:
-        """Return those picked by a mask or by indices."""
+        """Return the correspondences chosen by a mask or by indices."""
         d = None if self.directions is None else self.directions.select(which)
         A21, sigma_px, sigma_A = (None if v is None else v[which] for v in (self.A21, self.sigma_px, self.sigma_A))
         return Correspondences(self.pixels1[which], self.pixels2[which], A21, d, sigma_px, sigma_A)
 
     def exchanged(self) -> Correspondences:
-        """Return the points with the two images exchanged, without directions; sigmas of entries of A21 are those of
-        its inverse at first order."""
+        """Return the points with the two images exchanged, without directions; sigma_A is propagated to first order."""
         if self.A21 is None:
             return Correspondences(self.pixels2, self.pixels1, sigma_px=self.sigma_px)
         a, b, c, d = np.moveaxis(self.A21.reshape(-1, 4), -1, 0)
@@ -70,7 +69,7 @@ class Correspondences:
         return Correspondences(self.pixels2, self.pixels1, A12, sigma_px=self.sigma_px, sigma_A=sigma_A)
 
     def matches(self, camera1: Camera, camera2: Camera) -> tuple[Matches, BoolArray]:
-        """Return matches with rays and Jacobians, and which of the N points they are: those that both cameras see."""
+        """Return matches with rays and Jacobians for the points that both cameras see, and which these are (N,)."""
         seen = camera1.unproject(self.pixels1)[1] & camera2.unproject(self.pixels2)[1]
         kept = self.select(seen)
         sigma = np.full(len(kept), DEFAULT_SIGMA_PX) if kept.sigma_px is None else kept.sigma_px

@@ -1,10 +1,9 @@
-"""How far a patch that is aligned by an affine warp is off, where the map between the images is none.
+"""The bias of a patch aligned by an affine warp, due to the second derivatives of the map between the images.
 
-From image to image a plane is mapped by a homography, or by what lenses make of it: x2(u) = x2 + A u + u^T H u / 2.
-Aligned by an affine warp with a window w, a patch finds the mean of that map over the window, which at the window's
-middle is off by sum_w u^T H u / 2. With the pose the map of every pair's own plane is known, and with it H. In pinhole
-images of near surfaces that shift is thousandths of a pixel, between lenses that distort hundredths: more than the
-noise of many patches together, and alike all over a part of the image.
+A plane maps as x2(u) = x2 + A u + u^T H u / 2, with H from perspective and distortion. Alignment by an affine warp
+under a window w estimates the mean of that map over the window, and so is biased by sum_w u^T H u / 2. Pose and plane
+determine H. The bias is thousandths of a pixel between pinhole images of near surfaces and hundredths between distorted
+ones: more than the noise of the mean of many patches, and similar throughout a part of the image.
 """
 
 from __future__ import annotations
@@ -17,13 +16,13 @@ from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.geometry.rigid3 import Rigid3
 
 STENCIL_PX = 4.0
-"""Of the second differences, about as wide as a window."""
+"""Step of the second differences, about the width of a window."""
 MAX_CURVATURE_PX = 1.0
-"""A larger shift comes of a plane that is wrong, and counts as none."""
+"""Larger shifts are due to wrong planes and set to zero."""
 
 
 def window_variance(half_width: int) -> float:
-    """Return the variance of a patch's window along an axis, px^2 of the level that it is read from."""
+    """Return the variance of a patch's window along an axis, px^2 of its pyramid level."""
     offset = np.arange(-half_width, half_width + 1.0)
     weight = np.exp(-0.5 * (offset / (WINDOW_OF_PATCH * half_width)) ** 2)
     return float(np.sum(weight * offset**2) / np.sum(weight))
@@ -37,14 +36,14 @@ def curvature_shift(
     cam2_from_cam1: Rigid3,
     off: FloatArray | None = None,
 ) -> FloatArray:
-    """Return by how much patches are too far on in image 2, (N, 2) px; zero where that is not known.
+    """Return the bias of the aligned positions in image 2, (N, 2) px; zero where unknown.
 
     Parameters
     ----------
-    pixels1 : (N, 2) where the pairs are in image 1.
-    planes : (N, 3) m of the plane m . X = 1 of each, in the frame of camera 1; NaN where there is none.
+    pixels1 : (N, 2) positions in image 1.
+    planes : (N, 3) m of the planes m . X = 1, in the frame of camera 1; NaN where unknown.
     variance : (N,) of the window along an axis, px^2 of image 1.
-    off : (N, 2) how far `pixels1` are from the middles of the windows; None: they are there.
+    off : (N, 2) offset of `pixels1` from the window centres; None: zero.
     """
     by_uu, by_uv, by_vv = _second_derivatives(pixels1, planes, cameras, cam2_from_cam1)
     shift = variance[:, None] * (by_uu + by_vv)

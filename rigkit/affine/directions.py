@@ -1,11 +1,11 @@
 """Directions along a board's rows, columns and diagonals at every corner, with exact lengths, in pixels.
 
-A direction is the derivative of the pixel by the grid index (px per square). It is taken where straight lines are
-straight: in the plane tangent to the unit sphere at the corner's own ray. Coordinates there agree with the pixels to
-first order. So a direction in raw pixels is found, fisheye or not, however far off the axis.
+A direction is the derivative of the pixel by the grid index (px per square). It is estimated in the plane tangent to
+the unit sphere at the corner's ray, where images of straight lines are straight and whose coordinates agree with the
+pixels to first order. This works for raw pixels of any central camera, at any angle to the axis.
 
 Reference: Hajder, Affine Correspondences in Stereo Vision, directions of a chessboard. Chord lengths to the neighbours
-are first-order wrong under perspective; harmonic means, or a projective fit, are exact.
+have first-order errors under perspective; harmonic means, or a projective fit, are exact.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ Support = Literal["chord", "neighbours", "line", "patch"]
 SUPPORTS: tuple[Support, ...] = get_args(Support)
 
 MIN_COSINE = 0.2
-"""Corners further than 78 degrees from a corner say nothing about its own surroundings."""
+"""Corners whose rays are more than 78 degrees from that of a corner are not used for its directions."""
 MIN_PIVOT = 1e-7
-"""A local fit is singular where a pivot is below this part of the largest."""
+"""Smallest pivot of a local fit over the largest that is not singular."""
 PROJECTIVE_STEPS = 4
 
 
@@ -37,8 +37,8 @@ class DirectionField:
 
     Attributes
     ----------
-    vectors : (N, 3, 2) px per square: horizontal (columns rise), vertical (rows rise), diagonal (both rise); NaN
-        where unknown.
+    vectors : (N, 3, 2) px per square: horizontal (along a row, towards higher columns), vertical (towards higher rows)
+        and diagonal (their sum); NaN where unknown.
     valid : (N, 3) bool
     covariance : (N, 3, 2, 2) px^2, from the corners' `sigma_px`.
     shared : (N, 2, 2) px^2, covariance of the horizontal (rows) with the vertical (columns).
@@ -60,28 +60,28 @@ def direction_field(
 ) -> DirectionField:
     """Return the directions at every corner of one detection.
 
-    Raises InputError: unknown support, a window below 1, or anything but patches on a board whose points are not one
-    square apart.
+    Raises InputError: unknown support, a window below 1, or any other support than "patch" for a pattern whose points
+    are not one square apart.
 
     Parameters
     ----------
-    pattern : of the board, whose grid the detection has; None, and for chessboards: corners are one square apart.
+    pattern : of the board; None: corners are one square apart, as on chessboards.
     support : what a direction is estimated from.
-        "chord": the chord to the next corner, at the far border from the one before (the paper's directions): the
+        "chord": the chord to the next corner, at the far border from the previous one (the paper's directions): the
         angle is exact, the length is not.
         "neighbours": the chord through the two neighbours, its length their harmonic mean; at a border the next two
-        corners: exact lengths.
+        corners. Lengths are exact.
         "line": a projective fit x(s) = (p + s v) / (1 + g s) to the nearest 2 `window` + 1 corners of the line.
-        "patch": a homography through the nearest (2 `window` + 1)^2 corners; the more corners, the less noise, the
-        more it relies on a flat board and a true camera.
-    window : half width in squares; None takes the whole line or board. Ignored by "chord" and "neighbours".
+        "patch": a homography through the nearest (2 `window` + 1)^2 corners. More corners reduce noise, but the
+        result depends more on the flatness of the board and on the calibration.
+    window : half width in squares; None: the whole line or board. Ignored by "chord" and "neighbours".
 
     Notes
     -----
-    Weights follow the corners' `sigma_px` through the derivative of the tangent plane by each corner's pixel.
+    Corners are weighted by their `sigma_px`, propagated to the tangent plane.
 
-    Why a patch of 5 x 5 by default: rms angle errors of 8x6 boards in random corners, degrees, for "neighbours" and
-    "patch" with window 1, 2, 3 and all. Corner noise 0.05 px: regular lens .054 .028 .010 .006 .005, fisheye .101 .053
+    The default, a patch of 5 x 5, follows from rms angle errors on 8x6 boards (degrees, SIMULATED) for "neighbours" and
+    "patch" with window 1, 2, 3 and None. Corner noise 0.05 px: regular lens .054 .028 .010 .006 .005, fisheye .101 .053
     .020 .012 .012. A board of 350 mm bent by 0.5 mm, no noise: .021 .022 .049 .082 .099.
     """
     if window is not None and window < 1:
@@ -127,9 +127,9 @@ class _Tangent:
         return cls(rays, jacobians, inverse @ np.swapaxes(jacobians, 1, 2), detection.sigma_px, seen)
 
     def positions(self, index: IntArray) -> tuple[FloatArray, BoolArray, FloatArray]:
-        """Return where corners `index` (N, M; -1 for none) lie in the tangent plane of corner n, (N, M, 2) px.
+        """Return the coordinates (N, M, 2), px, of corners `index` (N, M) in the tangent planes of the N corners.
 
-        With them, where they are usable (N, M), and the cosine between the two rays (N, M; NaN where not).
+        Also returns which are usable (N, M), and the cosines between the rays (N, M; NaN where not). Index -1 is none.
         """
         rays = self.rays[index]
         cosine = np.einsum("ni,nmi->nm", self.rays, rays)
@@ -138,7 +138,7 @@ class _Tangent:
         return np.einsum("nij,nmj->nmi", self.bases, rays) / cosine[..., None], usable, cosine
 
     def whitening(self, index: IntArray, positions: FloatArray, cosine: FloatArray) -> FloatArray:
-        """Return (N, M, 2, 2) that maps errors in the tangent plane to units of their standard deviation."""
+        """Return matrices (N, M, 2, 2) that whiten errors in the tangent plane."""
         by_ray = (self.bases[:, None] - positions[..., None] * self.rays[:, None, None, :]) / cosine[..., None, None]
         by_pixel = by_ray @ self.jacobians[index]
         usable = _finite(by_pixel.reshape(*index.shape, 4))
@@ -167,16 +167,16 @@ def _span(position: IntArray, count: int, window: int | None) -> IntArray:
 
 
 def _along_both(horizontal: tuple[FloatArray, FloatArray], vertical: tuple[FloatArray, FloatArray]) -> DirectionField:
-    """Join two directions and their sum. The sum's covariance leaves out what the two share by the corner itself."""
+    """Return two directions and their sum, whose covariance neglects the correlation due to the common corner."""
     vectors = np.stack([horizontal[0], vertical[0], horizontal[0] + vertical[0]], axis=1)
     covariance = np.stack([horizontal[1], vertical[1], horizontal[1] + vertical[1]], axis=1)
     return DirectionField(vectors, _finite(vectors), covariance, np.zeros((len(vectors), 2, 2)))
 
 
 def _next_chords(tangent: _Tangent, detection: BoardDetection) -> DirectionField:
-    """Return the chords to the next corner along row, column and diagonal, or from the one before where it is last.
+    """Return the chords to the next corner along row, column and diagonal, at the far border from the previous one.
 
-    The corners without a diagonal neighbour have the sum of their other two exact derivatives.
+    Corners without a diagonal neighbour get the sum of their exact horizontal and vertical derivatives.
     """
     padded = np.pad(_index_map(detection), 1, constant_values=-1)
     column, row = detection.grid[:, 0] + 1, detection.grid[:, 1] + 1
@@ -260,14 +260,14 @@ def _line_fit(
 
 
 def _patch_fit(tangent: _Tangent, detection: BoardDetection, places: FloatArray, window: int | None) -> DirectionField:
-    """Return all three directions by a homography through the corners around each corner; `places` (N, 2) are theirs
-    on the board, in squares."""
+    """Return all three directions by homographies through the corners around each corner; `places` (N, 2) are the
+    corners' positions on the board in squares."""
     lattice = _index_map(detection)
     columns = _span(detection.grid[:, 0], detection.columns, window)
     rows = _span(detection.grid[:, 1], detection.rows, window)
     n = len(columns)
     index = lattice[rows[:, :, None], columns[:, None, :]].reshape(n, -1)
-    # What was not found (-1) has any place: it takes no part.
+    # Index -1 (not found) takes an arbitrary place; `positions` marks it as not usable.
     vectors, covariance = _projective_fit(tangent, index, places[index] - places[:, None])
     joint = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     all_vectors = joint @ vectors
@@ -284,8 +284,8 @@ def _projective_fit(tangent: _Tangent, index: IntArray, steps: FloatArray) -> tu
     -----
     Gauss-Newton from the linear start: with w = 1 + g.s and the fitted y, the rows are
     [s/w, 1/w, -y s/w] (V, c, g) = y_measured - y + y/w, whitened by each corner's covariance in this tangent plane.
-    Undamped, unlike what `rigkit.optim` solves: the start is the fit without perspective, which is off by a few per
-    cent, the rows are nearly linear in (V, c, g), and what would not converge shows as w <= 0 and is refused.
+    No damping is needed: the start, a fit without perspective, is good to a few per cent, and the rows are nearly
+    linear in (V, c, g). Fits that diverge have w <= 0 and are rejected.
     """
     n, m, d = steps.shape
     measured, usable, cosine = tangent.positions(index)

@@ -1,8 +1,8 @@
 """F2UDIR and F3UDIR: the affinity from directions without lengths and the epipolar geometry.
 
-All A that agree with the epipolar geometry are A = A0 + m y^T with A0 = -n2 n1^T / |n2|^2 and m = perp(n2) / |n2|;
-every direction gives one equation in y. A direction along its epipolar line gives none: in standard stereo that is
-every board edge parallel to the baseline.
+All A consistent with the epipolar geometry are A = A0 + m y^T with A0 = -n2 n1^T / |n2|^2 and m = perp(n2) / |n2|;
+every direction gives one equation in y. A direction along its epipolar line, in standard stereo every board edge
+parallel to the baseline, gives none.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rigkit.core.matches import DirectionPairs
 def usable_directions(
     directions: PlanarDirections, n2: FloatArray, count: int | None, min_conditioning: float
 ) -> BoolArray:
-    """Return which directions to use, (K, n): the first `count` (None: all) that do not lie along the epipolar line."""
+    """Return which directions to use, (K, n): all without a `count`, else the first `count` off the epipolar line."""
     if count is None:
         return directions.use
     across = directions.x2 * n2[0] + directions.y2 * n2[1]
@@ -38,8 +38,8 @@ def epipolar_block(directions: PlanarDirections, n1: FloatArray, n2: FloatArray)
     Notes
     -----
     Residual of direction k: perp(u2)^T A u1 with unit u1, u2 (the paper's alpha eliminated), that is
-    (u2 . n2/|n2|)(u1 . y) - (u2 x n2/|n2|)(n1/|n2| . u1); least squares in y. The epipolar equations hold exactly: they
-    are far more precise than directions. (Hajder stacks them with the directions; see `soft_epipolar`.)
+    (u2 . n2/|n2|)(u1 . y) - (u2 x n2/|n2|)(n1/|n2| . u1); least squares in y. The epipolar equations, far more precise
+    than directions, are hard constraints. (Hajder stacks them with the directions; see `soft_epipolar`.)
     """
     x1, y1, x2, y2 = directions.x1, directions.y1, directions.x2, directions.y2
     w1, w2 = unit_weights(directions)
@@ -66,8 +66,8 @@ def soft_epipolar(directions: DirectionPairs, use: BoolArray, epipolar: Epipolar
 
     Notes
     -----
-    Minimises sum_k (perp(u2)^T A u1)^2 + |A^T n2 + n1|^2 / |n2|^2. Dividing by |n2| removes the arbitrary
-    scale of F that the paper's rows carry. For comparison: with hard rows the normals are as good or better.
+    Minimises sum_k (perp(u2)^T A u1)^2 + |A^T n2 + n1|^2 / |n2|^2. Dividing by |n2| removes the arbitrary scale of F in
+    the paper's rows. This exists for comparison: hard constraints give normals that are as good or better.
     """
     keep = use[..., None]
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,8 +1,7 @@
-"""Affine correspondences of two images of a textured scene: SIFT in simulated views, frames refined on the images.
+"""Affine correspondences of two images of a textured scene: SIFT in simulated views, refined by patch alignment.
 
-Each image is also seen from the side, by simulated tilts (ASIFT, Morel and Yu 2009): features of a surface that the two
-cameras see at different slants match there. A match gives a first affinity from the two features' scale, orientation
-and tilt; aligning the patches makes it accurate.
+With simulated tilts of each image (ASIFT, Morel and Yu 2009) features of surfaces match that the two cameras see at
+different slants. Scale, orientation and tilt of two features give an initial affinity, which patch alignment refines.
 """
 
 from __future__ import annotations
@@ -20,26 +19,27 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.kernels.patches import Pyramid
 
 TILTS = (1.0, np.sqrt(2.0), 2.0)
-"""Simulated tilts: together with those of the other image they cover slants of 60 degrees and more."""
+"""Simulated tilts: combined over both images they cover slants of 60 degrees and more."""
 ROLL_STEP_DEG = 72.0
 """Step of the tilts' direction, over the tilt (as in ASIFT)."""
 SAME_POINT_PX = 8.0
-"""Features of different simulated views this near are one point: no rivals in the ratio test."""
+"""Features closer than this are one point in different simulated views, and no rivals in the ratio test."""
 RIVALS = 8
+"""Nearest descriptors among which a rival is sought."""
 MIN_CORRELATION = 0.9
-"""Of two aligned patches."""
+"""Smallest correlation of two aligned patches."""
 MAX_RATIO = 0.85
-"""A match must be nearer than this times its best rival elsewhere in the image (D. Lowe, IJCV 2004)."""
+"""Largest descriptor distance over that of the best rival elsewhere in the image (D. Lowe, IJCV 2004)."""
 CELL_PX = 4.0
-"""A cell of this side has one match."""
+"""Side of the cells with at most one match each."""
 FEATURES_OF_VIEWS = (600, 6000)
-"""In a tilted view; and at most in a plain one."""
+"""Features of a tilted view, and the most of a plain one."""
 AREA_OF_FEATURE = 150.0
-"""Pixels of a plain view to one of its strongest features."""
+"""Pixels of a plain view per feature."""
 MAX_TILTED_AREA = 1e6
-"""Pixels of a tilted view: larger images are shrunk first."""
+"""Pixels of a tilted view at the most: larger images are shrunk first."""
 ENOUGH_PLAIN = 300
-"""Correspondences of plain views; with fewer the tilted ones are looked at too."""
+"""Correspondences of plain views below which tilted views are used too."""
 MIN_SIZE_PX = 64
 
 
@@ -57,7 +57,7 @@ def match_affine_features(
     features_per_view: int | None = None,
     unique: bool = False,
 ) -> Correspondences:
-    """Return affine correspondences of two images; contaminated by some wrong ones, as matches are.
+    """Return affine correspondences of two images, with some outliers.
 
     Raises InputError: not images, or too small; DegenerateError: no correspondences (no texture, or images of
     different scenes).
@@ -65,37 +65,24 @@ def match_affine_features(
     Parameters
     ----------
     image1, image2 : (H, W) or (H, W, 3) RGB, uint8 or uint16.
-    tilts : simulated tilts, 1 (none) and above. None: none, and where that finds too little, those of TILTS too.
+    tilts : simulated tilts, 1 (none) and above. None: 1, and those of TILTS if that gives too few correspondences.
     features_per_view : strongest SIFT features kept in each simulated view; None: by the area of the image.
-    unique : features of the same image that look alike are rivals, too. What is repeated (tiles, keys, bricks) is
-        easily matched a period off, and such a match may lie near its epipolar line all the same.
+    unique : similar features of the same image are rivals too. Repeated structures (tiles, keys, bricks) are easily
+        matched with a shift of one period, and such matches may fit the epipolar geometry.
     """
     greys = grey_of(image1, "image1"), grey_of(image2, "image2")
     pyramid1, pyramid2 = (patch_pyramid(grey) for grey in greys)
-    found: _AlignedMatches | None = None
     for views in (_views(tilts),) if tilts is not None else (_views((1.0,)), _views(TILTS)):
         first, second = (_features(grey, views, features_per_view) for grey in greys)
-        matched = _match(first, second, unique)
-        found = _aligned(first, second, matched, pyramid1, pyramid2)
-        if len(found.pairs) >= ENOUGH_PLAIN:
+        pairs, tried = _aligned(first, second, _match(first, second, unique), pyramid1, pyramid2)
+        if len(pairs) >= ENOUGH_PLAIN:
             break
-    assert found is not None
-    if not len(found.pairs):
-        # Where nothing looks alike there is nothing to align.
-        what = (
-            f"none of {found.tried} matches could be aligned" if found.tried else "nothing looks alike in both images"
-        )
+    if not len(pairs):
+        what = f"none of {tried} matches could be aligned" if tried else "nothing looks alike in both images"
         raise DegenerateError(
             f"affine features: {what}; check that they show one textured scene, from places not too far apart"
         )
-    return found.pairs
-
-
-class _AlignedMatches(NamedTuple):
-    """The correspondences, and how many matches were tried to align."""
-
-    pairs: Correspondences
-    tried: int
+    return pairs
 
 
 def _aligned(
@@ -104,8 +91,8 @@ def _aligned(
     matched: tuple[IntArray, IntArray, FloatArray],
     pyramid1: Pyramid,
     pyramid2: Pyramid,
-) -> _AlignedMatches:
-    """Return the matches of two images' features whose patches align."""
+) -> tuple[Correspondences, int]:
+    """Return the matches of two images' features whose patches align, and the number of matches tried."""
     i, j, rank = matched
     once = _unrepeated(first.pixels[i], second.pixels[j], rank)
     i, j = i[once], j[once]
@@ -122,11 +109,11 @@ def _aligned(
         refined.sigma_px[good],
         refined.sigma_A[good],
     )
-    return _AlignedMatches(pairs, i.size)
+    return pairs, i.size
 
 
 def _views(tilts: Sequence[float]) -> list[tuple[float, float]]:
-    """Return tilt and roll (rad) of the simulated views."""
+    """Return (tilt, roll in rad) of the simulated views."""
     views = []
     for tilt in tilts:
         if tilt < 1.0:
@@ -137,7 +124,7 @@ def _views(tilts: Sequence[float]) -> list[tuple[float, float]]:
 
 
 def grey_of(image: NDArray[Any], name: str) -> NDArray[np.uint8]:
-    """Return the image in grey, 8 bits; raises InputError where it is none, or too small."""
+    """Return the image in grey, 8 bits; raises InputError if it is not an image, or too small."""
     import cv2
 
     array = np.asarray(image)
@@ -158,7 +145,7 @@ def grey_of(image: NDArray[Any], name: str) -> NDArray[np.uint8]:
 
 
 def _features(grey: NDArray[np.uint8], views: Sequence[tuple[float, float]], count: int | None) -> _Features:
-    """Return the features of all simulated views in the pixels of the image itself."""
+    """Return the features of all simulated views, in pixels of the image."""
     import cv2
 
     parts = []
@@ -178,7 +165,7 @@ def _features(grey: NDArray[np.uint8], views: Sequence[tuple[float, float]], cou
         size = np.array([k.size for k in keypoints])[:, None, None]
         # RootSIFT: Euclidean distances of square roots compare histograms better.
         root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6))
-        # Of a smaller image pixels are larger, and their centres lie elsewhere.
+        # Pixel centres of a shrunk image are at half-integer positions of the scale.
         pixels = scale * (pixels + 0.5) - 0.5
         parts.append(_Features(pixels, scale * inverse @ (size * turn), root.astype(np.float32)))
     if not parts:
@@ -187,7 +174,7 @@ def _features(grey: NDArray[np.uint8], views: Sequence[tuple[float, float]], cou
 
 
 def _shrunk(grey: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
-    """Return the image of no more than MAX_TILTED_AREA, and how many of its own pixels one of that is."""
+    """Return the image shrunk to at most MAX_TILTED_AREA, and the size of its pixels in those of the original."""
     import cv2
 
     scale = np.sqrt(grey.shape[0] * grey.shape[1] / MAX_TILTED_AREA)
@@ -210,7 +197,7 @@ def _simulated(
     turn = np.array([[c, -s], [s, c]])
     corners = np.array([[0.0, 0.0], [width - 1.0, 0.0], [0.0, height - 1.0], [width - 1.0, height - 1.0]]) @ turn.T
     low, size = corners.min(axis=0), np.ceil(np.ptp(corners, axis=0)).astype(int) + 1
-    # The border goes on outside: an edge between image and nothing would be full of features.
+    # The border is replicated: an edge between image and background would give many features.
     outside = cv2.BORDER_REPLICATE
     turned = cv2.warpAffine(grey, np.column_stack([turn, -low]), size.tolist(), borderMode=outside)
     blurred = cv2.GaussianBlur(turned, (0, 0), sigmaX=0.8 * np.sqrt(tilt**2 - 1.0), sigmaY=0.01)
@@ -223,7 +210,7 @@ def _simulated(
 
 
 def _match(first: _Features, second: _Features, unique: bool) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return index pairs of features that choose each other and have no rival elsewhere, with their distances."""
+    """Return indices (M,) and (M,) of mutual nearest neighbours that pass the ratio test, and their distances (M,)."""
     forward, distance, rival = _nearest(first, second)
     backward, _, _ = _nearest(second, first)
     if not forward.size or not backward.size:
@@ -232,7 +219,7 @@ def _match(first: _Features, second: _Features, unique: bool) -> tuple[IntArray,
     mutual = np.linalg.norm(returned - first.pixels, axis=1) < SAME_POINT_PX
     if unique:
         for features, which in ((first, slice(None)), (second, forward)):
-            # The nearest is the feature itself: the rival is elsewhere in its own image.
+            # The nearest feature is the feature itself.
             own = _nearest(features, features)[2]
             rival = np.minimum(rival, own[which]) if own.size else rival
     i = np.flatnonzero(mutual & (distance < MAX_RATIO * rival))
@@ -240,7 +227,7 @@ def _match(first: _Features, second: _Features, unique: bool) -> tuple[IntArray,
 
 
 def _nearest(first: _Features, second: _Features, block: int = 1024) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the nearest feature of `second` for each of `first`, how near, and how near any other point comes."""
+    """Return the nearest feature of `second` for each of `first`, its distance, and that of the nearest other point."""
     n, m = len(first.pixels), len(second.pixels)
     if m <= RIVALS or n == 0:
         return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0)
@@ -251,7 +238,7 @@ def _nearest(first: _Features, second: _Features, block: int = 1024) -> tuple[In
         similarity = first.descriptors[rows] @ second.descriptors.T
         each = np.arange(len(similarity))
         top, values = np.empty((len(each), RIVALS), np.int64), np.empty((len(each), RIVALS), np.float32)
-        # The largest one after the other: a partition of the rows takes twenty times as long.
+        # Repeated argmax: np.partition takes twenty times as long.
         for k in range(RIVALS):
             top[:, k] = similarity.argmax(axis=1)
             values[:, k] = similarity[each, top[:, k]]
@@ -259,14 +246,14 @@ def _nearest(first: _Features, second: _Features, block: int = 1024) -> tuple[In
         distance = np.sqrt(np.maximum(2.0 - 2.0 * values, 0.0))
         distinct = np.linalg.norm(second.pixels[top] - second.pixels[top[:, :1]], axis=-1) > SAME_POINT_PX
         other = np.where(distinct, distance, np.inf).min(axis=1)
-        # No rival among the nearest ones: the furthest of them is a bound.
+        # Without a rival among the nearest ones the furthest of them is a lower bound.
         rival[rows] = np.where(np.isfinite(other), other, distance[:, -1])
         best[rows], nearest[rows] = top[:, 0], distance[:, 0]
     return best, nearest, rival
 
 
 def _unrepeated(pixels1: Pixels, pixels2: Pixels, rank: FloatArray) -> BoolArray:
-    """Return which to keep so that every cell of either image has one point, the one of lowest rank."""
+    """Return which matches (N,) to keep so that every cell of either image has only the match of lowest rank."""
     keep = np.zeros(len(pixels1), dtype=bool)
     order = np.argsort(rank, kind="stable")
     for pixels in (pixels1, pixels2):

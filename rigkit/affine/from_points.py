@@ -1,4 +1,4 @@
-"""Affinities of bare points that any matcher found: from how their neighbours move, then from the images."""
+"""Affinities for point matches of any matcher: from the motion of neighbouring points, refined on the images."""
 
 from __future__ import annotations
 
@@ -8,22 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
-from rigkit.affine.features import grey_of
+from rigkit.affine.features import MIN_CORRELATION, grey_of
 from rigkit.affine.refine_patches import patch_pyramid, refine_patches
 from rigkit.core.arrays import Affines, Pixels
 from rigkit.core.errors import DegenerateError
 
 ROUGH_SIGMA_A = 0.1
-"""Affinities that are known no better than that are only where an alignment starts."""
+"""Affinities with a larger median sigma_A are only initial values for the alignment."""
 
 POINTS_AROUND = 12
-"""Points around, of which some lie on another surface or are wrong."""
+"""Neighbours of a point, some of which are outliers or on another surface."""
 MOTION_ROUNDS = 4
-MIN_CORRELATION = 0.9
 
 
 def are_rough(found: Correspondences) -> bool:
-    """Say whether the correspondences are bare points, or have affinities of no use as they are."""
+    """Return whether the correspondences have neither directions nor affinities better than ROUGH_SIGMA_A."""
     if found.A21 is None:
         return found.directions is None
     return found.sigma_A is not None and float(np.nanmedian(found.sigma_A)) >= ROUGH_SIGMA_A
@@ -32,10 +31,10 @@ def are_rough(found: Correspondences) -> bool:
 def with_affinities(
     found: Correspondences, image1: NDArray[np.generic], image2: NDArray[np.generic]
 ) -> Correspondences:
-    """Return the correspondences whose patches align, with the places and affinities that align them.
+    """Return the correspondences whose patches align, with refined pixels2 and affinities.
 
-    Affinities that are there are where the alignment starts, where none are the local motion of the neighbours is.
-    Raises DegenerateError where none align.
+    The alignment starts at the given affinities, else at those of the local motion of neighbouring points. Raises
+    DegenerateError if no patches align.
     """
     start = _local_motion(found.pixels1, found.pixels2)
     if found.A21 is not None:
@@ -56,7 +55,7 @@ def with_affinities(
 
 
 def _local_motion(pixels1: Pixels, pixels2: Pixels) -> Affines:
-    """Return the affinities (N, 2, 2) that the neighbours of each point show, robustly; one where they do not."""
+    """Return robust affinities (N, 2, 2) of the motion of each point's neighbours; the identity with too few points."""
     from scipy.spatial import cKDTree
 
     count = min(POINTS_AROUND + 1, len(pixels1))
@@ -69,7 +68,7 @@ def _local_motion(pixels1: Pixels, pixels2: Pixels) -> Affines:
     for _ in range(MOTION_ROUNDS):
         normal = np.einsum("nk,nki,nkj->nij", weight, d1, d1)
         right = np.einsum("nk,nki,nkj->nij", weight, d2, d1)
-        # Neighbours on one line say nothing across it: a little of "as it is" decides there.
+        # Regularised towards the identity, for collinear neighbours.
         doubt = 1e-3 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(2) + 1e-9 * np.eye(2)
         A21 = (right + doubt) @ np.linalg.inv(normal + doubt)
         off = np.linalg.norm(d2 - np.einsum("nij,nkj->nki", A21, d1), axis=-1)

@@ -1,7 +1,6 @@
-"""What the errors of the corners and of the pose do to normals, besides the errors of the affinities.
+"""Covariance of normals due to errors of the corners and of the pose, in addition to those of the affinities.
 
-Usually little; but near an epipole and with very accurate directions the parallax, and with it range, epipolar line and
-normal, is known no better than the corners.
+It is usually small. Near an epipole, or with very accurate directions, it limits parallax, range and normal.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from rigkit.geometry.triangulation import triangulate_midpoint
 STEP_PX = 1e-3
 STEP_RAD = 1e-7
 BASELINE_STEP = 1e-6
-"""Steps of the central differences: far above rounding, far below where the second order shows."""
+"""Steps of the central differences, with negligible rounding and second-order errors."""
 
 
 def geometry_covariance(
@@ -33,15 +32,15 @@ def geometry_covariance(
 ) -> FloatArray:
     """Return the covariance (N, 3, 3) of the unit normals, rad^2, from corner and pose errors at fixed directions.
 
-    To be added to that from the affinities (`estimate_normals(..., geometry=)`).
+    It is added to that from the affinities by `estimate_normals(..., geometry=)`.
 
     Parameters
     ----------
     matches : the corners, with their sigmas.
     cam2_from_cam1 : relative pose; points are triangulated with it.
-    A21 : (N, 2, 2), or for F2UDIR and F3UDIR the function that gives them for an epipolar geometry, because those
-        affinities move with it.
-    pose_covariance : (6, 6) of (left rotation perturbation rad, translation), or None: the pose is exact.
+    A21 : (N, 2, 2); for F2UDIR and F3UDIR, whose affinities depend on the epipolar geometry, the function that computes
+        them from it.
+    pose_covariance : (6, 6) of (left rotation perturbation rad, translation); None: the pose is exact.
     """
     f1, f2, b1, b2 = matches.rays1, matches.rays2, matches.jacobians1, matches.jacobians2
 
@@ -78,10 +77,9 @@ def geometry_covariance(
 
 
 def _moved(rays: Rays, jacobians: RayJacobians, step_px: FloatArray) -> tuple[Rays, RayJacobians]:
-    """Return rays and Jacobians at pixels `step_px` away; the Jacobian turns with the ray.
+    """Return rays and Jacobians at pixels displaced by `step_px`; the Jacobian rotates with the ray.
 
-    How the lens magnifies there is left out: it changes a Jacobian by step / focal length, which is nothing beside the
-    noise of any direction.
+    Changes of the magnification are neglected: they are step / focal length, far less than the noise of directions.
     """
     if not step_px.any():
         return rays, jacobians

@@ -10,11 +10,14 @@ from rigkit.core.arrays import Affines, BoolArray, Mat3, Normals, Pixels, as_arr
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 
+DEGENERATE = 1e-10
+"""Smallest relative eighth singular value of a system on nine unknowns with a unique null vector."""
+
 
 def affines_from_homography(H21: Mat3, pixels1: Pixels) -> tuple[Affines, BoolArray]:
-    """Return d pixel2 / d pixel1 (N, 2, 2) of H21 (3, 3) or (N, 3, 3) at pixels1 (N, 2), and where it is defined.
+    """Return d pixel2 / d pixel1 (N, 2, 2) of H21 (3, 3) or (N, 3, 3) at pixels1 (N, 2), and which are valid.
 
-    Undefined (NaN) where the homography sends the pixel to infinity.
+    Invalid (NaN) where the homography maps the pixel to infinity.
 
     Notes
     -----
@@ -36,7 +39,7 @@ def affines_from_homography(H21: Mat3, pixels1: Pixels) -> tuple[Affines, BoolAr
 def homography_from_plane(K1: Mat3, K2: Mat3, cam2_from_cam1: Rigid3, normal: Normals, offset_mm: float) -> Mat3:
     """Return H21 (3, 3), scaled to unit Frobenius norm, of the plane normal . x = offset_mm in the frame of camera 1.
 
-    H = K2 (R + t n^T / D) K1^-1. Raises DegenerateError where the plane goes through the centre of camera 1.
+    H = K2 (R + t n^T / D) K1^-1. Raises DegenerateError if the plane contains the centre of camera 1.
     """
     if offset_mm == 0.0:
         raise DegenerateError("homography of a plane: the plane goes through the centre of camera 1")
@@ -92,11 +95,7 @@ def homography_from_affines(pixels1: Pixels, pixels2: Pixels, A21: Affines, *, a
         raise DegenerateError("homography from affinities: points and affinities do not determine it")
     H21 = np.linalg.inv(T2) @ vt[-1].reshape(3, 3) @ T1
     H21 /= np.linalg.norm(H21)
-    return np.asarray(H21 if np.median(H21[2] @ np.concatenate([q1, np.ones((n, 1))], 1).T) > 0.0 else -H21)
-
-
-DEGENERATE = 1e-10
-"""Relative eighth singular value of a system on nine entries below which its null vector is not unique."""
+    return np.asarray(H21 if np.median(q1 @ H21[2, :2] + H21[2, 2]) > 0.0 else -H21)
 
 
 def _normalisation(pixels: Pixels) -> Mat3:

@@ -1,7 +1,7 @@
 """Affinities from any mix of directions with and without lengths, with and without epipolar geometry.
 
-The estimators of the registry are the pure cases: all with lengths (2SDIR, 3SDIR), all without and the epipolar
-geometry (F2UDIR, F3UDIR). Here every direction says for itself whether its length counts.
+The estimators of the registry are the pure cases: lengths of all directions (2SDIR, 3SDIR), or of none together with
+the epipolar geometry (F2UDIR, F3UDIR).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 
 SINGULAR = 1e-6
-"""Below this the normal equations have no digits left."""
+"""Smallest singular value at which normal equations are still solvable in double precision."""
 
 
 def affines_from_mixed_directions(
@@ -33,17 +33,16 @@ def affines_from_mixed_directions(
     Parameters
     ----------
     directions : N corners, K directions each.
-    scaled : bool, broadcast to (N, K): whether the length of a direction counts. A direction with length gives two
-        equations, one without gives one; without epipolar geometry four are needed, one of them with length, and
-        with it two.
-    epipolar : hard constraint A^T n2 + n1 = 0 where given.
-    noise : of the directions; then each affinity has a covariance.
-    min_conditioning : affinities whose system has a smaller smallest singular value are invalid.
+    scaled : bool, broadcast to (N, K): whether the length of a direction is used. A direction with length gives two
+        equations, one without gives one. Four are needed, including a length; two with epipolar geometry.
+    epipolar : hard constraint A^T n2 + n1 = 0; None: no constraint.
+    noise : of the directions, for covariances of the affinities.
+    min_conditioning : smallest singular value of the system of a valid affinity.
 
     Notes
     -----
-    Rows in unit directions: perp(u2)^T A u1 = 0, and u2^T A u1 = |d2| / |d1| where the length counts: both angles and
-    relative lengths are pure numbers, so they are weighted alike.
+    Rows in unit directions: perp(u2)^T A u1 = 0, and u2^T A u1 = |d2| / |d1| where the length is used. Both angles and
+    relative lengths are dimensionless and get equal weights.
     """
     counts = _checked(directions.valid.shape, scaled, epipolar)
     A21, conditioning = _solved(directions, counts, epipolar)
@@ -77,7 +76,7 @@ def _solved(
 
 
 def _checked(shape: tuple[int, ...], scaled: BoolArray, epipolar: EpipolarNormals | None) -> BoolArray:
-    """Return `scaled` as (N, K). Raises InputError where that or the epipolar normals do not fit."""
+    """Return `scaled` as (N, K). Raises InputError if its shape or that of the epipolar normals does not fit."""
     n, k = shape
     if epipolar is not None and len(epipolar) != n:
         raise InputError(f"mixed directions: {n} corners but epipolar normals of {len(epipolar)}")
@@ -90,7 +89,7 @@ def _checked(shape: tuple[int, ...], scaled: BoolArray, epipolar: EpipolarNormal
 
 
 def _unknowns(n: int, epipolar: EpipolarNormals | None) -> tuple[FloatArray, FloatArray]:
-    """Return base (N, 4) and basis (N, 4, U) of the affinities allowed: all, or those of the epipolar geometry."""
+    """Return offset (N, 4) and basis (N, 4, U) of all affinities, or of those with the epipolar constraint."""
     if epipolar is None:
         return np.zeros((n, 4)), np.broadcast_to(np.eye(4), (n, 4, 4))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,8 +1,7 @@
 """Surface normals from affinities, with their predicted error.
 
 Source: L. Hajder, "Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations", and D. Barath, J.
-Molnar, L. Hajder, "Optimal Surface Normal from Affine Transformation" (VISAPP 2015), which the paper means by its
-optimal normal.
+Molnar, L. Hajder, "Optimal Surface Normal from Affine Transformation" (VISAPP 2015), the paper's optimal normal.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import angle_between
 
 MIN_PARALLAX = 1e-9
-"""Smallest |h| / |J2|, about the angle between the two viewing rays in radians: below, it is rounding."""
+"""Smallest |h| / |J2| (about the angle between the two viewing rays, rad) that is not rounding."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -29,9 +28,8 @@ class NormalEstimate:
     ----------
     normals : (N, 3) unit, facing camera 1, in the frame of the Jacobians; NaN where invalid.
     valid : (N,) bool.
-    sigma_rad : (N,) predicted rms angle; NaN where unknown. For small errors it is the root of the trace of the
-        normal's covariance; where the geometry hardly determines the normal it stays an angle, of about a radian, and
-        does not run away.
+    sigma_rad : (N,) predicted rms angular error; NaN where unknown. For small errors it is the root of the trace of
+        the normal's covariance. It is bounded: about a radian where the normal is hardly determined.
     """
 
     normals: Normals
@@ -40,19 +38,19 @@ class NormalEstimate:
 
 
 def normals_from_affines(J1: FloatArray, J2: FloatArray, A21: Affines) -> tuple[Normals, BoolArray]:
-    """Return the unit normals (N, 3) that face camera 1 and whose affinities are nearest to A21, and where valid.
+    """Return the unit normals (N, 3), facing camera 1, whose affinities are nearest to A21, and which are valid.
 
     Parameters
     ----------
-    J1, J2 : (N, 2, 3) d pixel / d point of both images in one frame (`pair_projection_jacobians`); the normals' frame.
-    A21 : (N, 2, 2) affinities, NaN where there is none.
+    J1, J2 : (N, 2, 3) d pixel / d point of both images in the frame of the normals (`pair_projection_jacobians`).
+    A21 : (N, 2, 2) affinities, NaN where unknown.
 
     Notes
     -----
-    With A(n) = G - h y^T, n ~ J1^T y + d, the minimum of |A(n) - A|_F is y = (G - A)^T h / (h . h). Undefined without
-    parallax, h = 0 (the point lies at the epipole, or the cameras coincide): NaN and invalid.
+    With A(n) = G - h y^T, n ~ J1^T y + d, the minimum of |A(n) - A|_F is y = (G - A)^T h / (h . h). Invalid (NaN)
+    without parallax, h = 0 (a point at the epipole, or coincident cameras).
 
-    Raises InputError for arrays of other shapes, or that are no numbers.
+    Raises InputError for arrays of other shapes or types.
     """
     J1, J2, A21 = _matching(J1, J2, A21)
     out = np.empty((len(A21), 3))
@@ -88,13 +86,13 @@ def estimate_normals(
     Parameters
     ----------
     J1, J2, A21 : as in `normals_from_affines`.
-    covariance : (N, 4, 4) of vec(A21), from `Affinities.covariance`; None: the error is not known.
-    geometry : (N, 3, 3) covariance that corners and pose add, rad^2, from `geometry_covariance`.
+    covariance : (N, 4, 4) of vec(A21), from `Affinities.covariance`; None: the error is unknown.
+    geometry : (N, 3, 3) covariance due to corners and pose, rad^2, from `geometry_covariance`.
 
     Notes
     -----
     dy = -dA^T h / (h . h): the error is the affinity's error along the epipolar line over |h| = |d pixel2 / d range|.
-    Small baselines, far planes and points near the epipole are lost.
+    It grows without bound for small baselines, far planes and points near the epipole.
     """
     normals, valid = normals_from_affines(J1, J2, A21)
     if covariance is None:
@@ -110,9 +108,9 @@ def estimate_normals(
 
 
 def _rms_angle(J1: FloatArray, normals: Normals, spread_y: FloatArray) -> FloatArray:
-    """Return the rms angle (N,) to the normals of four points one (scaled) standard deviation of y away.
+    """Return the rms angle (N,) between the normals and those at four sigma points of y.
 
-    Two-dimensional sigma points y +- sqrt(2) L e_i with weight 1/4: exact to first order, and bounded beyond.
+    The sigma points y +- sqrt(2) L e_i have weight 1/4: exact to first order, and bounded for large errors.
     """
     ray = np.cross(J1[:, 0], J1[:, 1])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -129,7 +127,7 @@ def _rms_angle(J1: FloatArray, normals: Normals, spread_y: FloatArray) -> FloatA
 
 
 def _optimal(J1: FloatArray, J2: FloatArray, A21: Affines) -> Normals:
-    """Return -unit(J1^T y + d), NaN without parallax: in this gauge n . d = 1, so its opposite faces camera 1."""
+    """Return -unit(J1^T y + d), NaN without parallax. In this gauge n . d = 1, so that -n faces camera 1."""
     G, h, d = linear_gauge(J1, J2)
     hx, hy = h[:, 0], h[:, 1]
     j = J2.reshape(len(J2), 6)
@@ -148,5 +146,5 @@ def _optimal(J1: FloatArray, J2: FloatArray, A21: Affines) -> Normals:
 
 
 def _planar(array: FloatArray) -> FloatArray:
-    """Return the same array with its first axis contiguous in memory, so that single components are."""
+    """Return the array with its first axis contiguous in memory, so that single components are contiguous."""
     return np.moveaxis(np.ascontiguousarray(np.moveaxis(array, 0, -1)), -1, 0)

@@ -1,4 +1,4 @@
-"""The affine estimators by name. Adding one is a module and an entry of the table."""
+"""The affine estimators by name. A new one needs a module and an entry of the table."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Block = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Known:
-    """What is known beside the directions: see `affines_from_directions`."""
+    """Arguments of `affines_from_directions` other than the directions."""
 
     epipolar: EpipolarNormals | None
     scale: str
     determinant: FloatArray | None
 
     def select(self, which: slice | BoolArray) -> _Known:
-        """Return what is known of some of the corners."""
+        """Return those of some of the corners."""
         lines = None if self.epipolar is None else EpipolarNormals(self.epipolar.n1[which], self.epipolar.n2[which])
         determinant = None if self.determinant is None else np.asarray(self.determinant, dtype=np.float64)[which]
         return _Known(lines, self.scale, determinant)
@@ -37,8 +37,7 @@ class _Known:
 
 @dataclass(frozen=True, slots=True)
 class _Estimator:
-    """Solves a block of corners, from so many directions of each: the first `count` usable ones (None: all), at least
-    `min_count`."""
+    """Solver of a block of corners from at least `min_count` directions: the first `count` usable ones (None: all)."""
 
     solve: Callable[[PlanarDirections, _Known], Block]
     count: int | None = None
@@ -62,7 +61,7 @@ AFFINE_METHODS = tuple(_ESTIMATORS)
 
 
 def needs_epipolar(method: str) -> bool:
-    """Say whether `method` needs the epipolar geometry (then re-estimating that from its affinities is circular)."""
+    """Return whether `method` needs the epipolar geometry, which then must not be re-estimated from its affinities."""
     return _estimator(method).needs_epipolar
 
 
@@ -80,28 +79,27 @@ def affines_from_directions(
 ) -> Affinities:
     """Return the affinities of N corners from corresponding directions.
 
-    Raises InputError: unknown method or option, no epipolar geometry or no lengths where the method needs them, lengths
-    that differ.
+    Raises InputError: unknown method or option, no epipolar geometry or no lengths although the method needs them, or
+    arrays of different lengths.
 
     Parameters
     ----------
     directions : N corners, K directions each.
     method : "F2UDIR" or "2SDIR" use the first two usable directions of a corner, "F3UDIR", "DET3UDIR" and "3SDIR" all.
         Usable: valid, and for F2UDIR not along the epipolar line (|unit(d2) . unit(n2)| >= min_conditioning), so that
-        the diagonal of a board steps in for an edge that is parallel to the baseline.
-    F21 : for F2UDIR and F3UDIR in perspective images: the fundamental matrix; `directions` must have pixels then.
-    epipolar : the same for any central camera: epipolar normals in the same pixels as the directions.
+        the diagonal of a board replaces an edge parallel to the baseline.
+    F21 : fundamental matrix, for F2UDIR and F3UDIR in perspective images; `directions` must have pixels.
+    epipolar : epipolar normals in the pixels of the directions, for F2UDIR and F3UDIR with any central camera.
     scale : for DET3UDIR: "area" (exact, default), "ls" (exact), "sqmean" (the paper's) or "diagonal" (both biased).
-    noise : of the directions; then each affinity has a covariance.
-    determinant : (N,) for DET3UDIR: det A where it is known otherwise; then lengths are not used.
-    epipolar_rows : "hard", or "soft": the epipolar equations stacked with the directions in least squares, as in the
-        paper.
-    min_conditioning : affinities below are invalid. 0 accepts everything that can be computed.
+    noise : of the directions, for covariances of the affinities.
+    determinant : (N,) for DET3UDIR: det A if it is known; lengths are then not used.
+    epipolar_rows : "hard": exact constraint; "soft": least squares together with the directions, as in the paper.
+    min_conditioning : smallest conditioning of a valid affinity; 0 accepts all that can be computed.
 
     Returns
     -------
     Affinities
-        `valid` is False, and A21 NaN, where too few directions are usable or they do not determine the affinity.
+        `valid` is False, and A21 NaN, if too few directions are usable or they do not determine the affinity.
     """
     if F21 is not None and epipolar is None and needs_epipolar(method):
         epipolar = _epipolar_of(directions, F21)
@@ -121,7 +119,7 @@ def affines_from_directions(
 def _solved(
     directions: DirectionPairs, method: str, known: _Known, min_conditioning: float
 ) -> tuple[Affines, FloatArray, BoolArray]:
-    """Return affinities (N, 2, 2), conditioning (N,) and which directions were used (N, K), a block at a time."""
+    """Return affinities (N, 2, 2), conditioning (N,) and which directions were used (N, K)."""
     n, estimator = len(directions.valid), _estimator(method)
     A21 = np.full((n, 2, 2), np.nan)
     conditioning = np.full(n, np.nan)
@@ -142,7 +140,7 @@ def _solved(
 def _covariance(
     directions: DirectionPairs, method: str, known: _Known, use: BoolArray, valid: BoolArray, noise: DirectionNoise
 ) -> FloatArray:
-    """Propagate the noise of the directions in use to vec(A), (N, 4, 4), to first order; NaN where invalid."""
+    """Return the first-order covariance of vec(A), (N, 4, 4), from the noise of the used directions; NaN if invalid."""
     some, of_some = replace(directions, valid=use).select(valid), known.select(valid)
 
     def solve(moved: DirectionPairs) -> Affines:

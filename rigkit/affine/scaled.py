@@ -1,4 +1,4 @@
-"""2SDIR and 3SDIR: the affinity from directions whose lengths count, by linear least squares. No epipolar geometry."""
+"""2SDIR and 3SDIR: the affinity from directions with lengths, by linear least squares. No epipolar geometry."""
 
 from __future__ import annotations
 

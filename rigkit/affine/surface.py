@@ -1,4 +1,4 @@
-"""The affinity that a surface with a given normal shows between two cameras."""
+"""The affinity between two cameras of a surface with a given normal."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from rigkit.core.arrays import Affines, BoolArray, FloatArray, Normals
 
 
 class LinearGauge(NamedTuple):
-    """A = G - h y^T for the surface n ~ J1^T y + d: the affinity is linear in two numbers.
+    """A = G - h y^T for the surface n ~ J1^T y + d, which makes the affinity linear in y (2,).
 
     Attributes
     ----------
-    G : (..., 2, 2) the affinity of the surface that faces camera 1.
-    h : (..., 2) d pixel2 / d range1, px/mm: along the epipolar line of image 2. Zero at the epipole.
+    G : (..., 2, 2) affinity of the surface perpendicular to the ray of camera 1.
+    h : (..., 2) d pixel2 / d range1, px/mm, along the epipolar line of image 2. Zero at the epipole.
     d : (..., 3) unit viewing ray of camera 1.
     """
 
@@ -25,7 +25,7 @@ class LinearGauge(NamedTuple):
 
 
 def linear_gauge(J1: FloatArray, J2: FloatArray) -> LinearGauge:
-    """Return the gauge n . d = 1 for d pixel / d point of both images, (..., 2, 3), in one frame. Any central camera.
+    """Return the gauge n . d = 1 from d pixel / d point (..., 2, 3) of both images, in one frame, for central cameras.
 
     Notes
     -----
@@ -52,10 +52,9 @@ def linear_gauge(J1: FloatArray, J2: FloatArray) -> LinearGauge:
 
 
 def affines_from_normals(J1: FloatArray, J2: FloatArray, normals: Normals) -> tuple[Affines, BoolArray]:
-    """Return A21 (..., 2, 2) of surfaces with `normals` (..., 3; any length and sign), and where it is defined.
+    """Return A21 (..., 2, 2) of surfaces with `normals` (..., 3; of any length and sign), and which are valid.
 
-    Undefined (NaN) where camera 1 sees the surface edge-on. J1, J2: d pixel / d point (..., 2, 3) in the normals'
-    frame.
+    Invalid (NaN) where camera 1 sees the surface edge-on. J1, J2: d pixel / d point (..., 2, 3) in the normals' frame.
     """
     G, h, d = linear_gauge(J1, J2)
     n = np.asarray(normals, dtype=np.float64)

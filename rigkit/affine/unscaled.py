@@ -1,8 +1,8 @@
-"""DET3UDIR: the affinity from three or more directions without lengths and its determinant. No epipolar geometry.
+"""DET3UDIR: the affinity from its determinant and three or more directions without lengths. No epipolar geometry.
 
-In complex numbers A x = z x + w conj(x), with |z|^2 - |w|^2 = det A; z is the part of A that turns and scales, w the
-part that reflects. In a = (Re z, Im z, Re w, Im w) the residuals are a quadratic form with 2x2 blocks [P, Q; Q^T, R]
-and the determinant is diag(1, 1, -1, -1), which makes the 4x4 generalised eigenproblem a scalar equation.
+In complex numbers A x = z x + w conj(x), with |z|^2 - |w|^2 = det A. In a = (Re z, Im z, Re w, Im w) the sum of squared
+residuals is a quadratic form with 2x2 blocks [P, Q; Q^T, R] and the determinant is diag(1, 1, -1, -1), which reduces
+the 4x4 generalised eigenproblem to a scalar equation.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 
 from rigkit.affine.components import PlanarDirections, first_of, last_of, smaller_eigenvalue, unit_weights
 from rigkit.core.arrays import FloatArray
-from rigkit.core.errors import InputError
 
 SCALES = ("area", "ls", "sqmean", "diagonal")
 
@@ -60,24 +59,24 @@ def _form(directions: PlanarDirections) -> _Form:
     )
 
 
-def shape_block(directions: PlanarDirections) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return vec(A), (4, n), with determinant 1, the conditioning, (n,), and the mean square residual, (n,).
+def shape_block(directions: PlanarDirections) -> tuple[FloatArray, FloatArray]:
+    """Return vec(A), (4, n), with determinant 1, and the conditioning, (n,).
 
-    Minimises sum_k (perp(u2_k)^T A u1_k)^2 over all A of determinant 1, globally, and signs A so that it maps d1 along,
-    not against, d2. With three directions the residual is zero unless noise has reversed their cyclic order.
+    A is the global minimum of sum_k (perp(u2_k)^T A u1_k)^2 over all A of determinant 1, with the sign for which A d1
+    points along d2. With three directions the residual is zero unless noise has reversed their cyclic order.
 
     Notes
     -----
     Stationary points: S a = mu B a. Erratum: the appendix takes the largest generalised eigenvalue (of lambda = -2
-    mu); as eigen-solvers return mu, the minimum is the smallest positive one, and the sign of A, free there, is fixed
-    here. With w = -(R + mu)^-1 Q^T z that mu is the largest root of lambda_min(P - Q (R + mu)^-1 Q^T) = mu. The left
-    side is concave in mu, so Newton from the right, from lambda_min(P), reaches that root monotonically. Its step is
+    mu); eigen-solvers return mu, of which the smallest positive one is the minimum. Its sign of A is arbitrary.
+    With w = -(R + mu)^-1 Q^T z that mu is the largest root of lambda_min(P - Q (R + mu)^-1 Q^T) = mu. The left side is
+    concave in mu, so Newton's method started at lambda_min(P), to the right of it, converges monotonically. Its step is
     the Rayleigh quotient a^T S a / a^T B a.
     """
     f = _form(directions)
     count = directions.use.sum(0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        # Three directions have an exact solution, mu = 0, where its determinant is positive.
+        # Three directions have an exact solution, mu = 0, if its determinant is positive.
         exact = (count == 3) & (_determinant(*_vector(f, np.zeros_like(f.p11))) > 0.0)
         mu = np.where(exact, 0.0, smaller_eigenvalue(f.p11, f.p12, f.p22))
         open_ = np.flatnonzero(~exact)
@@ -94,11 +93,11 @@ def shape_block(directions: PlanarDirections) -> tuple[FloatArray, FloatArray, F
         a = np.stack([z1 + w1, w2 - z2, z2 + w2, z1 - w1])
         a *= 1.0 / np.sqrt(np.where(determinant > 0.0, determinant, np.nan))
         a *= np.sign(_agreement(directions, a))
-        return a, _third_singular(directions), mu * 2.0 / count
+        return a, _third_singular(directions)
 
 
 def _newton_step(f: _Form, mu: FloatArray) -> FloatArray:
-    """Return the Rayleigh quotient of the vector that belongs to mu: the Newton step of the scalar equation."""
+    """Return the Rayleigh quotient of the vector of mu, the result of a Newton step of the scalar equation."""
     z1, z2, w1, w2 = _vector(f, mu)
     numerator = (
         z1 * (f.p11 * z1 + 2.0 * f.p12 * z2)
@@ -126,12 +125,12 @@ def _vector(f: _Form, mu: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
     c22 = f.p22 - f.q21 * t12 - f.q22 * t22
     half = 0.5 * (c11 - c22)
     root = np.sqrt(half * half + c12 * c12)
-    # Of the two forms of the eigenvector take the one without cancellation.
+    # The form of the eigenvector without cancellation.
     upper = half > 0.0
     z1 = np.where(upper, -c12, root - half)
     z2 = np.where(upper, half + root, -c12)
     norm = z1 * z1 + z2 * z2
-    # A multiple of the identity has no preferred direction: any z is an eigenvector.
+    # Of a multiple of the identity any z is an eigenvector.
     equal = norm == 0.0
     z1, norm = np.where(equal, 1.0, z1), np.where(equal, 1.0, norm)
     length = 1.0 / np.sqrt(norm)
@@ -140,15 +139,15 @@ def _vector(f: _Form, mu: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
 
 
 def _agreement(directions: PlanarDirections, a: FloatArray) -> FloatArray:
-    """Return sum_k d2_k . A d1_k / (|d1_k| |d2_k|)^2-weighted by length: positive where A maps along the directions."""
+    """Return sum_k d2_k . A d1_k, (n,): positive where A maps directions along, not against, each other."""
     x1, y1, x2, y2 = directions.x1, directions.y1, directions.x2, directions.y2
     return np.asarray((x2 * (a[0] * x1 + a[1] * y1) + y2 * (a[2] * x1 + a[3] * y1)).sum(0))
 
 
 def _third_singular(directions: PlanarDirections) -> FloatArray:
-    """Return sqrt(e3 / e2) of the rows' Gram matrix: the third singular value where the fourth is (nearly) zero.
+    """Return sqrt(e3 / e2) of the rows' Gram matrix, the third singular value if the fourth is (nearly) zero.
 
-    Zero where two directions of three are parallel in both images: then the shape is not unique.
+    Zero if two of three directions are parallel in both images, so that the shape is not unique.
     """
     w1, w2 = unit_weights(directions)
     x1, y1 = directions.x1 * np.sqrt(w1), directions.y1 * np.sqrt(w1)
@@ -177,35 +176,31 @@ def determinant_from_lengths(directions: PlanarDirections, shape: FloatArray, sc
     """Return det A, (n,), from the lengths of the directions.
 
     "area": ratio of the signed areas that the first two directions span; exact. "ls": the scale of `shape`
-    (determinant 1) that fits the lengths best; exact. "sqmean": squared mean of the scales |d2|/|d1|, as the paper
-    has it; biased unless A is a similarity, for replication. "diagonal": the same of the last direction alone.
+    (determinant 1) that fits the lengths best; exact. "sqmean": squared mean of the scales |d2|/|d1|, as in the paper;
+    biased unless A is a similarity, for replication. "diagonal": |d2|/|d1| squared of the last direction, likewise.
     """
-    if scale == "area":
-        pair = first_of(directions.use, 2)
-        first = first_of(directions.use, 1)
-        second = pair & ~first
+    x1, y1, x2, y2, use = directions.x1, directions.y1, directions.x2, directions.y2, directions.use
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if scale == "area":
+            first = first_of(use, 1)
+            second = first_of(use, 2) & ~first
 
-        def area(x: FloatArray, y: FloatArray) -> FloatArray:
-            ax, ay = (x * first).sum(0), (y * first).sum(0)
-            return np.asarray(ax * (y * second).sum(0) - ay * (x * second).sum(0))
+            def area(x: FloatArray, y: FloatArray) -> FloatArray:
+                ax, ay = (x * first).sum(0), (y * first).sum(0)
+                return np.asarray(ax * (y * second).sum(0) - ay * (x * second).sum(0))
 
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return area(directions.x2, directions.y2) / area(directions.x1, directions.y1)
-    length1, length2 = np.hypot(directions.x1, directions.y1), np.hypot(directions.x2, directions.y2)
-    if scale == "ls":
-        a1, a2, a3, a4 = shape
-        mapped = np.hypot(a1 * directions.x1 + a2 * directions.y1, a3 * directions.x1 + a4 * directions.y1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(((mapped * length2).sum(0) / (mapped * mapped).sum(0)) ** 2)
-    if scale == "sqmean":
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.where(directions.use, length2 / length1, 0.0).sum(0) / directions.use.sum(0)
+            return area(x2, y2) / area(x1, y1)
+        length1, length2 = np.hypot(x1, y1), np.hypot(x2, y2)
+        if scale == "ls":
+            a1, a2, a3, a4 = shape
+            mapped = np.hypot(a1 * x1 + a2 * y1, a3 * x1 + a4 * y1)
+            ratio = (mapped * length2).sum(0) / (mapped * mapped).sum(0)
+        elif scale == "sqmean":
+            ratio = np.where(use, length2 / length1, 0.0).sum(0) / use.sum(0)
+        else:
+            last = last_of(use)
+            ratio = np.where(last, length2, 0.0).sum(0) / np.where(last, length1, 0.0).sum(0)
         return np.asarray(ratio**2)
-    if scale == "diagonal":
-        last = last_of(directions.use)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray((np.where(last, length2, 0.0).sum(0) / np.where(last, length1, 0.0).sum(0)) ** 2)
-    raise InputError(f"affine scale '{scale}' is unknown; known: {', '.join(SCALES)}")
 
 
 def determinant_block(
@@ -213,10 +208,10 @@ def determinant_block(
 ) -> tuple[FloatArray, FloatArray]:
     """Return vec(A), (4, n), and the conditioning, (n,), from all directions in use (three at least).
 
-    `determinant` (n,) overrides the lengths. NaN where the determinant is not positive: no surface seen from the same
-    side by both cameras reverses the order of directions.
+    `determinant` (n,) replaces that from the lengths. NaN where the determinant is not positive: a surface seen from
+    the same side by both cameras preserves the cyclic order of directions.
     """
-    shape, conditioning, _ = shape_block(directions)
+    shape, conditioning = shape_block(directions)
     s = determinant_from_lengths(directions, shape, scale) if determinant is None else determinant
     with np.errstate(invalid="ignore"):
         return shape * np.sqrt(np.where(s > 0.0, s, np.nan)), conditioning
