@@ -1,1 +1,1 @@
-"""Which board is which, and which of its corners is the first."""
+"""Identification of boards and of their first corners."""

@@ -1,8 +1,8 @@
-"""Which board of image 1 is which board of image 2: hypotheses from single boards, completed and refined jointly.
+"""Assignment of the boards of image 1 to those of image 2: hypotheses from single boards, extended and refined jointly.
 
-One detection in either image, taken for the same board in the same position, fixes the relative pose of the cameras; it
-predicts all other boards in image 2. The detections that agree complete the assignment, and a joint least squares over
-all their corners scores it.
+One detection in each image, assumed to be the same board in the same position, determines the relative pose of the
+cameras, which predicts all other boards in image 2. Detections that fit their predictions extend the assignment, and a
+joint least squares fit of all their corners gives its chi square.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from rigkit.identification.joint_pose import JointPose, refine_joint
 from rigkit.identification.placements import BoardKind
 
 SEED_GATE = 2.0
-"""Squares by which a board may miss the prediction from one other board: its tilt is uncertain, its lever long."""
+"""Largest rms error, in squares, of a board predicted from one other board, whose tilt is uncertain."""
 REJOIN_GATE = 0.5
-"""Squares by which a board may miss the prediction of a joint fit to be tried as part of it."""
+"""Largest rms error, in squares, of a board predicted by a joint fit for it to be added to the fit."""
 MAX_SEEDS = 300
 MAX_ASSIGNMENTS = 20
 MAX_SETTLE_ROUNDS = 4
 SEARCH_TOLERANCE = 1e-3
-"""Fits that only decide who belongs need no more digits."""
+"""Relative tolerance of the cost in fits that only decide which boards belong to an assignment."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Assignment:
-    """A whole assignment with its joint fit.
+    """An assignment of boards with its joint fit.
 
     Attributes
     ----------
-    matches : the boards taken to be seen in both images.
+    matches : the boards seen in both images.
     pose : the joint fit, boards in the order of `matches`.
-    chi2_1, chi2_2 : chi2 of every detection in image 1 and 2, at most that of giving it up.
+    chi2_1, chi2_2 : chi2 of every detection in image 1 and 2, at most that of an unassigned one (`give_up`).
     """
 
     matches: tuple[BoardMatch, ...]
@@ -52,7 +52,7 @@ class Assignment:
         return float(self.chi2_1.sum() + self.chi2_2.sum())
 
     def differs_from(self, other: Assignment) -> bool:
-        """Say whether the two contradict each other: one detection, but another partner or position."""
+        """Return whether a detection has another partner or position in the other assignment."""
         mine = {("1", s.first): (s.second, s.key) for s in self.matches} | {
             ("2", s.second): s.first for s in self.matches
         }
@@ -66,12 +66,9 @@ class Assignment:
 def ranked_assignments(
     matches: Sequence[BoardMatch], view1: ImageObservations, view2: ImageObservations, kinds: Sequence[BoardKind]
 ) -> list[Assignment]:
-    """Return distinct assignments with their joint fits, best first.
-
-    Raises DegenerateError where no motion takes any board along.
-    """
+    """Return distinct assignments with their joint fits, best first; raises DegenerateError if there is none."""
     predictor = _Predictor.build(matches, view2, kinds)
-    # Whole boards first: a part whose place on the board is open makes many links, most of them wrong.
+    # Whole boards first: a part of a board has many possible positions, most of them wrong.
     open_places = Counter((s.first, s.second) for s in matches)
     seeds = np.array(
         sorted(range(len(matches)), key=lambda n: open_places[matches[n].first, matches[n].second])[:MAX_SEEDS]
@@ -103,7 +100,7 @@ def ranked_assignments(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Predictor:
-    """Where the outermost corners of each link's second detection are predicted, given the relative pose."""
+    """Predicts the outermost corners of each match's second detection from the relative pose."""
 
     cam1_from_board: FloatArray
     cam2_from_board: FloatArray
@@ -132,7 +129,7 @@ class _Predictor:
         )
 
     def misses(self, motions: FloatArray) -> FloatArray:
-        """Return the rms distance (S, L) of predicted from seen corners in squares, for each motion (S, 4, 4)."""
+        """Return the rms errors (S, L), in squares, of the predicted corners of L matches for motions (S, 4, 4)."""
         x = np.einsum("sij,lpj->slpi", motions[:, :3, :3], self.in_cam1) + motions[:, None, None, :3, 3]
         u = x / np.linalg.norm(x, axis=-1, keepdims=True)
         closeness = np.maximum(1.0 + np.einsum("slpi,lpi->slp", u, self.rays), 1e-9)[..., None]
@@ -147,7 +144,7 @@ def _outermost(detection: BoardDetection) -> IntArray:
 
 
 def _choose(miss: FloatArray, gate: float, matches: Sequence[BoardMatch], kinds: Sequence[BoardKind]) -> list[int]:
-    """Return the links taken greedily by rising miss: each detection once, no kind more often than it has boards."""
+    """Return the matches chosen greedily by increasing error: each detection once, no kind more often than listed."""
     chosen: list[int] = []
     first, second, used = set(), set(), [0] * len(kinds)
     order = np.argsort(miss, kind="stable")
@@ -171,10 +168,10 @@ def _settle(
     view2: ImageObservations,
     kinds: Sequence[BoardKind],
 ) -> Assignment:
-    """Refine an assignment, drop boards that do not fit, add those that then do, until nothing changes."""
+    """Return the assignment after repeatedly refining it, dropping boards that do not fit and adding those that do."""
 
     def fit(candidates: list[int], start: FloatArray) -> tuple[float, JointPose]:
-        """By how many gates the worst board misses, and the joint fit."""
+        """Return the error of the worst board in units of the gate, and the joint fit."""
         some = [matches[n] for n in candidates]
         pose = _fit(start, some, view1, view2, kinds, SEARCH_TOLERANCE)
         return _worst(pose, some, view1, view2), pose
@@ -184,7 +181,7 @@ def _settle(
         seen.add(tuple(chosen))
         worst, pose = fit(chosen, motion)
         while worst > 1.0 and len(chosen) > 1:
-            # The board that does not fit spoils the fit of the others: find it by leaving out each in turn.
+            # A wrong board distorts the fit of all: find it by leaving out each in turn.
             parts = [chosen[:k] + chosen[k + 1 :] for k in range(len(chosen))]
             fits = [fit(part, motion) for part in parts]
             k = min(range(len(parts)), key=lambda k: fits[k][0])

@@ -1,7 +1,4 @@
-"""Which of several boards that look alike is which in the list, and which of its corners is the first.
-
-Nothing on such boards tells them apart, so a rule does; it looks at the scene from camera 1.
-"""
+"""Ids and first corners of boards that look alike, by a rule on their positions as seen from camera 1."""
 
 from __future__ import annotations
 
@@ -22,16 +19,16 @@ BOARD_SIDES: Mapping[str, tuple[float, float, float]] = {
     "ceiling": (0.0, 1.0, 0.0),
     "back": (0.0, 0.0, -1.0),
 }
-"""Where a board may hang, and the way its face then looks in the frame of camera 1."""
+"""Normals of the boards on each side of a scene, in the frame of camera 1."""
 THREE = ("right", "floor", "left")
-"""Three boards of one kind, in the order listed: clockwise round the floor of a corner."""
+"""Default sides of three boards of one kind in the order listed, clockwise in a corner of a room."""
 LEVEL_COSINE = float(np.sqrt(0.5))
-"""A board within 45 degrees of level lies on the floor or the ceiling."""
+"""Boards within 45 degrees of level are on the floor or the ceiling."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LocatedBoard:
-    """A board of a kind whose place is known: `cam1_from_board` (4, 4) in the frame of the kind's first board."""
+    """A board of a kind with its pose `cam1_from_board` (4, 4), in the frame of the kind's first board."""
 
     kind: int
     cam1_from_board: FloatArray
@@ -43,7 +40,7 @@ class LocatedBoard:
 
     @property
     def face(self) -> FloatArray:
-        """The normal that looks at the viewer, whatever the hand of the grid."""
+        """The normal that points towards camera 1, for right- and left-handed grids."""
         normal = self.cam1_from_board[:3, 2]
         return np.asarray(-np.sign(normal @ self.cam1_from_board[:3, 3]) * normal)
 
@@ -53,11 +50,11 @@ def assign_board_ids(
 ) -> tuple[list[str], tuple[str, ...]]:
     """Return a board id for each located board, and notes. No kind may have more located than listed boards.
 
-    The rule, where several boards of a kind are listed: names that are known stay; then boards in `layout` go to the
-    sides it says; then boards listed upright (columns x rows swapped) to those seen so. The rest are taken in the order
-    listed, clockwise round the centre of all boards as camera 1 sees them, from opposite the floor or ceiling board
-    (from twelve o'clock if there is none). In a corner that is the right wall, the floor, the left wall. Where only
-    some of three are in sight, each is named by its side in that order.
+    The rule for several boards of a kind: known ids are kept. Boards in `layout` are assigned to their sides. Boards
+    listed upright (columns x rows swapped) are assigned to those seen upright. The others are assigned in the order
+    listed, clockwise around the centre of all boards as camera 1 sees them, starting opposite the floor or ceiling
+    board (at twelve o'clock without one): in a corner the right wall, the floor, the left wall. If only some of three
+    boards are visible, they are assigned by their sides in that order.
     """
     notes: list[str] = []
     names: list[str | None] = [item.board_id for item in located]
@@ -89,27 +86,27 @@ def assign_board_ids(
 
 
 def first_corner_turn(item: LocatedBoard, kind: BoardKind, board: Board, others: Sequence[FloatArray]) -> int:
-    """Return the quarter turns from the kind's frame to that of `board`, one of its boards.
+    """Return the number of quarter turns from the kind's frame to that of `board`, one of its boards.
 
-    Where the board looks the same turned, the first corner is, of those possible, the end of the board nearest to the
-    centres of the `others` (3,), mm; without others, the one from which the columns run most nearly to the right in
-    camera 1. Where it does not, the colours or the marks have told the first corner already.
+    If the board is symmetric under rotation, its first corner is the possible one nearest to the mean of the centres of
+    the `others` (3,), mm; without others, the one whose columns point most nearly to the right in camera 1. Otherwise
+    colours or markers have determined the first corner.
     """
     turns: tuple[int, ...] = (0, *board.turns) if kind.board.size == board.size else (1, 3)
     if not board.turns:
         return turns[0]
     columns, rows = kind.board.columns - 1, kind.board.rows - 1
-    # The corner that `BoardDetection.turned` makes the first, and the direction of the columns from there.
+    # The first corner after `BoardDetection.turned`, and the direction of the columns there.
     first = kind.board.points(np.array([(0, 0), (0, rows), (columns, rows), (columns, 0)]))
     along = {0: (1, 0), 1: (0, -1), 2: (-1, 0), 3: (0, 1)}
 
-    def badness(turn: int) -> float:
+    def cost(turn: int) -> float:
         if others:
             corner = item.cam1_from_board[:3, :3] @ first[turn] + item.cam1_from_board[:3, 3]
             return float(np.linalg.norm(corner - np.mean(others, axis=0)))
         return -float(item.cam1_from_board[0, :2] @ np.array(along[turn]))
 
-    return min(turns, key=lambda turn: (round(badness(turn), 6), turn))
+    return min(turns, key=lambda turn: (round(cost(turn), 6), turn))
 
 
 def _check(layout: Mapping[str, str] | None, kinds: Sequence[BoardKind]) -> None:
@@ -122,7 +119,7 @@ def _check(layout: Mapping[str, str] | None, kinds: Sequence[BoardKind]) -> None
 
 
 def _clock(located: Sequence[LocatedBoard], kinds: Sequence[BoardKind]) -> FloatArray:
-    """Return where each board lies round the common centre, radians clockwise from twelve o'clock in camera 1."""
+    """Return the angle of each board around the common centre, rad clockwise from twelve o'clock in camera 1."""
     centres = np.array([item.centre(kinds[item.kind].board) for item in located]).reshape(-1, 3)
     rays = centres / np.linalg.norm(centres, axis=1, keepdims=True)
     right, down = _image_axes(rays.mean(axis=0))
@@ -130,7 +127,7 @@ def _clock(located: Sequence[LocatedBoard], kinds: Sequence[BoardKind]) -> Float
 
 
 def _image_axes(towards: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the unit vectors to the right and down, across the line of sight `towards` (3,)."""
+    """Return the unit vectors to the right and down, perpendicular to the line of sight `towards` (3,)."""
     sight = towards / np.linalg.norm(towards)
     right = np.cross([0.0, 1.0, 0.0], sight)
     length = np.linalg.norm(right)
@@ -139,7 +136,7 @@ def _image_axes(towards: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _from_opposite_level(free: list[int], located: Sequence[LocatedBoard], clock: FloatArray) -> list[int]:
-    """Return boards clockwise, from opposite the one that lies most nearly level, if any does."""
+    """Return boards in clockwise order, starting opposite the most level one if that is on floor or ceiling."""
     if not free:
         return []
     level = max(free, key=lambda n: abs(located[n].face[1]))
@@ -150,7 +147,7 @@ def _from_opposite_level(free: list[int], located: Sequence[LocatedBoard], clock
 def _by_side(
     located: Sequence[LocatedBoard], names: list[str | None], free: list[int], sides: Mapping[str, str]
 ) -> None:
-    """Give the boards with a side to the located boards that face most nearly as that side does."""
+    """Assign the ids with a side to the located boards whose normals fit the sides best, IN PLACE in `names`."""
     if not sides:
         return
     from scipy.optimize import linear_sum_assignment
@@ -164,7 +161,7 @@ def _by_side(
 def _by_shape(
     order: list[int], ids: list[str], located: Sequence[LocatedBoard], kind: BoardKind
 ) -> list[tuple[str, int]]:
-    """Pair ids with boards in the order given, boards listed upright with those that stand more upright."""
+    """Pair ids with boards in the order given, those of boards listed upright with the most upright boards."""
     shape = {board.board_id: board.size for board in kind.boards}
     alike = [i for i in ids if shape[i] == kind.board.size]
     swapped = [i for i in ids if shape[i] != kind.board.size]

@@ -1,7 +1,4 @@
-"""Two detections taken for one board: every way in which a detection of image 1 can be one of image 2.
-
-What a view of an image holds for that: rays, poses of each detection from its own corners, the kinds that it may be.
-"""
+"""Candidate matches of detections of image 1 with detections of image 2, in all possible positions on a board."""
 
 from __future__ import annotations
 
@@ -22,25 +19,25 @@ from rigkit.identification.placements import BoardKind, Placement, describe, pla
 GATE_SQUARES = 0.1
 GATE_PX = 2.0
 GATE_SMALL_SQUARES = 0.25
-"""How far (rms) a board may miss the joint fit and still count as seen there: a tenth of a square; on small squares
-2 px, for noise and calibration errors, but never more than a quarter of a square."""
+"""Largest rms residual of a board in a joint fit: a tenth of a square; for small squares 2 px, due to noise and
+calibration errors, but at most a quarter of a square."""
 MIN_OBSERVED_CORNERS = 4
 TILT_RMS_RATIO = 3.0
 TILT_RMS_PX = 0.5
-"""The reversed tilt of a board is tried too where its rms is within this ratio, or this many px, of the better one."""
+"""The second pose of a plane is tried too if its rms is at most this multiple of the first one's, or this many px."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class BoardMatch:
-    """Detection `first` of image 1 and `second` of image 2 taken for one board of a kind.
+    """The hypothesis that detection `first` of image 1 and `second` of image 2 are one board of a kind.
 
     Attributes
     ----------
-    key : what is claimed: equal for all placements (and tilts) that say the same of the two images.
+    key : equal for all placements and poses with the same correspondence of corners.
     placement1, placement2 : grids of the detections to the grid of the board.
     cam1_from_board, cam2_from_board : (4, 4)
-    against_colour : whether the two are turned by 90 degrees against each other although the colours of a square board
-        with an odd number of corners a side (a quarter turn exchanges them) should have prevented that.
+    against_colour : whether the two differ by a rotation of 90 degrees that contradicts the colours of the squares, on
+        a square board with an odd number of corners per side.
     """
 
     first: int
@@ -56,13 +53,13 @@ class BoardMatch:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ImageObservations:
-    """The detections of one image with all that does not depend on the other image.
+    """The detections of one image with their rays and possible kinds.
 
     Attributes
     ----------
-    detections : without names that are not listed and corners that have no ray.
-    observations, spacing_px, kinds : by detection: rays, distance of neighbours, the kinds that it may be.
-    notes : what was left out.
+    detections : without ids that are not listed and corners without a ray.
+    observations, spacing_px, kinds : per detection: rays, distance of neighbouring corners, possible kinds.
+    notes : on corners that were left out.
     """
 
     camera: Camera
@@ -76,7 +73,7 @@ class ImageObservations:
     def of(
         cls, detections: Sequence[BoardDetection], kinds: Sequence[BoardKind], camera: Camera, image: str
     ) -> ImageObservations:
-        """Build for the detections of `image` (its name in messages); raises InputError where a name comes twice."""
+        """Build for the detections of `image` (its name in messages); raises InputError if an id occurs twice."""
         listed = {board_id for kind in kinds for board_id in kind.ids}
         kept: list[BoardDetection] = []
         notes = []
@@ -101,12 +98,12 @@ class ImageObservations:
 
     @property
     def gate_px(self) -> FloatArray:
-        """How far (rms px) each detection (D,) may miss the joint fit."""
+        """Largest rms residual (D,), px, of each detection in a joint fit."""
         small = np.minimum(GATE_PX, GATE_SMALL_SQUARES * self.spacing_px)
         return np.asarray(np.maximum(GATE_SQUARES * self.spacing_px, small))
 
     def give_up(self) -> FloatArray:
-        """Return the chi2 (D,) of each detection when all its corners miss by the gate."""
+        """Return the chi2 (D,) of each detection with all residuals at the gate: the cost of leaving it out."""
         both = zip(self.gate_px, self.observations, strict=True)
         return np.array([((gate / observation.sigma_px) ** 2).sum() for gate, observation in both])
 
@@ -120,12 +117,12 @@ def _spacing(detection: BoardDetection) -> float:
 
 
 Tilts: TypeAlias = list[tuple[FloatArray, float]]
-"""[(cam_from_grid (4, 4), chi2)] of the plausible tilts, best first; none where degenerate."""
+"""[(cam_from_grid (4, 4), chi2)] of the plausible poses of a plane, best first; empty if degenerate."""
 
 
 class GridPoses:
-    """Poses of detections, each computed once: in the frame of their own grid, which any shift on a board of even steps
-    has in common, else in that of the board."""
+    """Cached poses of detections: in the frame of their own grid for boards of even steps, where it is the same for all
+    shifts, else in that of the board."""
 
     def __init__(self, view: ImageObservations) -> None:
         self.view = view
@@ -168,7 +165,7 @@ class GridPoses:
 def matches_between(
     view1: ImageObservations, view2: ImageObservations, kinds: Sequence[BoardKind]
 ) -> tuple[list[BoardMatch], FloatArray, FloatArray]:
-    """Return all links, and the free chi2 of each detection (its own pose, its best kind; NaN where it has none)."""
+    """Return all candidate matches, and the chi2 of each detection's own best pose in image 1 and 2 (NaN without)."""
     poses1, poses2 = GridPoses(view1), GridPoses(view2)
     matches: list[BoardMatch] = []
     for i, detection1 in enumerate(view1.detections):
@@ -190,7 +187,8 @@ def matches_between(
 def _matches_of_pair(i: int, j: int, k: int, kind: BoardKind, poses1: GridPoses, poses2: GridPoses) -> list[BoardMatch]:
     detection1, detection2 = poses1.view.detections[i], poses2.view.detections[j]
     square = kind.board.columns == kind.board.rows and detection1.complete and detection2.complete
-    matches, keys = [], set()
+    matches: list[BoardMatch] = []
+    keys = set()
     for placement1 in placements(detection1, kind):
         for placement2 in placements(detection2, kind):
             key = (k, *placement2.relative_to(placement1, detection1, detection2))
@@ -199,18 +197,19 @@ def _matches_of_pair(i: int, j: int, k: int, kind: BoardKind, poses1: GridPoses,
             keys.add(key)
             odd = (placement1.quarter_turns + placement2.quarter_turns) % 2 == 1
             against = square and kind.board.columns % 2 == 1 and odd
-            for pose1, _ in poses1.placed(i, kind, placement1):
-                for pose2, _ in poses2.placed(j, kind, placement2):
-                    match = BoardMatch(
-                        first=i,
-                        second=j,
-                        kind=k,
-                        key=key,
-                        placement1=placement1,
-                        placement2=placement2,
-                        cam1_from_board=pose1,
-                        cam2_from_board=pose2,
-                        against_colour=against,
-                    )
-                    matches.append(match)
+            matches += [
+                BoardMatch(
+                    first=i,
+                    second=j,
+                    kind=k,
+                    key=key,
+                    placement1=placement1,
+                    placement2=placement2,
+                    cam1_from_board=pose1,
+                    cam2_from_board=pose2,
+                    against_colour=against,
+                )
+                for pose1, _ in poses1.placed(i, kind, placement1)
+                for pose2, _ in poses2.placed(j, kind, placement2)
+            ]
     return matches

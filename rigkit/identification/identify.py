@@ -1,8 +1,8 @@
-"""Names and orientation of the boards found: in the two images of a pair by geometry, in one image by size.
+"""Ids and orientations of the boards in the two images of a pair, by geometry.
 
-Boards may be all different, partly equal or all equal, and may look the same turned. Every way in which one detection
-of image 1 can be one of image 2 fixes a relative pose of the cameras, which all other boards support or contradict; the
-assignment with the smallest joint residual wins, and says by how much.
+Boards may be different or look alike, and may be symmetric under rotation. Every candidate match of a detection in
+image 1 with one in image 2 determines a relative pose of the cameras, which all other boards support or contradict. The
+assignment with the smallest joint residual is chosen; its odds against the others say whether it is ambiguous.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from rigkit.identification.pair_identity import PairIdentity
 from rigkit.identification.placements import BoardKind, Placement, board_kinds, describe, placements
 
 LOG_ODDS = float(np.log(1000.0))
-"""Odds of a thousand to one decide between two assignments; below, the geometry leaves a tie."""
+"""Log odds of a thousand to one, below which two assignments are tied."""
 RESIDUAL_FLOOR_PX = 0.01
-"""No camera and no printed board is truer than this: smaller misfits decide nothing."""
+"""Lower bound of the residuals due to imperfect calibrations and boards."""
 
 
 def identify_pair(
@@ -43,27 +43,27 @@ def identify_pair(
     layout: Mapping[str, str] | None = None,
     angles: Sequence[MeasuredAngle] = (),
 ) -> PairIdentity:
-    """Return the boards of two images named and turned alike, and the relative pose that they imply.
+    """Return the boards of two images with consistent ids and orientations, and the relative pose of the cameras.
 
-    Raises InputError: no boards, unknown names in `layout`, one name for two detections of an image; DegenerateError:
-    no listed board is seen in both images.
+    Raises InputError: no boards, unknown ids in `layout`, one id for two detections of an image; DegenerateError: no
+    listed board is seen in both images.
 
     Parameters
     ----------
-    detections1, detections2 : what was found in either image; a board id that is given is kept.
-    boards : the boards that may be there.
-    camera1, camera2 : the calibrated cameras, in whose pixels the detections are.
-    layout : where boards that look alike hang, by board id: "left", "right", "floor", "ceiling" or "back" (see
-        `rigkit.identification.board_ids`, which also states the rule without it).
-    angles : between boards, as measured: where no layout does, they identify boards that look alike.
+    detections1, detections2 : of the two images; given board ids are kept.
+    boards : the boards that may be visible.
+    camera1, camera2 : the calibrated cameras of the two images.
+    layout : sides of boards that look alike, by board id: "left", "right", "floor", "ceiling" or "back" (see
+        `rigkit.identification.board_ids`, also for the rule without a layout).
+    angles : measured between boards; they identify boards that look alike and are not in the layout.
 
     Notes
     -----
-    With n boards in both images the joint fit takes 6 (n - 1) degrees of freedom from the free one, in which every
-    board has its own pose in every image. An assignment has to answer for the excess of chi2 over the free fit, noise
-    and an imperfect calibration alike. With an unknown scale of these errors the odds of two assignments are (excess_b
-    / excess_a) ** (3 (n - 1)): one board alone never decides, several do unless their arrangement is itself
-    symmetric. Ties within 1000 : 1 go to the smallest roll between the cameras, and are reported.
+    With n boards in both images the joint fit has 6 (n - 1) fewer parameters than the free fit, in which every board
+    has its own pose in every image. The excess of its chi2 is due to noise, calibration errors or a wrong assignment.
+    With an unknown scale of the errors the odds of two assignments are (excess_b / excess_a) ** (3 (n - 1)). One board
+    alone therefore never decides; several do, unless their arrangement is symmetric. Ties within 1000 : 1 are resolved
+    by the smallest roll between the cameras, and reported.
     """
     kinds = _checked_kinds(boards)
     views = (
@@ -108,7 +108,7 @@ def _nothing_shared(views: tuple[ImageObservations, ImageObservations], kinds: S
 
 
 def _roll_rad(assignment: Assignment) -> float:
-    """Return how far camera 2 is turned against camera 1 about the optical axis: the twist of the rotation about z."""
+    """Return the roll of camera 2 relative to camera 1: the twist of the rotation about z."""
     r = assignment.pose.cam2_from_cam1[:3, :3]
     return abs(float(np.arctan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1])))
 
@@ -146,7 +146,7 @@ def _tie_note(winner: Assignment, others: Sequence[Assignment]) -> str:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _MatchedBoard:
-    """A board of some kind: where it is, which detection shows it in image 1 and 2, and how that is placed."""
+    """A located board, the indices of its detections in image 1 and 2, and their placements."""
 
     located: LocatedBoard
     index: tuple[int | None, int | None]
@@ -156,9 +156,9 @@ class _MatchedBoard:
 def _identified_boards(
     winner: Assignment, views: tuple[ImageObservations, ImageObservations], kinds: Sequence[BoardKind]
 ) -> tuple[list[_MatchedBoard], list[tuple[int, int]]]:
-    """Return the boards of the winner, then those of one image only as far as they are listed, and what is left over.
+    """Return the boards of the winner and listed boards in one image only, and the other detections.
 
-    What is left over: (image 0 or 1, detection).
+    The other detections are (image 0 or 1, index).
     """
     out = []
     for match, pose in zip(winner.matches, winner.pose.cam1_from_board, strict=True):
@@ -198,9 +198,9 @@ def _result(
     layout: Mapping[str, str] | None,
     renamed: Mapping[str, str] | None = None,
 ) -> PairIdentity:
-    """Name and turn the winner's boards, refine with each board's own squares, and sum up.
+    """Return the winner's boards with ids and orientations, refined with each board's own squares.
 
-    `renamed` maps the ids that the rules of `assign_board_ids` give to those that the boards are to have.
+    `renamed` maps ids from `assign_board_ids` to the final ones.
     """
     seen, left_over = _identified_boards(winner, views, kinds)
     names, notes = assign_board_ids([s.located for s in seen], kinds, layout)
@@ -226,6 +226,7 @@ def _result(
         start[board_id] = pose.cam1_from_board[k]
     corners = np.array([[len(d[i].grid) for d in detections] for i in both])
     contradicting = [s for s in tied if s.differs_from(winner)]
+    ties = [_tie_note(winner, contradicting)] if contradicting else []
     lost = [_why_left_over(v, views[v], n) for v, n in left_over]
     ordered = [[*both, *(b.board_id for b in boards if b.board_id in d and b.board_id not in both)] for d in detections]
     return PairIdentity(
@@ -235,14 +236,8 @@ def _result(
         cam1_from_board={i: Rigid3.from_matrix(m) for i, m in start.items()},
         residual_px=float(np.sqrt(pose.squared_px.sum() / corners.sum())),
         ambiguous=bool(contradicting),
-        missing=_missing(boards, detections, both),
-        notes=(
-            *views[0].notes,
-            *views[1].notes,
-            *notes,
-            *lost,
-            *([_tie_note(winner, contradicting)] if contradicting else []),
-        ),
+        missing=_missing(boards, detections),
+        notes=(*views[0].notes, *views[1].notes, *notes, *lost, *ties),
     )
 
 
@@ -254,19 +249,13 @@ def _refined(
     boards: Mapping[str, Board],
     views: tuple[ImageObservations, ImageObservations],
 ) -> JointPose:
-    observations = [
+    observations1, observations2 = (
         [BoardObservation.of(view.camera, d[i].pixels, d[i].sigma_px, i) for i in both]
         for view, d in zip(views, detections, strict=True)
-    ]
-    points = [[boards[i].points(d[i].grid) for i in both] for d in detections]
-    return refine_joint(
-        cam2_from_cam1,
-        np.stack([cam1_from_board[i] for i in both]),
-        observations[0],
-        points[0],
-        observations[1],
-        points[1],
     )
+    points1, points2 = ([boards[i].points(d[i].grid) for i in both] for d in detections)
+    start = np.stack([cam1_from_board[i] for i in both])
+    return refine_joint(cam2_from_cam1, start, observations1, points1, observations2, points2)
 
 
 def _why_left_over(image: int, view: ImageObservations, index: int) -> str:
@@ -279,18 +268,12 @@ def _why_left_over(image: int, view: ImageObservations, index: int) -> str:
 def _missing(
     boards: Sequence[Board],
     detections: tuple[Mapping[str, BoardDetection], Mapping[str, BoardDetection]],
-    both: Sequence[str],
 ) -> dict[str, str]:
+    """Return why boards are not in both images, by board id."""
     out = {}
     for board in boards:
-        i = board.board_id
-        if i in both:
-            continue
-        size = f"{board.columns}x{board.rows} corners"
-        if i in detections[0]:
-            out[i] = f"{size}: seen in image 1 only"
-        elif i in detections[1]:
-            out[i] = f"{size}: seen in image 2 only"
-        else:
-            out[i] = f"{size}: not seen in either image"
+        seen = [k for k, found in enumerate(detections, start=1) if board.board_id in found]
+        if len(seen) < 2:
+            where = f"seen in image {seen[0]} only" if seen else "not seen in either image"
+            out[board.board_id] = f"{board.columns}x{board.rows} corners: {where}"
     return out

@@ -1,4 +1,4 @@
-"""Poses of two cameras and of the boards that both see by least squares over all corners: a small bundle adjustment."""
+"""Bundle adjustment of the poses of two cameras and of the boards that both see."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ JOINT_DAMPING = Damping(start=1e-6, floor=1e-9, refused_floor=1e-4, ceiling=1e4)
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoardObservation:
-    """Corners of one board in one image, ready for residuals in pixels.
+    """Corners of one board in one image, as rays.
 
     Attributes
     ----------
     rays : (N, 3) unit.
-    bases : (N, 2, 3) pseudo-inverse of d ray / d pixel: turns an offset of the ray into one of the pixel.
+    bases : (N, 2, 3) pseudo-inverse of d ray / d pixel, which maps an offset of the ray to one of the pixel.
     sigma_px : (N,)
     """
 
@@ -36,7 +36,7 @@ class BoardObservation:
 
     @classmethod
     def of(cls, camera: Camera, pixels: Pixels, sigma_px: FloatArray, where: str) -> BoardObservation:
-        """Build from pixels; raises InputError, naming `where`, where a pixel has no ray."""
+        """Build from pixels; raises InputError, with `where` in its message, if a pixel has no ray."""
         rays, seen = camera.unproject(pixels)
         if not seen.all():
             lost = int((~seen).sum())
@@ -52,8 +52,8 @@ class JointPose:
     ----------
     cam2_from_cam1 : (4, 4)
     cam1_from_board : (B, 4, 4)
-    squared_px : (B, 2) sum over corners of the squared distance, board by board, in image 1 and 2.
-    chi2 : (B, 2) the same in units of the corners' variances.
+    squared_px : (B, 2) sum of the corners' squared residuals, px^2, per board in image 1 and 2.
+    chi2 : (B, 2) the same over the corners' variances.
     """
 
     cam2_from_cam1: FloatArray
@@ -69,8 +69,8 @@ class BoardCorners:
     Attributes
     ----------
     rays : (N, 3) unit.
-    bases : (N, 2, 3) rows perpendicular to the rays that make residuals in sigmas.
-    points, board : (N, 3) mm on their boards, and (N,) which board.
+    bases : (N, 2, 3) rows perpendicular to the rays, scaled for residuals in sigmas.
+    points, board : (N, 3) mm in the frame of the board, and (N,) index of the board.
     sigma_px : (N,)
     """
 
@@ -82,7 +82,7 @@ class BoardCorners:
 
     @classmethod
     def stack(cls, observations: Sequence[BoardObservation], points: Sequence[Points]) -> BoardCorners:
-        """Return the corners of boards as an image shows them, board after board."""
+        """Concatenate the corners of the boards of one image."""
         sigma = np.concatenate([s.sigma_px for s in observations])
         bases = np.concatenate([s.bases for s in observations]) / sigma[:, None, None]
         board = np.repeat(np.arange(len(observations)), [len(p) for p in points])
@@ -99,14 +99,14 @@ def refine_joint(
     *,
     tolerance: float = 1e-9,
 ) -> JointPose:
-    """Return relative pose and board poses that minimise the whitened distances of all corners in both images.
+    """Return relative pose and board poses that minimise the whitened residuals of all corners in both images.
 
     Parameters
     ----------
-    cam2_from_cam1, cam1_from_board : (4, 4) and (B, 4, 4) where to start.
-    observations1, observations2 : B boards as either image sees them.
-    points1, points2 : their corners in the frame of their board, mm; the two images need not see the same ones.
-    tolerance : stop when a step gains less than this part of the cost.
+    cam2_from_cam1, cam1_from_board : (4, 4) and (B, 4, 4) initial poses.
+    observations1, observations2 : of B boards in image 1 and 2.
+    points1, points2 : their corners in the frame of the board, mm; the images may show different corners.
+    tolerance : relative decrease of the cost below which the minimisation stops.
     """
     images = BoardCorners.stack(observations1, points1), BoardCorners.stack(observations2, points2)
 
@@ -131,7 +131,7 @@ def refine_joint(
 
 
 def moved_poses(pose: FloatArray, step: FloatArray) -> FloatArray:
-    """Return poses (..., 4, 4) changed by (w, v): R' = exp([w]x) R, t' = t + v."""
+    """Return poses (..., 4, 4) updated by (w, v): R' = exp([w]x) R, t' = t + v."""
     out = pose.copy()
     out[..., :3, :3] = exp_so3(step[..., :3]) @ pose[..., :3, :3]
     out[..., :3, 3] += step[..., 3:]
@@ -144,9 +144,9 @@ def joint_residuals(
     boards: FloatArray,
     log_sizes: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return whitened residuals of image 1, then 2, (2N,), and their derivatives by the motion, then the boards.
+    """Return whitened residuals of image 1 and 2, (2N,), and their derivatives by the motion and the board poses.
 
-    With `log_sizes` (K,) of the boards, their true sizes over the declared ones, come the derivatives by these.
+    With `log_sizes` (K,), logarithms of the boards' true over declared sizes, the derivatives by these follow.
     """
     count, residuals, jacobians = len(boards), [], []
     for k, image in enumerate(images):

@@ -1,4 +1,4 @@
-"""What identifying the boards of a pair of images found."""
+"""Result of identifying the boards of a pair of images."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from rigkit.geometry.rigid3 import Rigid3
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PairIdentity:
-    """Boards of two images, named and turned so that one physical corner has one grid index in both.
+    """Boards of two images, with ids and orientations such that a corner has the same grid index in both.
 
     Attributes
     ----------
-    detections1, detections2 : the boards of either image that are known; those seen in both come first, in the order
-        of the boards listed, the same board at the same place in both; then those seen in that image only.
-    cam2_from_cam1 : relative pose, metric, refined over all corners of the boards seen in both images.
-    cam1_from_board : pose of every named board, from both images where both see it.
-    residual_px : rms distance (2-D per corner, both images) of the corners from the rigid scene of the winner.
-    ambiguous : whether geometry alone cannot tell the winner from another assignment; the one with the smallest roll
-        between the cameras was then taken, and `notes` says so.
+    detections1, detections2 : the identified boards of each image: first those seen in both, in the same order, that of
+        the boards listed; then those seen in that image only.
+    cam2_from_cam1 : metric relative pose, refined over all corners of the boards seen in both images.
+    cam1_from_board : pose of every identified board, from both images if both see it.
+    residual_px : rms reprojection error (2-D per corner, both images).
+    ambiguous : whether geometry alone does not distinguish the result from another assignment; it is then the one with
+        the smallest roll between the cameras, and `notes` says so.
     missing : why a listed board is not in both lists, by board id.
-    notes : what was assumed or left out, in words.
+    notes : assumptions, and detections or corners that were left out, in words.
     """
 
     detections1: tuple[BoardDetection, ...]

@@ -1,7 +1,7 @@
-"""Which detection may be which board, in which position: what a single image leaves open.
+"""Possible boards of a detection, and its possible positions on them.
 
-A placement takes the grid of a detection to the grid of a board: some quarter turns, then a shift. Boards whose grids
-and squares are equal, as listed or turned by 90 degrees, form one kind: nothing but geometry tells them apart.
+A placement maps the grid of a detection to the grid of a board: quarter turns, then a shift. Boards with equal grids
+and squares, as listed or rotated by 90 degrees, form one kind: only geometry distinguishes them.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from rigkit.core.detections import BoardDetection, grid_turned
 from rigkit.core.patterns.base import Pattern
 
 PLACE_ROUNDING = 1e-6
-"""Positions in squares that differ by less differ by rounding."""
+"""Largest difference of positions in squares that is rounding."""
 SAME_SQUARE_REL = 0.03
-"""Squares that differ by less look alike."""
+"""Largest relative difference of the squares of boards that look alike."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoardKind:
-    """Boards that look alike. The first one lends its frame."""
+    """Boards that look alike; poses refer to the frame of the first one."""
 
     boards: tuple[Board, ...]
 
@@ -103,10 +103,10 @@ def _alike(a: Board, b: Board) -> bool:
 
 
 def possible_kinds(detections: Sequence[BoardDetection], kinds: Sequence[BoardKind]) -> list[list[int]]:
-    """Return for each detection of one image the kinds that it may be (indices into `kinds`; none: not listed).
+    """Return the possible kinds (indices into `kinds`) of each detection of one image; none for a board not listed.
 
-    A name settles the kind. A whole grid is what its size says, unless more grids of that size were found than there
-    are boards: then each may also be part of a larger board, as any smaller grid may.
+    A board id determines the kind. A grid of the size of a kind is of that kind; if there are more such grids than
+    boards, each may also be a part of a larger board, as any smaller grid.
     """
     named = {board_id: k for k, kind in enumerate(kinds) for board_id in kind.ids}
     out: list[list[int]] = []
@@ -115,7 +115,7 @@ def possible_kinds(detections: Sequence[BoardDetection], kinds: Sequence[BoardKi
         if d.board_id in named:
             out.append([named[d.board_id]])
             continue
-        # A board with marks is known by them, that is by name, or not at all.
+        # Boards with markers are identified by these only.
         plain = [k for k, kind in enumerate(kinds) if not kind.board.identified]
         whole = [k for k in plain if tuple(sorted(kinds[k].board.size)) == size]
         crowded = sizes.count(size) > sum(len(kinds[k].boards) for k in whole)
@@ -125,11 +125,10 @@ def possible_kinds(detections: Sequence[BoardDetection], kinds: Sequence[BoardKi
 
 
 def placements(detection: BoardDetection, kind: BoardKind) -> list[Placement]:
-    """Return the ways to put a detection onto a board of its kind, most likely first; none where it does not fit.
+    """Return the possible placements of a detection on a board of a kind, most likely first; empty if it does not fit.
 
-    Where a board looks the same in no other way (a chessboard whose columns + rows is odd) the detector's convention
-    leaves one way to place a whole grid; a square grid may have been turned by 90 degrees against the convention, which
-    comes last.
+    A whole grid of a board without rotational symmetry (a chessboard with odd columns + rows) has one placement, by
+    the detector's convention. Of a square grid rotations by 90 degrees against the convention come last.
     """
     columns, rows = kind.board.size
     if kind.board.identified:
@@ -148,8 +147,8 @@ def placements(detection: BoardDetection, kind: BoardKind) -> list[Placement]:
 
 
 def _same_form(detection: BoardDetection, placement: Placement, pattern: Pattern) -> bool:
-    """Say whether corners stand to each other on the board as they do on the grid of the detection, counted from a
-    corner of its own: staggered rows do not after every shift and turn."""
+    """Return whether the corners have the same relative positions on the board as on the detection's own grid; with
+    staggered rows not every placement preserves them."""
     own = pattern.positions(detection.grid.astype(np.float64))
     there = pattern.positions(placement.grid_of(detection).astype(np.float64))
     for _ in range(placement.quarter_turns):
@@ -158,6 +157,6 @@ def _same_form(detection: BoardDetection, placement: Placement, pattern: Pattern
 
 
 def describe(detection: BoardDetection) -> str:
-    """Return words by which a person finds a detection in the image."""
+    """Return a description of a detection by its size and position."""
     u, v = detection.pixels.mean(axis=0)
     return f"the {detection.columns}x{detection.rows} grid round ({u:.0f}, {v:.0f})"

@@ -1,7 +1,7 @@
-"""Which board's squares were declared of another size, where a pair's boards do not all fit together as listed.
+"""Finds boards whose squares were declared with a wrong size.
 
-Identifying boards gives up one whose squares are off by a tenth: it fits nowhere beside the others. Those others alone
-give the pose of the cameras, and a board that both images show then has one unknown left, its size.
+A board whose squares are wrong by a tenth does not fit the others and is not identified. The others determine the
+relative pose of the cameras, and the scale of a board that both images show is then the only unknown.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ class FittingSquares:
 
     Attributes
     ----------
-    boards : those that it may be: they were declared alike.
-    factor : by which its squares would have to grow.
-    where : words by which a person finds it in image 1.
+    boards : those it may be, which were declared alike.
+    factor : true over declared size of its squares.
+    where : description of its detection in image 1.
     """
 
     boards: tuple[Board, ...]
@@ -45,10 +45,10 @@ def fitting_squares(
     camera1: Camera,
     camera2: Camera,
 ) -> tuple[FittingSquares, ...]:
-    """Return the boards that fit all others of a pair with squares of another size; arguments as of `identify_pair`.
+    """Return the boards that fit all others of a pair with squares of another size; arguments as in `identify_pair`.
 
-    Of two boards either may be the wrong one. Nothing is returned where the others do not fit by themselves, or what
-    else the images show fits at no size, or at about the declared one.
+    Of two boards either may be the wrong one. The result is empty if the others do not fit each other, or if the
+    remaining detections fit at no size, or at about the declared one.
     """
     kinds = board_kinds(boards)
     view1 = ImageObservations.of(detections1, kinds, camera1, "image 1")
@@ -62,7 +62,7 @@ def fitting_squares(
             for match in free
         ]
         off, factor, first = min(sized, default=(np.inf, 1.0, 0))
-        # Sizes that look alike are no reason why a board was given up.
+        # A difference within the tolerance of one kind does not explain why a board was not identified.
         if off <= 1.0 and abs(factor - 1.0) > SAME_SQUARE_REL:
             out.append(FittingSquares(kind.boards, factor, describe(view1.detections[first])))
     return tuple(out)
@@ -76,7 +76,7 @@ def _poses_by_others(
     kinds: Sequence[BoardKind],
 ) -> Iterator[tuple[FloatArray, list[BoardMatch]]]:
     """Yield each cam2_from_cam1 (4, 4) at which all boards but one of kind `k` fit, with the matches of that kind among
-    the detections that are left: two boards may fit in several ways, and the third one tells."""
+    the remaining detections."""
     one_less = [BoardKind(kind.boards[:-1] or kind.boards) if j == k else kind for j, kind in enumerate(kinds)]
     of_others = [match for match in matches if match.kind != k or len(kinds[k].boards) > 1]
     if not of_others:
@@ -95,10 +95,10 @@ def _poses_by_others(
 def _sized(
     match: BoardMatch, view2: ImageObservations, board: Board, cam2_from_cam1: FloatArray
 ) -> tuple[float, float]:
-    """Return by how many gates (rms) image 2 contradicts a board that image 1 places, at its best size, and the factor
-    of that size.
+    """Return the rms residual in image 2, in units of the gate, of a board posed in image 1 at its best size, and the
+    factor f of that size.
 
-    A board of f times the size stands f times as far away, its corners at f X. Image 2 sees them along the rays r where
+    A board of f times the size is f times as far away, with corners at f X. Image 2 sees them along rays r with
     r x (f R X + t) = 0, which is linear in f.
     """
     observed = view2.observations[match.second]
