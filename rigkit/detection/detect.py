@@ -1,4 +1,4 @@
-"""Finding every board of an image: chessboards without being told a size, and any target that is listed."""
+"""Detection of all boards in an image: chessboards of unknown size, and any listed target."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rigkit.detection.targets.registry import FINDERS, check_searchable
 from rigkit.kernels.front import near_any
 
 SAME_CORNER_PX = 2.0
-"""Corners of two detections nearer than this are one corner."""
+"""Corners of two detections closer than this are the same corner."""
 
 
 def detect_boards(
@@ -31,31 +31,30 @@ def detect_boards(
     camera: Camera | None = None,
     quick: bool = False,
 ) -> tuple[BoardDetection, ...]:
-    """Find every board of `image`: chessboards of any size, or what is listed.
+    """Return all boards in `image`: chessboards of any size, or the listed boards.
 
     Parameters
     ----------
     image : (H, W) or (H, W, 3 or 4), uint8 or uint16 (or float 0..255), grey or RGB, or the mosaic of a colour camera.
-    boards : what may be in the image, if known. A grid of a board's size, either way round, is turned to its columns x
-        rows; a part of a board whose borders show where it lies gets its place in the board's grid, any other part
-        stays a grid of its own. A board is named by its marks, or where one single given board has that size and one
-        single detection fits it: whole, if others lack corners that would lie in the image. A grid of circles is named
-        where it cannot be the visible part of a larger board that the image's border cuts off.
-    min_corners : boards with fewer corners are not reported, but for whole ones of `boards`.
-    camera : the calibrated camera, if known: it shows which parts are of one board (`guided.rejoin`) and where
-        corners of known boards were missed, and fits all of them with windows and lines as it sees them
-        (`guided.guided`).
-    quick : points to a tenth of a pixel or so are enough: circles take half the time.
+    boards : the boards that may be in the image, if known. A grid with a board's size, or with columns and rows
+        swapped, is rotated to that board's columns x rows. A part of a board gets its position in the board's grid if
+        its borders determine it, else it remains a grid of its own. A board is identified by its markers, or if it is
+        the only listed board of its size and only one detection fits it, of several the only whole one. A grid of
+        circles is identified unless it may be the visible part of a larger board that the image border cuts off.
+    min_corners : smallest number of corners of a reported board, except whole ones of `boards`.
+    camera : the calibrated camera, if known. It joins the parts of a partly covered board (`guided.rejoin`), predicts
+        missed corners of known boards, and determines windows and line curvatures for their fit (`guided.guided`).
+    quick : an accuracy of about a tenth of a pixel is enough: circles take half the time.
 
     Returns
     -------
-    Detections by falling number of corners, then from top to bottom and left to right. Grids are right-handed; the
+    Detections by decreasing number of corners, then from top to bottom and left to right. Grids are right-handed; the
     first corner follows the convention of `rigkit.detection.lattice.origin`.
 
     Raises
     ------
     InputError
-        `image` is not an image of a supported type, or nothing looks for the pattern of one of `boards`.
+        `image` is not an image of a supported type, or there is no finder for the pattern of one of `boards`.
     """
     check_searchable(boards or ())
     stored = without_mosaic(grey_image(image))
@@ -63,14 +62,14 @@ def detect_boards(
     found: list[BoardDetection] = []
     for kind, finder in FINDERS.items():
         own = [board for board in search.boards if board.pattern.type == kind]
-        # Boards beside those listed cost nothing where chessboards were looked for anyway.
+        # Chessboards that are not listed are returned too if lattices were searched for anyway.
         if own or (kind == Chessboard.type and (search.has_lattices or not search.boards)):
             found += finder.find(search, own)
     sizes = search.chessboard_sizes
     if search.min_corners_seen < min_corners:
         found = [item for item in found if len(item.grid) >= min_corners or _whole(item, sizes)]
     ordered = sorted(found, key=_rank) if len(found) > 1 else found
-    # Grids of circles are named where they are placed, and not where a larger board may be meant.
+    # The finder of circles has identified its grids already.
     plain = [board for board in search.boards if board.pattern.type == Chessboard.type]
     return tuple(_with_ids(_without_repeated(ordered), plain, (stored.shape[1], stored.shape[0])))
 
@@ -85,9 +84,9 @@ def _rank(item: BoardDetection) -> tuple[int, float, float]:
 
 
 def _without_repeated(found: Sequence[BoardDetection]) -> list[BoardDetection]:
-    """Return those of `found`, the largest first, that are not for the most part corners of one before them.
+    """Return `found` (largest first) without detections most of whose corners belong to an earlier one.
 
-    A board that something lies across is found in parts; the largest, completed, has the corners of the others.
+    A partly covered board is found in parts; the largest part, once completed, contains the corners of the others.
     """
     if len(found) < 2:
         return list(found)
@@ -103,17 +102,16 @@ def _without_repeated(found: Sequence[BoardDetection]) -> list[BoardDetection]:
 
 
 def _cut_by_frame(item: BoardDetection, size_px: tuple[int, int]) -> bool:
-    """Return whether most of the corners that `item` lacks are not in the image, whose (width, height) is `size_px`."""
+    """Return whether most missing corners of `item` are outside the image, whose (width, height) is `size_px`."""
     lattice = item.lattice()
     missing = fit_cells(lattice, np.isnan(lattice[..., 0]), degree=1).pixels
     return 2 * int(np.count_nonzero(((missing < 0.0) | (missing > np.array(size_px) - 1.0)).any(axis=1))) > len(missing)
 
 
 def _with_ids(found: list[BoardDetection], boards: Sequence[Board], size_px: tuple[int, int]) -> list[BoardDetection]:
-    """Return `found` with the names of those boards that only one detection, and that only this board, can be.
+    """Return `found` with ids where the match of board and detection is unique.
 
-    A whole board is it rather than a grid that lacks corners within the image: a floor or a shirt has patches of any
-    size. One that the frame cuts may be a copy.
+    Whole grids take precedence over grids that lack corners within the image, which may be patches of a floor or shirt.
     """
     out = list(found)
     for board in boards:

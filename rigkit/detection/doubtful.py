@@ -1,11 +1,11 @@
-"""What is seen but not trusted: grids that the judgement of `rigkit.detection.checks.evidence` refuses, in words."""
+"""A message on grids that `rigkit.detection.checks.evidence` rejects, for images without a detected board."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import FloatArray, upper_median
+from rigkit.core.arrays import upper_median
 from rigkit.detection.checks.evidence import Evidence
 from rigkit.detection.lattices import Seen, candidates
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
@@ -15,48 +15,36 @@ from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.subpixel import refine
 
 MIN_DOUBTFUL_CORNERS = 20
-"""Chance makes smaller grids out of anything."""
+"""Corners of the smallest grid that is reported; smaller ones occur by chance."""
 
 MIN_DOUBTFUL_SCORE = -7.0
-"""Boards in the background with squares of under 6 px have scores down to -6.5; so have grids of dots, which are only
-said to be seen."""
+"""Smallest evidence score of a grid that is reported. Boards with squares of under 6 px have scores down to -6.5."""
 
 DOUBTFUL_SIGMA, DOUBTFUL_RESIDUAL, BLURRED_CELLS = 0.02, 0.15, 0.1
-"""What is named as the cause: a sigma, in squares, and a residual, relative to the contrast, that few boards exceed;
-the first comes from blur where that is as wide as this, in squares."""
+"""Sigma in squares and residual over contrast that few boards exceed, and the blur, in squares, that explains such a
+sigma: they decide which cause is reported."""
 
 
 def doubtful_grid(image: NDArray[np.generic]) -> str | None:
-    """Return what is said of the largest grid of `image` that may be a board but is not taken for one; None without.
-
-    For images in which no board was found.
-    """
+    """Return a message on the largest rejected grid of `image` that may be a board; None if there is none."""
     grey = without_bad_pixels(without_mosaic(grey_image(image)))
-    seen = [
-        item for item in refine(grey, candidates(Seen.of(grey), MIN_DOUBTFUL_CORNERS, lambda *_: True)) if _worth(item)
-    ]
+    fitted = refine(grey, candidates(Seen.of(grey), MIN_DOUBTFUL_CORNERS, lambda *_: True))
+    large = (item for item in fitted if item.lattice.count >= MIN_DOUBTFUL_CORNERS)
+    seen = [item for item in large if Evidence.of(item).score > MIN_DOUBTFUL_SCORE]
     if not seen:
         return None
     largest = max(seen, key=lambda item: item.lattice.count)
     columns, rows = largest.lattice.size
-    sigma_px = upper_median(_known(largest, largest.worst_sigma_px))
-    return f"a {columns}x{rows} grid is seen, corners uncertain by {sigma_px:.1g} px: {_cause(largest)}"
+    sigma_px = upper_median(largest.worst_sigma_px[largest.lattice.known])
+    return f"a {columns}x{rows} grid is seen, corners uncertain by {sigma_px:.1g} px: {_cause(largest, sigma_px)}"
 
 
-def _worth(item: RefinedLattice) -> bool:
-    return item.lattice.count >= MIN_DOUBTFUL_CORNERS and Evidence.of(item).score > MIN_DOUBTFUL_SCORE
-
-
-def _cause(item: RefinedLattice) -> str:
+def _cause(item: RefinedLattice, sigma_px: float) -> str:
     evidence = Evidence.of(item)
-    blur_px = upper_median(_known(item, item.blur_px))
-    cell_px = upper_median(_known(item, item.worst_sigma_px)) / max(evidence.sigma_cells * item.scatter, 1e-9)
+    blur_px = upper_median(item.blur_px[item.lattice.known])
+    cell_px = sigma_px / max(evidence.sigma_cells * item.scatter, 1e-9)
     if evidence.sigma_cells > DOUBTFUL_SIGMA or blur_px > BLURRED_CELLS * cell_px:
         return "blurred" if blur_px > BLURRED_CELLS * cell_px else "small or noisy"
     if evidence.excess_residual > DOUBTFUL_RESIDUAL:
         return "its edges are not those of squares"
     return "its corners do not lie in smooth rows"
-
-
-def _known(item: RefinedLattice, values: FloatArray) -> FloatArray:
-    return values[item.lattice.known]

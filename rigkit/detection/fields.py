@@ -1,9 +1,8 @@
-"""Interlaced pictures: even and odd lines are of two moments, and what moved between them is shifted in every second
-line.
+"""Interlaced images: even and odd lines are exposed at different times and show moving objects at different places.
 
-A line that lies where its neighbours lie is their mean, but for what curves from line to line, which has no sign that
-changes with every line. So the difference from that mean, with a sign that changes, is the shift between both fields
-times the slope along the line.
+Without a shift a line is the mean of its neighbours up to second differences, whose sign does not alternate with the
+lines. The part of the difference that alternates is therefore the shift between the fields times the slope along the
+line.
 """
 
 from __future__ import annotations
@@ -13,13 +12,12 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, Pixels
 
 FIELDS_MARGIN_PX = 6
-"""So far around the outermost corners lines are looked at."""
+"""Margin of the evaluated part of the image around the outermost corners."""
 
 
 def shift_between_fields(image: FloatArray, pixels: Pixels) -> float:
-    """Return by how many px odd lines of a grey image (H, W) are shifted to the right against even ones, where the
-    corners at `pixels` (N, 2) are; 0 where nothing is to be seen there. Of shifts wider than edges are blurred less is
-    told."""
+    """Return the shift, px, of odd lines of a grey image (H, W) to the right of even ones, around the corners `pixels`
+    (N, 2); 0 without contrast. Shifts larger than the blur of the edges are underestimated."""
     first = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - FIELDS_MARGIN_PX, 0)
     last = np.ceil(pixels.max(axis=0)).astype(int) + FIELDS_MARGIN_PX + 1
     part = np.asarray(image[first[1] : last[1], first[0] : last[0]], dtype=np.float64)

@@ -1,6 +1,5 @@
-"""Every lattice of corners in an image that may be a chessboard: loose corners, links, lattices, growth, the sub-pixel
-fit, and what is a board. No size need be known, no number of boards, no lens.
-"""
+"""Search for chessboards of unknown number and size: loose corners, links, lattices, growth, sub-pixel fit,
+evidence."""
 
 from __future__ import annotations
 
@@ -42,25 +41,25 @@ from rigkit.kernels.front import near_any
 IsPlausible = Callable[[GreyImage, Level, Lattice], bool]
 
 MIN_PART_CORNERS = 6
-"""Corners of the smallest part of a board that something lies across."""
+"""Corners of the smallest part of a partly covered board."""
 
 MIN_BOARD_CORNERS = 9
-"""Fewer than 3 x 3 corners are too often no board."""
+"""Corners of the smallest board, 3 x 3: smaller lattices are often something else."""
 
 Vouched = Callable[[GreyImage, Lattice], bool]
-"""Says whether marks in the squares of a lattice, on the image, make it a board whatever its corners say."""
+"""Returns whether markers in the squares of a lattice prove that it is a board."""
 
 SMEARED_CORNERS = 12
-"""From so many corners that only motion explains, an image without a board is searched once more with them."""
+"""Smallest number of corners with motion blur for which an image without a board is searched again with them."""
 
 SAME_PX = 4.0
-"""Corners of one board placed in two ways lie nearer than this, px: strong blur moves them so much at most."""
+"""Largest distance between the same corners fitted in the image and in a resampled part: the effect of strong blur."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sought:
-    """What is looked for: boards of `min_corners`; (columns, rows) of all that may be there, if known; and what makes a
-    lattice one of them beyond doubt."""
+    """The boards sought: smallest number of corners, (columns, rows) of all possible boards if known, and the test that
+    proves a lattice to be one of them."""
 
     min_corners: int
     sizes: Sequence[tuple[int, int]] = ()
@@ -74,12 +73,11 @@ def find_lattices(
     *,
     vouched: Vouched | None = None,
 ) -> list[RefinedLattice]:
-    """Return the lattices of all boards of `image`, refined, in no particular order and orientation.
+    """Return the refined lattices of all boards in `image`, in arbitrary order and orientation.
 
-    `sizes` : (columns, rows) of all boards that may be in it, if known.
-    `vouched` : given where some of them have markers in their squares, into which blur takes the edges, and whose ink
-    spoils the fit: lattices with edges aside of their corners (`has_edge_offset`) are then among those returned, and
-    those of which it is true, whatever the evidence of their corners.
+    `sizes` : (columns, rows) of all possible boards, if known.
+    `vouched` : for boards with markers in their squares, which affect edges and fit. Lattices with edge offsets
+    (`has_edge_offset`) are then not rejected, and those for which it is true are accepted regardless of their evidence.
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
@@ -98,7 +96,7 @@ def find_lattices(
     if _needs_second_search(seen, found, sizes):
         found = max(looked(seen.with_smeared()), found, key=_corners_of)
     for k in range(1, len(seen.levels)):
-        # The squares of clutter do meet.
+        # Coarser levels help only where squares do not meet at their corners; those of clutter do.
         if _whole(found, sizes) or plausible.rejected >= MAX_FAILED_GROWTHS:
             break
         coarser = seen.coarser(k)
@@ -112,7 +110,7 @@ def find_lattices(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Seen:
-    """An image in grey levels, the finest level of its pyramid, those that are looked at, and what is seen in them."""
+    """An image in grey levels, the finest level of its pyramid, the levels searched, and the corners found in them."""
 
     grey: GreyImage
     finest: Level
@@ -126,27 +124,25 @@ class Seen:
         return cls(grey, levels[0], levels, *find_corners(levels))
 
     def coarser(self, without: int) -> Seen | None:
-        """Return this as the coarser levels alone show it, `without` so many of the finest; None where that is hardly
-        anything.
+        """Return the corners of the coarser levels only, `without` the finest ones; None if there are too few.
 
-        Where bright squares run over into dark ones (too much light, thin print), or dark ones into bright ones (ink
-        that spreads), these do not meet. Near a corner, the borders of the quadrants lie aside of the lines, by an
-        angle that falls with the radius of the ring. On coarser levels, dots look like squares, too: what lattices are
-        is seen on the finest one.
+        With saturation or thin print bright squares merge at the corners, with spreading ink dark ones. The borders of
+        the quadrants are then off the lines, by an angle that decreases with the radius of the ring. Since dots look
+        like squares on coarser levels, lattices are tested on the finest one.
         """
         corners = each_once(self.saddles.by_level[without:])
-        return (
-            replace(self, levels=self.levels[without:], corners=corners) if len(corners) >= MIN_BOARD_CORNERS else None
-        )
+        if len(corners) < MIN_BOARD_CORNERS:
+            return None
+        return replace(self, levels=self.levels[without:], corners=corners)
 
     def with_smeared(self) -> Seen:
-        """Return this with what is a corner only if something moved among the corners."""
+        """Return this with the corners that only motion blur explains added."""
         return replace(self, corners=joined([self.corners, self.saddles.smeared]))
 
 
 @dataclass(slots=True)
 class _Counting:
-    """Says which lattices are promising, and counts those that are not, or turn out to be no boards."""
+    """Returns whether lattices are plausible, and counts those that are not, or are rejected later."""
 
     plausible: IsPlausible
     rejected: int = 0
@@ -162,14 +158,14 @@ def _corners_of(found: Sequence[RefinedLattice]) -> int:
 
 
 def _whole(found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
-    """Return whether one of `found` has all corners of a grid of one of `sizes`, or of any if none are known."""
+    """Return whether one of `found` is complete and has one of `sizes`, or any size if none is known."""
     whole = {frozenset(item.lattice.size) for item in found if item.lattice.known.all()}
     return not whole.isdisjoint(map(frozenset, sizes)) if sizes else bool(whole)
 
 
 def _needs_second_search(seen: Seen, found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
-    """Return whether corners that only motion explains may show more than was `found`: no whole board of `sizes`, or
-    without these none at all, or one that moved."""
+    """Return whether a search with motion-blurred corners may find more: no whole board of `sizes` was `found`, or no
+    board at all without `sizes`, or a board with uneven blur."""
     if sizes and _whole(found, sizes):
         return False
     if any(item.picture is not None for item in found):
@@ -178,10 +174,7 @@ def _needs_second_search(seen: Seen, found: Sequence[RefinedLattice], sizes: Seq
 
 
 def candidates(seen: Seen, min_corners: int, plausible: IsPlausible) -> list[Lattice]:
-    """Return the lattices of an image that may be boards, before the sub-pixel fit.
-
-    `plausible` says of a lattice, on the image and the finest level of its pyramid, whether it is worth growing.
-    """
+    """Return the lattices of an image that may be boards, before the sub-pixel fit; only `plausible` ones are grown."""
     size_px = (seen.grey.shape[1], seen.grey.shape[0])
     level = seen.levels[0]
     lattices = build_lattices(seen.corners, find_links(seen.corners, level))
@@ -195,14 +188,14 @@ def candidates(seen: Seen, min_corners: int, plausible: IsPlausible) -> list[Lat
 
 
 def fitted(grey: GreyImage, boards: Sequence[Lattice], sought: Sought) -> list[RefinedLattice]:
-    """Return those of `boards` that the fit confirms, refined, without what belongs to others that they touch.
+    """Return those of `boards` that the fit confirms, refined, without corners of boards that they touch.
 
-    Those whose blur is uneven are fitted where it is made even (`RefinedLattice.picture`).
+    Boards with uneven blur are fitted in a resampled part of the image with even blur (`RefinedLattice.picture`).
     """
     refined = refine(grey, boards, _evidence_score(grey, sought))
     found = _fitted(grey, boards, refined, sought)
     if any(known_median(item.blur_px) <= LOOKED_AT_PX for item in found):
-        # What is blurred beside a board that is sharp lies in the background.
+        # Blurred lattices in an image with a sharp board are background.
         return found
     for board, item in zip(boards, refined, strict=True):
         picture = with_uniform_blur(grey, board, item)
@@ -216,7 +209,7 @@ def fitted(grey: GreyImage, boards: Sequence[Lattice], sought: Sought) -> list[R
 
 
 def _evidence_score(grey: GreyImage, sought: Sought) -> EvidenceScore:
-    """Return the score that the evidence for a lattice is judged by, beside those that are placed (`_confirmed`)."""
+    """Return the function that scores the evidence for a lattice, given the lattices already fitted (`_confirmed`)."""
     sizes = sought.sizes
     every = {frozenset({(c, r), (r, c)}) for c, r in sizes}
 
@@ -224,7 +217,7 @@ def _evidence_score(grey: GreyImage, sought: Sought) -> EvidenceScore:
         own, (columns, rows) = Evidence.of(item).score, item.lattice.size
         if own <= 0.0 and sought.vouched is not None and sought.vouched(grey, item.lattice):
             return np.inf
-        # Rows and columns may be too many for a board (`known_part`), but no more are found.
+        # The fit removes additional rows and columns (`known_part`), but adds none.
         if own > 0.0 or not any(columns >= c and rows >= r for both in every for c, r in both):
             return own
         sure = sum(trustworthy(after, before.count, sought.min_corners) for before, after in placed)
@@ -234,7 +227,7 @@ def _evidence_score(grey: GreyImage, sought: Sought) -> EvidenceScore:
 
 
 def _with_better(found: list[RefinedLattice], others: Sequence[RefinedLattice]) -> list[RefinedLattice]:
-    """Return `found` with `others` instead of those that are mostly of the same corners, and have no more of them."""
+    """Return `found` with `others` in place of lattices with mostly the same corners, and no more in total."""
     for item in others:
         mine = item.lattice.pixels[item.lattice.known]
         same = [
@@ -251,7 +244,7 @@ def _with_better(found: list[RefinedLattice], others: Sequence[RefinedLattice]) 
 def _fitted(
     grey: GreyImage, boards: Sequence[Lattice], refined: Sequence[RefinedLattice], sought: Sought
 ) -> list[RefinedLattice]:
-    """Return those of `refined` (what the fit left of `boards`) that are boards, each by itself."""
+    """Return those of `refined` (the fits of `boards`) that are boards, split where they touch."""
     size_px = (grey.shape[1], grey.shape[0])
     out = []
     for item in _confirmed(grey, boards, refined, sought):
@@ -264,7 +257,7 @@ def _fitted(
         if len(parts) == 1:
             out += [_scattered(placed_together(grey, own))] if large(own.lattice, sought.min_corners) else []
             continue
-        # The edges on the other side of a discontinuity had a say in these corners.
+        # The fits of these corners used edges on the other side of the discontinuity: fit them again.
         alone = [part.lattice.trimmed() for part in parts]
         own_parts = [part for part in alone if large(part, sought.min_corners)]
         out += _fitted(grey, own_parts, refine(grey, own_parts, _evidence_score(grey, sought)), sought)
@@ -272,7 +265,8 @@ def _fitted(
 
 
 def _scattered(item: RefinedLattice) -> RefinedLattice:
-    """Return `item` with the sigmas of a small board raised to what its corners scatter (`scatter.small_scatter`)."""
+    """Return `item` with the sigmas of a small board raised for the scatter of its corners
+    (`scatter.small_scatter`)."""
     raised = small_scatter(item.lattice.pixels, item.sigma_px)
     return item if raised == 1.0 else replace(item, sigma_px=item.sigma_px * raised, scatter=item.scatter * raised)
 
@@ -280,11 +274,11 @@ def _scattered(item: RefinedLattice) -> RefinedLattice:
 def _confirmed(
     grey: GreyImage, boards: Sequence[Lattice], refined: Sequence[RefinedLattice], sought: Sought
 ) -> list[RefinedLattice]:
-    """Return those of `refined` (what the fit left of `boards`) that are boards.
+    """Return those of `refined` (the fits of `boards`) that are boards.
 
-    Where fewer are seen than may be there, lattices with the rows and columns of those that may be there are believed
-    more if they are seen to end there; their corners may be uncertain, and their sigmas say so. Beside boards that are
-    sure such a lattice would be something else: a board in the background, or a mirror image.
+    If there are fewer than listed boards, lattices of the listed sizes whose borders are confirmed need less evidence;
+    the sigmas of their corners account for their uncertainty. In addition to all listed boards such a lattice would be
+    something else: a board in the background, or a mirror image.
     """
     every, sizes, min_corners = list(zip(boards, refined, strict=True)), sought.sizes, sought.min_corners
     sure = [
@@ -307,36 +301,36 @@ def _confirmed(
 
 
 def _marked(grey: GreyImage, before: Lattice, after: RefinedLattice, sought: Sought) -> bool:
-    """Return whether what the fit left of a lattice is a board because marks in its squares say so."""
+    """Return whether markers in the squares of a fitted lattice prove that it is a board."""
     if sought.vouched is None or not trustworthy(after, before.count, sought.min_corners, np.inf):
         return False
     return sought.vouched(grey, after.lattice)
 
 
 def _of_size(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
-    """Return whether `lattice` has the rows and columns of one of `sizes`, and corners enough for that to mean much."""
+    """Return whether `lattice` has one of `sizes`, and enough corners for that to be evidence."""
     return lattice.count >= MIN_EXPECTED_CORNERS and frozenset(lattice.size) in {frozenset(size) for size in sizes}
 
 
 def _is_plausible(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
-    """Return whether `lattice` may be a board, as far as a quick look at its edges and a sample of it tell."""
+    """Return whether `lattice` may be a board, by the offsets of its edges and a fit of a sample."""
     return not (lattice.solid and has_edge_offset(lattice, finest)) and _sampled(grey, finest, lattice)
 
 
 def _or_vouched(vouched: Vouched) -> IsPlausible:
-    """Return the judgement of lattices that may have markers in their squares."""
+    """Return the plausibility test of lattices that may have markers in their squares."""
     return lambda grey, finest, lattice: _sampled(grey, finest, lattice) or vouched(grey, lattice)
 
 
 def _sampled(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
-    """Return whether `lattice` may be a board, as far as a sample of it tells."""
+    """Return whether `lattice` may be a board, by a fit of a sample of its corners."""
     sample = sample_of(lattice)
     if sample is None:
         return True
     (refined,) = refine(grey, [sample], _evidence_score(grey, Sought(0)))
     if trustworthy(refined, sample.count, 0):
         return True
-    # Clutter leaves few corners.
+    # Of clutter the fit leaves few corners.
     picture = with_uniform_blur(grey, sample, refined) if refined.lattice.count >= MIN_BOARD_CORNERS else None
     if picture is None:
         return False

@@ -1,1 +1,1 @@
-"""What speaks against a grid being a board: patterns, discontinuities, borders."""
+"""Tests of lattices: evidence for a board, discontinuities, borders."""

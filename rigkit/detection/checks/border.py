@@ -1,10 +1,10 @@
-"""Where a part of a board of known size lies in the board: which of its sides are the board's own border.
+"""The position of a part of a board of known size, from which of its sides are the border of the board.
 
-Beyond the last corners of a board there is one more square, and then white paper, or what the board is glued to. One
-and a quarter squares beyond the last row seen there are three cases. Squares go on alternating: the board goes on, and
-what follows was missed, or is out of the image. It is equally bright all along, and the squares end on one line, where
-they should: that is a border. Else nothing is known. Borders and the known size together may leave one place for the
-part, or several: then it remains a part.
+Beyond the last corners of a board there is one more square, and then the white margin or the background. The image is
+evaluated 1.2 squares beyond the last row. If squares continue to alternate, the board continues, and further corners
+were missed or are outside the image. If the brightness is uniform and the squares end on one line at the expected
+distance, the side is a border. Otherwise the side is unknown. If borders and size allow several positions, the part
+remains a part.
 """
 
 from __future__ import annotations
@@ -22,74 +22,74 @@ from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.subpixel.refined import RefinedLattice
 
 MIN_CELL_PX = 6.0
-"""In smaller squares a quarter of one is not told from its edges."""
+"""Smallest side of a square that is evaluated: within smaller ones blur hides the brightness."""
 
 MIN_SUPPORT, MAX_BORDER_GAIN = 6, 12.0
-"""Corners behind a prediction, and its standard deviation for corners of standard deviation 1: of a few hundredths of a
-pixel, that is less than a tenth of a square."""
+"""Smallest number of corners of a prediction, and its largest standard deviation for corners of standard deviation 1:
+for a few hundredths of a pixel this is less than a tenth of a square."""
 
 WITHIN = np.array([-0.2, 0.0, 0.2])
-"""Where the brightness of a square is read, from its middle along the row, in squares."""
+"""Positions along the row at which a square is sampled, from its middle, in squares."""
 
 SQUARE = np.array([0.35, 0.5, 0.65])
 BEYOND = np.array([1.14, 1.2, 1.26])
-"""Where the last square and the paper beyond it are read, in squares from the last corners outwards: near enough for
-narrow margins, far enough for blur."""
+"""Distances from the last corners at which the last square and the paper beyond it are sampled, in squares: they suit
+narrow margins and blur."""
 
 PROFILE = np.arange(0.5, 1.3001, 0.02)
-"""Where the end of the dark squares is looked for."""
+"""Distances from the last corners, in squares, between which the end of the squares is sought."""
 
 ENDS_WITHIN = 0.13
-"""The squares end this near to where the next corners would be, in squares: some boards are cut a little short."""
+"""Largest distance between the end of the squares and the expected next corners, in squares: some boards are cut."""
 
 STRAIGHT, STRAIGHT_PX = 0.07, 0.7
-"""They end this near to one line, in squares or (the larger) in px."""
+"""Largest distance of the squares' ends from one line, in squares or (the larger) in px."""
 
 EDGE_WIDTH = 0.12
-"""Half the width of the edge at their end, in squares: noise may cross its middle more than once."""
+"""Half width of the edge at the end of the squares, in squares: within it noise may cross the threshold repeatedly."""
 
 WHITE = (0.8, 1.25)
-"""Brightness of a white margin, 0 for the dark and 1 for the white squares beside it: it is the same paper."""
+"""Range of the brightness of a white margin, where 0 and 1 are the dark and white squares beside it."""
 
 EVEN = 0.2
-"""What lies beyond a border is so even in brightness, on the same scale."""
+"""Largest deviation of the brightness beyond a border from its median, on the same scale."""
 
 SAME_LEVEL = 0.15
-"""Two borders of one board with this difference in brightness beyond, on the same scale, bear each other out: where
-there is no white margin, a sheet that lies along the squares looks like a border, but not like another one."""
+"""Largest difference in brightness beyond two borders, on the same scale, that confirm each other without a white
+margin: an object along the squares looks like a border, but rarely like another one."""
 
 MIN_STEP = 0.3
-"""Steps of brightness from which the end of a square is looked for, on the same scale."""
+"""Smallest step of brightness at the end of a square that is evaluated, on the same scale."""
 
 MAX_NEXT_DARK = 0.35
-"""The next dark square is darker than this, on the same scale."""
+"""Largest brightness of the next dark square, on the same scale."""
 
 MIN_OUTER_CONTRAST = 0.5
-"""Contrast of the outer squares relative to that of the corners: squares that something covers say nothing."""
+"""Smallest contrast of the outer squares over that of the corners: covered squares are not evaluated."""
 
 MIN_OF_KIND = 2
-"""Dark and white squares that must have been seen to end, or to go on, each."""
+"""Smallest number of dark and of white squares that are evaluated."""
 
 AGREEING_SQUARES = 0.8
-"""Part of the squares seen that must say the same."""
+"""Share of the squares that must agree."""
 
 
 NEXT_SQUARE = np.array([1.35, 1.5, 1.65])
-"""Where the squares would be that follow the last ones of a board, had it more, in squares from the last corners."""
+"""Distances from the last corners at which further squares are sampled, in squares."""
 
 MIN_NEXT_SUPPORT = 4
-"""Corners behind a prediction of where they would be: it need not be better than a part of a square."""
+"""Smallest number of corners of a prediction of further squares, whose error may be a part of a square."""
 
 MAX_ALTERNATION, MIN_SIDES_SEEN = 0.5, 2
-"""They alternate by less than this part of the contrast of the last ones beyond each side of a board that is seen, and
-so many sides are. Of 43 boards in REAL images, blurred by 6 to 8 px or moved by 10 to 20 px so that their size decides
-(`rigkit.detection.checks.evidence.OF_EXPECTED_SIZE`), it is 0.34 at most and three sides are seen; of 36 patches of 20
-corners and more in 1500 RENDERED cloths, blurred and folded, three have two such sides, one of 0.83 at least each:
-patches of a pattern have no straight sides."""
+"""Largest alternation beyond the sides of a board, over the contrast of its last squares, and the smallest number of
+sides for which it is known. For 43 boards in REAL images, blurred by 6 to 8 px or moved by 10 to 20 px so that their
+size decides (`rigkit.detection.checks.evidence.OF_EXPECTED_SIZE`), it is 0.34 at most, on three sides or more. Of 36
+patches of 20 corners and more in 1500 RENDERED cloths, blurred and folded, three have two such sides, one of them with
+0.83 or more in each case."""
 
 
 class Side(Enum):
-    """What lies beyond one side of a lattice."""
+    """The image beyond one side of a lattice."""
 
     BORDER = "border"
     GOES_ON = "goes on"
@@ -98,17 +98,17 @@ class Side(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Beyond:
-    """What lies beyond one side of a lattice, and how bright it is: 0 as the dark squares, 1 as the white ones."""
+    """The image beyond one side of a lattice, and its brightness: 0 as the dark squares, 1 as the white ones."""
 
     side: Side
     level: float = np.nan
 
     def agrees(self, missing: int) -> bool:
-        """Return whether `missing` rows beyond the side can be what is seen there."""
+        """Return whether the side is consistent with `missing` further rows."""
         return {Side.BORDER: missing == 0, Side.GOES_ON: missing > 0, Side.UNKNOWN: True}[self.side]
 
     def proven(self, every: Sequence[Beyond]) -> bool:
-        """Return whether the side is a border beyond doubt, the others seen as well: `every`, itself included."""
+        """Return whether the side is certainly a border, given `every` side of the board."""
         if self.side is not Side.BORDER:
             return False
         alike = sum(other.side is Side.BORDER and abs(other.level - self.level) < SAME_LEVEL for other in every)
@@ -116,13 +116,13 @@ class Beyond:
 
 
 def place_part(image: GreyImage, refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice | None:
-    """Return `refined` on the grid of the whole board, empty where nothing was found; None where its place is open.
+    """Return `refined` on the grid of the whole board, NaN where nothing was found; None if its position is ambiguous.
 
     Parameters
     ----------
     image : grey, as for `rigkit.detection.subpixel.subpixel.refine`.
-    refined : a part of a board; lattices of a known size come back as they are.
-    sizes : (columns, rows) of the boards that it may be, either way round.
+    refined : a part of a board; lattices of a known size are returned unchanged.
+    sizes : (columns, rows) of the possible boards, which may be swapped.
     """
     columns, rows = refined.lattice.size
     known = {size for c, r in sizes for size in ((c, r), (r, c))}
@@ -132,9 +132,8 @@ def place_part(image: GreyImage, refined: RefinedLattice, sizes: Sequence[tuple[
     if not larger:
         return None
     every = sides(image, refined.lattice)
-    if known_median(refined.blur_px) > EDGE_WIDTH * float(
-        np.median(fit_cells(refined.lattice.pixels, refined.lattice.known).cell_px())
-    ):
+    cell_px = fit_cells(refined.lattice.pixels, refined.lattice.known).cell_px()
+    if known_median(refined.blur_px) > EDGE_WIDTH * float(np.median(cell_px)):
         every = _ending_in_blur(image, refined.lattice, every)
     top, left, bottom, right = every
     fits = {
@@ -145,7 +144,7 @@ def place_part(image: GreyImage, refined: RefinedLattice, sizes: Sequence[tuple[
         if left.agrees(before) and right.agrees(across - before)
         if top.agrees(above) and bottom.agrees(down - above)
     }
-    # A row too many (a shadow, what lies beside the board) makes a part as wide as the board: a size alone is no proof.
+    # An additional row (of a shadow or the background) may make a part as wide as the board: the size is no proof.
     seen = all(any(side.proven(every) for side in axis) for axis in ((left, right), (top, bottom)))
     if len(fits) != 1 or not seen:
         return None
@@ -153,36 +152,32 @@ def place_part(image: GreyImage, refined: RefinedLattice, sizes: Sequence[tuple[
     return refined.padded((above, down - above), (before, across - before))
 
 
-FourSides = tuple[Beyond, Beyond, Beyond, Beyond]
-"""Beyond the first row, the first column, the last row and the last column."""
+def sides(image: GreyImage, lattice: Lattice) -> list[Beyond]:
+    """Return the four sides: beyond the first row, the first column, the last row and the last column."""
+    return [_above(image, lattice.turned(turns)) for turns in range(4)]
 
 
-def sides(image: GreyImage, lattice: Lattice) -> FourSides:
-    """Return what lies beyond the first row, the first column, the last row and the last column."""
-    first, second, third, fourth = (_above(image, lattice.turned(turns)) for turns in range(4))
-    return first, second, third, fourth
-
-
-def _ending_in_blur(image: GreyImage, lattice: Lattice, every: FourSides) -> FourSides:
-    """Return what lies beyond the sides of a board whose edges are too wide to tell: where squares do not go on
-    alternating it ends."""
-    quiet = [_alternation_above(image, lattice.turned(turns)) < MAX_ALTERNATION for turns in range(4)]
-    ends = [
-        replace(one, side=Side.BORDER) if ending and one.side is Side.UNKNOWN else one
-        for one, ending in zip(every, quiet, strict=True)
+def _ending_in_blur(image: GreyImage, lattice: Lattice, every: Sequence[Beyond]) -> list[Beyond]:
+    """Return the sides of a blurred board: unknown ones beyond which squares do not alternate are borders."""
+    return [
+        replace(one, side=Side.BORDER) if quiet and one.side is Side.UNKNOWN else one
+        for one, quiet in zip(every, _alternations(image, lattice) < MAX_ALTERNATION, strict=True)
     ]
-    return ends[0], ends[1], ends[2], ends[3]
 
 
 def ends_quietly(image: GreyImage, lattice: Lattice) -> bool:
-    """Return whether `lattice` is seen to end where it does: beyond its sides the squares do not go on alternating."""
-    every = np.array([_alternation_above(image, lattice.turned(turns)) for turns in range(4)])
+    """Return whether the squares do not continue to alternate beyond the sides of `lattice`."""
+    every = _alternations(image, lattice)
     seen = every[np.isfinite(every)]
     return len(seen) >= MIN_SIDES_SEEN and bool((seen < MAX_ALTERNATION).all())
 
 
+def _alternations(image: GreyImage, lattice: Lattice) -> FloatArray:
+    """Return the alternation (4,) of squares beyond each side over the contrast of the last ones; NaN if unseen."""
+    return np.array([_alternation_above(image, lattice.turned(turns)) for turns in range(4)])
+
+
 def _alternation_above(image: GreyImage, lattice: Lattice) -> float:
-    """Return by how much squares beyond the last ones above `lattice` alternate, relative to these; NaN: not seen."""
     squares = _Squares.above(lattice)
     seen = squares.inside(image, float(NEXT_SQUARE[1]), float(WITHIN[-1])) & squares.near
     seen &= squares.supported(MIN_NEXT_SUPPORT)
@@ -195,7 +190,7 @@ def _alternation_above(image: GreyImage, lattice: Lattice) -> float:
 
 
 def _above(image: GreyImage, lattice: Lattice) -> Beyond:
-    """Return what lies beyond the first row of `lattice`."""
+    """Return the side beyond the first row of `lattice`."""
     squares = _Squares.above(lattice)
     usable = squares.usable(image)
     if usable.sum() < 2 * MIN_OF_KIND:
@@ -219,13 +214,13 @@ def _above(image: GreyImage, lattice: Lattice) -> Beyond:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Squares:
-    """The M squares above the first row of a lattice, from the one before its first corner to the one after its last.
+    """The M squares above the first row of a lattice, including those before its first and after its last corner.
 
     Attributes
     ----------
     bright : (M,) whether they are white.
-    near : (M,) whether a corner at their foot is known.
-    shape : of the cells (row -1, columns -1 .. C) and then of (row 0, columns -1 .. C), 2 (M + 1) in all.
+    near : (M,) whether one of the two corners of row 0 is known.
+    shape : of the cells (row -1, columns -1 .. C), then of (row 0, columns -1 .. C); 2 (M + 1) in all.
     """
 
     bright: BoolArray
@@ -237,14 +232,14 @@ class _Squares:
         wide = lattice.padded((2, 2), (2, 2))
         cells = np.zeros(wide.known.shape, bool)
         cells[1:3, 1:-1] = True
-        # The square between two columns is bright where brightness falls with the angle (downwards) across its foot.
+        # The square between two columns is bright if brightness falls with the angle (downwards) across its lower edge.
         bright = wide.signs()[2, 1:-2] < 0.0
         known = wide.known[2, 1:-1]
         shape = fit_cells(wide.pixels, cells, degree=3, ridge=(1e-3, 1e-2))
         return cls(bright, known[:-1] | known[1:], shape)
 
     def at(self, up: FloatArray, lateral: FloatArray) -> FloatArray:
-        """Return (M, K, 2) pixels `up` (K,) squares beyond the row and `lateral` (K,) from the squares' middles."""
+        """Return pixels (M, K, 2) at `up` (K,) squares beyond the row and `lateral` (K,) from the squares' middles."""
         count = len(self.bright)
         far = up >= 0.5
         out = np.zeros((count, len(up), 2))
@@ -261,37 +256,34 @@ class _Squares:
         return out
 
     def usable(self, image: GreyImage) -> BoolArray:
-        """Return which squares (M,) and the paper beyond them lie in the image, large enough, and well predicted."""
-        shape = self.shape
-        sound = shape.gain < MAX_BORDER_GAIN
-        side = shape.shorter_px()
-        sound &= side > MIN_CELL_PX
+        """Return which squares (M,) are large enough and well predicted, and in the image with the paper beyond."""
+        sound = (self.shape.gain < MAX_BORDER_GAIN) & (self.shape.shorter_px() > MIN_CELL_PX)
         inside = self.inside(image, 1.0, 0.5) & self.inside(image, float(BEYOND[-1]), 0.5)
         return np.asarray(inside & self.near & self.supported(MIN_SUPPORT) & self._of_squares(sound))
 
     def inside(self, image: GreyImage, up: float, lateral: float) -> BoolArray:
-        """Return which squares (M,) lie in the image at `up` squares beyond the row, to `lateral` on both sides."""
+        """Return which squares (M,) are in the image at `up` squares beyond the row, to `lateral` on both sides."""
         height, width = image.shape
         places = self.at(np.array([up, up]), np.array([-lateral, lateral]))
         return np.asarray(((places >= 0.0) & (places <= np.array([width, height]) - 1.0)).all(axis=(1, 2)))
 
     def supported(self, min_support: int) -> BoolArray:
-        """Return which squares (M,) have `min_support` corners behind the prediction of each of their own."""
+        """Return which squares (M,) have corners predicted from at least `min_support` corners each."""
         return self._of_squares(self.shape.support >= min_support)
 
     def _of_squares(self, sound: BoolArray) -> BoolArray:
-        """Return for which squares (M,) all four cells at their corners are `sound` (2 (M + 1),)."""
+        """Return for which squares (M,) all four corners are `sound` (2 (M + 1),)."""
         first, second = sound.reshape(2, len(self.bright) + 1)
         both = first & second
         return np.asarray(both[:-1] & both[1:])
 
     def brightness(self, image: GreyImage, up: FloatArray) -> FloatArray:
-        """Return the median brightness (M,) at `up` squares beyond the row, over the middle part of the squares."""
+        """Return the median brightness (M,) over `up` (K,) squares beyond the row and WITHIN the squares."""
         places = self.at(np.repeat(up, len(WITHIN)), np.tile(WITHIN, len(up)))
         return np.asarray(np.median(sample(image, places), axis=1), dtype=np.float64)
 
     def end_on_one_line(self, image: GreyImage, outer: FloatArray, beyond: FloatArray, judged: BoolArray) -> BoolArray:
-        """Return which squares (M,) change from brightness `outer` to `beyond` once, where those `judged` do."""
+        """Return which squares (M,) change from brightness `outer` to `beyond` once, on the line of those `judged`."""
         places = self.at(np.repeat(PROFILE, len(WITHIN)), np.tile(WITHIN, len(PROFILE)))
         values = sample(image, places).reshape(len(outer), len(PROFILE), len(WITHIN)).mean(axis=2)
         step = beyond - outer

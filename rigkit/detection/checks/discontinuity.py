@@ -1,8 +1,8 @@
-"""Boards that touch or overlap so nearly in line that one lattice goes on from one to the next.
+"""Boards that touch or overlap almost in line, so that one lattice extends over both.
 
-Where their borders meet there are corners that look like a chessboard's and are none, or lie where the two boards have
-them, by hundredths of a square beside where either of them would. So what the edge model fits badly is held against
-where the other corners have it; and a lattice whose two sides are each a smooth surface, but not the same one, is cut.
+Corners at their common border are wrong, or off by hundredths of a square. Corners with large residuals of the edge
+model are therefore compared with predictions from the other corners. A lattice whose two sides are smooth surfaces, but
+not one and the same, is split.
 """
 
 from __future__ import annotations
@@ -18,59 +18,58 @@ from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.kernels import lattice as native
 
 SUSPECT_FACTOR = 2.0
-"""A corner whose residual, relative to its contrast, exceeds the typical one of the board by this factor is suspect:
-chance makes 1.15, the rim of a fisheye at most 3; squares that are not one board's make 2 to 20."""
+"""A corner is suspect if its residual over its contrast exceeds the median of the board by this factor. By chance it is
+1.15, at the rim of a fisheye at most 3; at borders of two boards it is 2 to 20."""
 
 OUTLIER_FACTOR = 8.0
-"""A suspect is dropped that lies further from where the others have it than this times what is typical of the board and
-good to expect of the prediction. By the more pliant of the predictions alone that is 7 of 2302 suspects in pictures of
-single boards, half of them real, and 220 of 252 on the borders of boards that overlap: the rest lie in line with a row.
-"""
+"""A suspect is dropped if it is further from its prediction than this times the expected error. By the more flexible
+prediction alone this drops 7 of 2302 suspects in images of single boards, half of them REAL, and 220 of 252 on the
+borders of boards that overlap: the rest are in line with a row."""
 
 MIN_OUTLIER_SIGMAS = 5.0
-"""And by more than so many of its own standard deviations: what is uncertain may lie aside."""
+"""Smallest distance of a dropped suspect from its prediction, in its own standard deviations."""
 
 IN_PLACE = 3.0
-"""A suspect nearer than this, in the same units, to either of the predictions is none."""
+"""A suspect closer than this, in the same units, to one of the predictions is an inlier."""
 
 MIN_SUSPECT_RESIDUAL = 0.02
-"""Residual relative to the contrast below which nothing is suspect: rounding and compression are uneven, too."""
+"""Smallest residual over contrast of a suspect: smaller ones are due to rounding and compression."""
 
 MIN_NEIGHBOURS_FIT = 8
-"""Corners behind a prediction that convicts."""
+"""Smallest number of corners of a prediction by which a suspect is dropped."""
 
 UNUSUAL, MIN_UNUSUAL = 1.3, 3
-"""A discontinuity shows: so many corners have residuals beyond this times the typical one."""
+"""There may be a discontinuity if at least MIN_UNUSUAL corners have residuals above UNUSUAL times the median."""
 
 WINDOW = 5
-"""Columns to either side of a discontinuity that are looked at."""
+"""Columns on each side of a discontinuity that are used."""
 
 TWO_SURFACES = 2.5
-"""Two quadratic surfaces, one on each side, leave so many times less than one cubic surface through both where they are
-two boards. In 248 lattices of single boards, up to the rims of fisheyes, at most 1.8 times."""
+"""Smallest ratio, at a discontinuity, of the residuals of one cubic surface to those of two quadratic surfaces, one on
+each side. In 248 lattices of single boards, up to the rims of fisheyes, it is at most 1.8."""
 
 JUMP = 0.02
-"""Seen from both sides the discontinuity is so wide, in cells: at a crease of the paper the sides meet. It is anywhere
-between the columns, and looked for at five places of the way."""
+"""Smallest jump at a discontinuity, in cells: at a crease of the paper the two sides meet. It is evaluated at five
+positions between two columns."""
 
 FLOOR_CELLS = 1e-3
-"""No printed board is truer than this."""
+"""Lower bound of the scatter, in cells, due to imperfect prints."""
 
 MIN_BESIDE, MIN_FREE = 5, 6
-"""Corners on each side of a discontinuity, and in all beyond what the surfaces take up."""
+"""Smallest number of corners on each side of a discontinuity, and smallest redundancy of the surfaces."""
 
 AS_SMOOTH = 1.3
-"""What the two sides leave at the clearest discontinuity and, at most, at a narrower one that is taken for it."""
+"""Largest ratio of the residuals at a narrower discontinuity to those at the clearest one, to be preferred to it."""
 
 SURFACE_RIDGE = 1e-9
-"""On normal equations of terms of about 1: what too few columns leave open stays 0."""
+"""Ridge of the normal equations, whose terms are about 1: terms that few columns do not determine remain 0."""
 
 
 def may_be_discontinuous(item: RefinedLattice, size_px: tuple[int, int]) -> bool:
-    """Return whether `item` may have a discontinuity; a quick look. `size_px` is the (width, height) of the image.
+    """Return quickly whether `item` may have a discontinuity; `size_px` is the (width, height) of the image.
 
-    Corners on a discontinuity fit badly, and where boards are not side by side, corners are missing that the frame
-    does not cut off.
+    Corners on a discontinuity have large residuals; if boards are not exactly side by side, corners within the image
+    are missing.
     """
     known = item.lattice.known
     relative = np.sort(item.residual[known] / item.lattice.contrast[known])
@@ -84,20 +83,13 @@ def may_be_discontinuous(item: RefinedLattice, size_px: tuple[int, int]) -> bool
 
 
 def without_outliers(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedLattice:
-    """Return `item` without corners that fit badly and are not where the others have them, trimmed.
+    """Return `item` without corners that have large residuals and contradict the others, and without stray rows.
 
-    What these, and the fit, leave of a row that has strayed into it goes with them. `size_px` is the (width, height) of
-    the image.
+    The result is trimmed. `size_px` is the (width, height) of the image.
     """
-    return _tidied(_without_displaced(item), size_px)
-
-
-def _tidied(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedLattice:
-    stray = stray_row(item.lattice, size_px)
-    while stray is not None:
-        item = item.without(stray)
-        item = item.cut(*item.lattice.extent)
-        stray = stray_row(item.lattice, size_px)
+    item = _without_displaced(item)
+    while (stray := stray_row(item.lattice, size_px)) is not None:
+        item = item.without(stray).trimmed()
     return item
 
 
@@ -114,25 +106,24 @@ def _without_displaced(item: RefinedLattice) -> RefinedLattice:
     predicted_fit = fit_cells(pixels, judges, leave_out=True)
     expected = upper_median(np.hypot(*(predicted_fit.pixels - pixels[judges]).T) / predicted_fit.cell_px())
     outlying, in_place = _tested(item, suspect, expected)
-    # Under the edge of a shadow whole rows are suspect: those that are in place say where the rows beyond them are.
+    # At the edge of a shadow whole rows are suspect: inliers among them serve to predict the rows beyond.
     while outlying.any() and in_place.any():
         suspect = suspect & ~in_place
         outlying, in_place = _tested(item, suspect, expected)
     if not outlying.any():
         return item
-    item = item.without(outlying)
-    return item.cut(*item.lattice.extent)
+    return item.without(outlying).trimmed()
 
 
 def _tested(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[BoolArray, BoolArray]:
-    """Return which of the `suspect` corners (R, C) are not where the others have them, and which clearly are.
+    """Return which of the `suspect` corners (R, C) contradict their predictions, and which agree with one.
 
-    The others are mostly as good as `expected`, in cells.
+    `expected` is the typical error of the other corners, in cells.
     """
     pixels = item.lattice.without(suspect).pixels
     outlying, in_place = np.zeros((2, *suspect.shape), np.bool_)
     outlying[suspect] = True
-    # Both must agree.
+    # Outliers of both predictions.
     for degree, ridge in (STIFF, FLEXIBLE):
         shape = fit_cells(pixels, suspect, degree=degree, ridge=ridge)
         off = np.hypot(*(shape.pixels - item.lattice.pixels[suspect]).T)
@@ -146,9 +137,9 @@ def _tested(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[
 
 
 def split_at_discontinuities(item: RefinedLattice, *, several: bool = False) -> list[RefinedLattice]:
-    """Return the boards that `item` is made of, without the corners where they touch.
+    """Return the boards in `item`, without the corners where they touch.
 
-    several : it is known to be more than one, so the clearest discontinuity is one, however well the two go together.
+    several : it is known to be more than one board: split at the clearest discontinuity in any case.
     """
     if item.lattice.count < 2 * MIN_BESIDE + MIN_FREE:
         return [item]

@@ -1,10 +1,10 @@
-"""Whether a fitted lattice is a chessboard: one judgement of all that the fit says for and against it.
+"""Classification of fitted lattices as chessboards or other patterns, by logistic regression.
 
-No single measure tells boards from what resembles them: a webcam that sharpens leaves residuals as large as dots do, a
+No single measure separates boards from other patterns: a sharpening webcam gives residuals as large as those of dots, a
 small or blurred board is as uncertain as a weave, and a strong lens spaces corners as unevenly as the stripes of a
-tartan. Their product does. The score is the log odds of a logistic regression (Hosmer and Lemeshow 2000, chapter 1) on
-the logarithms of six measures, each of which falls for boards; `scripts/measure_thresholds.py` fits it again on
-rendered and real images and prints how far boards and other patterns lie from 0.
+tartan. Their combination does. The score is the log odds of a logistic regression (Hosmer and Lemeshow 2000, chapter 1)
+on the logarithms of six measures, each of which is smaller for boards. `scripts/measure_thresholds.py` repeats the
+regression on rendered and real images and prints the scores of boards and other patterns.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rigkit.detection.lattice.spacing import spacing_changes
 from rigkit.detection.subpixel.refined import RefinedLattice
 
 MIN_EXCESS_RESIDUAL, MIN_SPACING_CHANGE, MIN_BLUR = 0.03, 0.03, 0.03
-"""Smaller values are those of any sharp board seen straight on, and speak no further for it."""
+"""Lower bounds of measures: smaller values are common to all sharp frontal boards and are no further evidence."""
 
 SCORE = {
     "sigma_cells": -3.2,
@@ -31,37 +31,36 @@ SCORE = {
     "blur_cells": -3.2,
 }
 OFFSET = -30.2
-"""Weights of the logarithms, and what is added to them: the most probable ones if each is known beforehand to be 0,
-with a standard deviation of 70 over the root of the number of lattices, of measures of standard deviation 1; never
-positive, and that of raggedness not beyond -4, so that a hand may cover a third of a board.
+"""Weights of the logarithms, and the intercept: maximum a posteriori for a zero-mean Gaussian prior on the weights of
+standardised measures, of standard deviation 70 over the root of the number of lattices. Weights are not positive, and
+that of raggedness is at least -4, so that a hand may cover a third of a board.
 
-From 1545 lattices of boards of 27 real sets, four fifths of them blurred, noisy, compressed, sharpened, faint, shrunk,
-covered or cut, and 276 of other patterns. As taken, boards score 0.7 and more and all but one of the others -1.9 and
-less: a page of 1304 discs of 7 px that nearly touch, every second row moved by half a step, -0.6. With what was done to
-the images 10 boards are refused, smeared and shrunk ones, and no other pattern is taken for one."""
+The data are 1545 lattices of boards of 27 REAL sets, four fifths of them blurred, noisy, compressed, sharpened, faint,
+shrunk, covered or cut, and 276 lattices of other patterns. In the original images boards score at least 0.7, and all
+other patterns but one at most -1.9; the exception, -0.6, is a page of 1304 discs of 7 px that nearly touch, every
+second row shifted by half a step. In the modified images 10 boards, smeared and shrunk ones, are rejected, and no other
+pattern is accepted."""
 
 OF_EXPECTED_SIZE, MIN_EXPECTED_CORNERS = 4.0, 20
-"""What the score grows by where a lattice of so many corners has the rows and columns of a board that may be there: the
-logarithm of how much rarer that is among other patterns. Of 75 lattices of these 1 or none has the size of a board in
-use (9 x 6, 7 x 10), 3 have 6 x 4 corners; smaller ones chance makes in any size."""
+"""Increase of the score of a lattice of at least MIN_EXPECTED_CORNERS corners with the size of a listed board: the log
+ratio of the frequencies of that size among boards and other patterns. Of 75 lattices of other patterns at most 1 has
+the size of a common board (9 x 6, 7 x 10), and 3 have 6 x 4 corners; smaller ones have any size."""
 
 
 class Evidence(NamedTuple):
-    """What the fit says of a lattice; (upper) medians over its corners.
+    """The measures of a lattice; (upper) medians over its corners.
 
     Attributes
     ----------
-    sigma_cells : standard deviation of a corner if all that the fit leaves were noise, in sides of a cell, before it is
-        raised for the scatter about the lattice.
-    scatter : the factor by which it is raised.
-    excess_residual : RMS of what the fit leaves beyond the noise, and so on both sides of the corner alike, relative to
-    the
-        contrast.
-    spacing_change : difference of neighbouring steps along rows or columns, whichever is larger, relative to the
-        shorter step; 0 where no three corners follow each other.
-    raggedness : places in the rows and columns over corners that are there, at least 1: boards are rectangles, and
-        patterns that go on for ever are found in patches.
-    blur_cells : width of the edges, in sides of a cell: the wider, the less there is to tell squares from dots by.
+    sigma_cells : standard deviation of a corner if all residuals were noise, in sides of a cell, before it is raised
+        by `scatter`.
+    scatter : the factor by which sigmas are raised for the scatter about the lattice.
+    excess_residual : rms residual in excess of the noise, relative to the contrast.
+    spacing_change : difference of successive steps along rows or columns, whichever is larger, relative to the shorter
+        step; 0 without three successive corners.
+    raggedness : rows times columns over the number of corners, at least 1: boards are rectangles, and periodic patterns
+        are found in patches.
+    blur_cells : s of the edges in sides of a cell: with more blur squares and dots look more alike.
     """
 
     sigma_cells: float
@@ -93,7 +92,7 @@ class Evidence(NamedTuple):
 
     @property
     def score(self) -> float:
-        """Log odds for a board: positive where the evidence speaks for one."""
+        """Log odds of a board against another pattern."""
         measures = {
             "sigma_cells": max(self.sigma_cells, 1e-9),
             "scatter": self.scatter,

@@ -1,4 +1,4 @@
-"""Which lattices are boards: squares that close, rows that are rows, one board to a place, sizes that are known."""
+"""Validation of lattices: stray rows, duplicates, edges between corners, completeness, known sizes."""
 
 from __future__ import annotations
 
@@ -17,50 +17,51 @@ from rigkit.kernels import lattice as native
 from rigkit.kernels.front import near_any
 
 STRAY_ROW = 2
-"""An outer row of so many corners or fewer, most of whose other corners should be in view too, is not of the board."""
+"""Largest number of corners of a stray outer row, which does not belong to the board."""
 
 FRAME_CELLS = 0.5
-"""A corner predicted nearer than this to the frame may be missing for a good reason, in cells."""
+"""Corners predicted closer than this to the image border, in cells, may be missing."""
 
 SHARED_PX = 2.0
-"""Corners of two lattices nearer than this are the same."""
+"""Corners of two lattices closer than this are the same."""
 
 MAX_SHARED = 0.25
-"""Largest part of a lattice's corners that larger ones may have, too: of what grows over a discontinuity, the row
-on it and the one beyond; of a board found twice, on two levels of the pyramid, nearly all."""
+"""Largest share of a lattice's corners that belong to larger ones too: those of a lattice grown across a discontinuity
+are two rows, of a board found on two levels of the pyramid nearly all."""
 
 MAX_LOST = 0.4
-"""Largest part of a lattice's corners that the sub-pixel fit may refuse: beside what covers a board there are many."""
+"""Largest share of a lattice's corners that the sub-pixel fit may reject: on partly covered boards it rejects many."""
 
 LARGE_SAMPLE, SAMPLE, RAGGED = 7, 5, 0.75
-"""Rows and columns by which a lattice of many corners is judged, or a smaller one that fills less than this part of its
-rows and columns."""
+"""Rows and columns of the sample of a lattice with many corners, of that of a ragged lattice, and the share of corners
+in rows times columns below which a lattice is ragged."""
 
 MIN_ROWS = 3
 """Rows and columns of the smallest board."""
 
 STEPS_ACROSS, MAX_EDGES = 16, 256
-"""Between two corners the edge runs straight. It is looked for in so many steps across, of so many edges."""
+"""Samples across an edge between two corners, and the largest number of edges, by which edge offsets are measured."""
 
 NARROW_STRIPE, MAX_DARK, MAX_BRIGHT = 0.12, 0.024, 0.036
-"""Halfway, in a stripe of NARROW_STRIPE to both sides, it lies aside by at most so much towards the bright or the dark
-squares, in squares: on 300 boards by 0.01 and 0.016. Lenses bend edges to the dark side as often as to the bright
-one."""
+"""Half width of the stripe in which the edge is sought halfway between two corners, and its largest median offset from
+their line to the dark or the bright side, in squares. On 300 boards it is 0.01 and 0.016; lenses bend edges to both
+sides alike."""
 
 WIDE_STRIPE, OFFSET_PARTS, MAX_SHIFT, MAX_BOW = 0.25, (0.2, 0.5, 0.8), 0.1, 0.04
-"""Ink that spreads, thin print, and light that saturates, shift edges by more, up to 0.08, but all along. They show in
-a wider stripe, into which markers in the squares reach, and in so many parts of their length. Rounded corners bow them
-by 0.01; threads shift by 0.15, dots by 0.08 to 0.2, and bow as much."""
+"""Half width of a wider stripe, positions along the edge, and the largest shift and bow there, in squares. Spreading
+ink, thin print and saturation shift edges by up to 0.08, equally along their length. Rounded corners bow them by 0.01;
+threads shift by 0.15, dots by 0.08 to 0.2, and bow as much."""
 
 RARELY_BY_CHANCE, NEARLY_FULL, BY_CHANCE = 24, 0.9, 24
-"""A board of fewer corners than the first has most of those between them, or somewhere a full block in so many squares:
-codes and mosaics have such blocks, too, but hardly one in 2^23 places, and one crooked chain of 24 in 126 pages."""
+"""A lattice is compact if it has at least RARELY_BY_CHANCE corners, or a share of NEARLY_FULL of its rows times
+columns, or a full block of BY_CHANCE squares. Codes and mosaics have such blocks in hardly one of 2^23 places, and one
+crooked chain of 24 corners in 126 pages."""
 
 MAX_EXTRA = 2
-"""Rows and columns that may be too many, when a grid is larger than the board it may be."""
+"""Largest number of additional rows and columns of a grid larger than its board."""
 
 WORSE_FIT = 1.5
-"""Corners of rows that do not belong to the board fit so many times worse."""
+"""Smallest ratio of the residuals of additional rows to those of the board's corners."""
 
 
 def tidy(lattice: Lattice, size_px: tuple[int, int]) -> Lattice:
@@ -68,15 +69,16 @@ def tidy(lattice: Lattice, size_px: tuple[int, int]) -> Lattice:
 
     `size_px` is the (width, height) of the full-resolution image.
     """
-    stray = stray_row(lattice, size_px)
-    while stray is not None:
+    while (stray := stray_row(lattice, size_px)) is not None:
         lattice = lattice.without(stray).trimmed()
-        stray = stray_row(lattice, size_px)
     return lattice
 
 
 def stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
-    """Return the first outer row or column (as a mask) that has strayed into the lattice, None if there is none."""
+    """Return the first stray outer row or column as a mask (R, C), None if there is none.
+
+    Such a row has few corners, although more of its predicted corners are within the image.
+    """
     known = lattice.known
     if min(known.shape) < 3:
         return None
@@ -98,15 +100,15 @@ def stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
 
 
 def large(lattice: Lattice, min_corners: int) -> bool:
-    """Return whether `lattice` has `min_corners` and, if that is to be a board (9), three rows and three columns."""
+    """Return whether `lattice` has `min_corners` and, if these are 9 or more, three rows and three columns."""
     return lattice.count >= min_corners and min(lattice.size) >= (MIN_ROWS if min_corners >= MIN_ROWS**2 else 2)
 
 
 def separate(lattices: Sequence[Lattice], min_corners: int) -> list[Lattice]:
     """Return those of `lattices` that are `large` enough, without the corners that they share with larger ones.
 
-    What has most of its corners in common with larger ones is the same board again, and left out. A lattice that grew
-    over the edge to another board keeps its own corners.
+    A lattice that shares many of its corners is a duplicate and left out; one that grew across the border of another
+    board keeps its own corners.
     """
     candidates = sorted((item for item in lattices if large(item, min_corners)), key=lambda item: -item.count)
     if len(candidates) < 2:
@@ -130,7 +132,7 @@ def separate(lattices: Sequence[Lattice], min_corners: int) -> list[Lattice]:
 
 
 def _without_shared(lattice: Lattice, shared: BoolArray) -> Lattice | None:
-    """Return `lattice` without those of its corners (N,) that are `shared`; None where most are."""
+    """Return `lattice` without those of its corners (N,) that are `shared`; None if more than MAX_SHARED are."""
     if not shared.any():
         return lattice
     if np.count_nonzero(shared) > MAX_SHARED * len(shared):
@@ -141,9 +143,9 @@ def _without_shared(lattice: Lattice, shared: BoolArray) -> Lattice | None:
 
 
 def sample_of(lattice: Lattice) -> Lattice | None:
-    """Return the fullest block of some rows and columns of a lattice that is large or ragged; None for others.
+    """Return the fullest block of a few rows and columns of a large or ragged lattice; None for other lattices.
 
-    A page of dots makes thousands of corners, with many gaps: a look at a few tells that they are none.
+    It serves to reject quickly lattices such as those of pages of dots, with thousands of corners and many gaps.
     """
     known = lattice.known
     many = lattice.count >= MANY
@@ -156,7 +158,7 @@ def sample_of(lattice: Lattice) -> Lattice | None:
 
 
 def has_edge_offset(lattice: Lattice, level: Level) -> bool:
-    """Return whether the edges of `lattice`, as `level` shows them, lie aside of the corners that they join, or bow."""
+    """Return whether the edges of `lattice` on `level` are off the lines between their corners, or bowed."""
     (shift,) = _edge_offsets(lattice, level, NARROW_STRIPE, (0.5,))
     if -MAX_DARK < shift < MAX_BRIGHT:
         return False
@@ -165,19 +167,20 @@ def has_edge_offset(lattice: Lattice, level: Level) -> bool:
 
 
 def _edge_offsets(lattice: Lattice, level: Level, reach: float, along: Sequence[float]) -> FloatArray:
-    """Return how far edges lie on the dark side of their corners' line, at parts `along` (K,) of it, in squares.
+    """Return the offsets (K,), in squares, of edges to the dark side of their corners' line at parts `along` (K,) of
+    it.
 
-    They are looked for in a stripe of `reach` squares to both sides.
+    They are sought within `reach` squares to both sides.
     """
     seen = (level.smooth, level.scale, level.offset)
     return native.shifts_of_edges(lattice.pixels, lattice.rising, *seen, reach, along, STEPS_ACROSS, MAX_EDGES)
 
 
 def compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:
-    """Return whether `lattice` is large, nearly full, or has a full block as large as chance does not make.
+    """Return whether `lattice` is large, nearly full, or has a large full block; `size_px` is (width, height).
 
-    Squares of random brightness that happen to alternate make crooked chains of corners; what covers a board, or the
-    frame of the image (`size_px` is its width and height), leaves blocks.
+    Squares of random brightness that happen to alternate make crooked chains of corners. On boards that are partly
+    covered, or cut by the image border, full blocks remain.
     """
     known = lattice.known
     if lattice.count >= RARELY_BY_CHANCE or known.mean() >= NEARLY_FULL:
@@ -194,10 +197,7 @@ def compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:
 
 
 def trustworthy(refined: RefinedLattice, before: int, min_corners: int, prior: float = 0.0) -> bool:
-    """Return whether what the fit left of a lattice of `before` corners is a board.
-
-    `prior` is added to the score of its evidence: what else speaks for a board.
-    """
+    """Return whether the fit of a lattice of `before` corners is a board; `prior` is added to its evidence score."""
     lattice = refined.lattice
     if lattice.count < max(min_corners, (1.0 - MAX_LOST) * before) or min(lattice.size) < MIN_ROWS:
         return False
@@ -211,10 +211,10 @@ def too_large(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
 
 
 def known_part(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice:
-    """Return the part of a grid that is a board of a known size, where what sticks out clearly is none of it.
+    """Return the part of a grid that is a board of a known size, if its additional rows clearly do not belong to it.
 
-    The outer border of a board, or what lies beside it, sometimes passes for a row of corners: few of them, or corners
-    that fit badly. A grid of a known size, or one whose extra rows are as good as the others, comes back as it is.
+    The border or the background of a board sometimes gives a row of few corners, or of corners with large residuals.
+    A grid of a known size, or one whose additional rows are as good as the others, is returned unchanged.
     """
     rows, columns = refined.lattice.known.shape
     both = {(r, c) for c, r in sizes} | {(c, r) for c, r in sizes}
@@ -239,7 +239,7 @@ def known_part(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> Ref
 
 
 def _sticks_out(known: BoolArray, relative: np.ndarray, inside: BoolArray) -> bool:
-    """Return whether the corners outside `inside` are few or fit badly, and those inside are nearly all there."""
+    """Return whether the corners outside `inside` are few or have large residuals, and those inside nearly complete."""
     outside = ~inside
     if known[inside].mean() < 0.9:
         return False

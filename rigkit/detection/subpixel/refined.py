@@ -1,4 +1,4 @@
-"""Lattices with what the sub-pixel fit says of their corners."""
+"""Lattices with the results of the sub-pixel fit."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from rigkit.detection.subpixel.resampled import Resampled
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RefinedLattice:
-    """A lattice with what the fit says of each corner, (R, C) each and NaN where unknown.
+    """A lattice with the fit's results per corner, (R, C) each, NaN where unknown.
 
     Attributes
     ----------
     lattice : the corners.
-    sigma_px, blur_px : predicted standard deviation, width of the edges.
-    residual, noise : RMS of what the fit leaves and of the part of it that is noise, grey levels.
-    scatter : factor by which `sigma_px` was raised, because the corners scatter about the lattice by so much more than
-        the noise in the image explains.
-    correlated : the same, because neighbouring pixels share noise (`correlation.sigma_factors`).
-    picture : what its corners were placed in, where that is not the image itself.
+    sigma_px, blur_px : predicted standard deviation, and s of the edges.
+    residual, noise : rms residual of the fit and of its part that is noise, grey levels.
+    scatter : factor by which `sigma_px` was raised because the corners scatter about the lattice by more than noise.
+    correlated : factor of `sigma_px` due to correlated noise of neighbouring pixels (`correlation.sigma_factors`).
+    picture : the resampled part of the image in which the corners were fitted; None: the image itself.
     """
 
     lattice: Lattice
@@ -39,23 +38,23 @@ class RefinedLattice:
 
     @property
     def worst_sigma_px(self) -> FloatArray:
-        """(R, C) standard deviation if all that the fit leaves were noise: large for what is no chessboard."""
-        # Of few pixels, those with mirror images may have more noise than all of them have residuals.
+        """(R, C) standard deviation if all residuals were noise: large for other patterns than chessboards."""
+        # With few pixels the noise may exceed the residual.
         worst: FloatArray = self.sigma_px * np.maximum(self.residual / self.noise, 1.0)
         return worst
 
     @property
     def relative_residual(self) -> FloatArray:
-        """(R, C) residual in parts of the contrast."""
+        """(R, C) residual over contrast."""
         relative: FloatArray = self.residual / self.lattice.contrast
         return relative
 
     def of(self, lattice: Lattice) -> RefinedLattice:
-        """Return this with `lattice` instead of its own, which has the same corners, or more of them."""
+        """Return the results with another `lattice`, which has the same corners or more."""
         return self._of(lattice, self._values())
 
     def without(self, drop: BoolArray) -> RefinedLattice:
-        """Return this with the corners `drop` (R, C) forgotten."""
+        """Return the lattice without the corners `drop` (R, C)."""
         rest = (np.where(drop, np.nan, values) for values in self._values())
         return self._of(self.lattice.without(drop), rest)
 
@@ -64,20 +63,24 @@ class RefinedLattice:
         rest = (values[rows, columns] for values in self._values())
         return self._of(self.lattice.cut(rows, columns), rest)
 
+    def trimmed(self) -> RefinedLattice:
+        """Return the lattice without empty outer rows and columns."""
+        return self.cut(*self.lattice.extent)
+
     def padded(self, rows: tuple[int, int], columns: tuple[int, int]) -> RefinedLattice:
-        """Return this with so many empty rows and columns before and after."""
+        """Return the lattice with numbers of empty rows and columns added before and after."""
         rest = (padded(values, rows, columns) for values in self._values())
         return self._of(self.lattice.padded(rows, columns), rest)
 
     def turned(self, quarter_turns: int) -> RefinedLattice:
-        """Return this numbered from another corner, as `Lattice.turned`."""
+        """Return the lattice numbered from another corner, as `Lattice.turned`."""
         if quarter_turns % 4 == 0:
             return self
         rest = (turned(values, quarter_turns) for values in self._values())
         return self._of(self.lattice.turned(quarter_turns), rest)
 
     def filled(self, other: RefinedLattice) -> RefinedLattice:
-        """Return this with the corners of `other`, of the same size, where it has none."""
+        """Return the lattice with missing corners taken from `other`, of the same size."""
         known = self.lattice.known
         pairs = zip(self._values(), other._values(), strict=True)
         scatter = max(self.scatter, other.scatter)
@@ -85,11 +88,11 @@ class RefinedLattice:
         return replace(self._of(self.lattice.filled(other.lattice), rest), scatter=scatter)
 
     def within(self, picture: Resampled) -> RefinedLattice:
-        """Return this as it lies in `picture`, a part of the image."""
+        """Return the lattice in pixels of `picture`, a resampled part of the image."""
         return self._moved(picture.of(self.lattice.pixels), 1.0 / picture.sigma_factor, None)
 
     def out_of(self, picture: Resampled) -> RefinedLattice:
-        """Return this, which lies in `picture`, as it lies in the image."""
+        """Return the lattice, which is in pixels of `picture`, in pixels of the image."""
         return self._moved(picture.back(self.lattice.pixels), picture.sigma_factor, picture)
 
     def _moved(self, pixels: FloatArray, factor: float, picture: Resampled | None) -> RefinedLattice:
@@ -101,6 +104,6 @@ class RefinedLattice:
         return (self.sigma_px, self.blur_px, self.residual, self.noise)
 
     def _of(self, lattice: Lattice, values: Iterable[FloatArray]) -> RefinedLattice:
-        """Return this of another lattice, with `values` as `_values`."""
+        """Return another lattice with results `values`, in the order of `_values`."""
         # `replace` takes twice as long.
         return RefinedLattice(lattice, *values, scatter=self.scatter, correlated=self.correlated, picture=self.picture)

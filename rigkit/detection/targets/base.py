@@ -1,4 +1,4 @@
-"""The contract of every search for a kind of target, and what the searches of one image share."""
+"""The interface of the finders of targets, and the data that they share for one image."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from rigkit.detection.tags.in_squares import vouched_by_markers
 
 
 class Search:
-    """An image that is searched, and what more than one kind of target needs of it.
+    """An image with the results that several finders use.
 
     Attributes
     ----------
     grey : grey levels 0..255.
-    boards : all boards that may be there.
-    min_corners : boards with fewer points are not reported, but for whole ones of `boards`.
+    boards : all boards that may be in the image.
+    min_corners : smallest number of points of a reported board, except whole ones of `boards`.
     camera : the calibrated camera, if known.
-    stored : the grey levels before bad pixels were replaced: modules of small markers look like these.
-    quick : points to a tenth of a pixel or so are enough, if that takes less time.
+    stored : grey levels before bad pixels were replaced, which modules of small markers resemble.
+    quick : an accuracy of about a tenth of a pixel is enough.
     """
 
     def __init__(
@@ -59,23 +59,23 @@ class Search:
 
     @property
     def has_lattices(self) -> bool:
-        """Whether the lattices were looked for."""
+        """Whether the lattices were searched for."""
         return self._lattices is not None
 
     @property
     def lattices(self) -> list[RefinedLattice]:
-        """The lattices of chessboard corners in the image that no target has taken; looked for when first asked for."""
+        """The lattices of chessboard corners that no finder has used; searched for at the first access."""
         if self._lattices is None:
             self._lattices = self._found_lattices()
         return self._lattices
 
     def leave(self, lattices: Sequence[RefinedLattice]) -> None:
-        """Let only these lattices be there for other targets."""
+        """Keep only these lattices for other finders."""
         self._lattices = list(lattices)
 
     @property
     def min_corners_seen(self) -> int:
-        """Corners that the smallest lattice of interest has: a whole board may have fewer than `min_corners`."""
+        """Corners of the smallest lattice searched for: a whole board may have fewer than `min_corners`."""
         whole = (max(columns * rows, MIN_BOARD_CORNERS) for columns, rows in self.chessboard_sizes)
         return min([self.min_corners, *whole])
 
@@ -86,22 +86,21 @@ class Search:
         vouched = functools.partial(vouched_by_markers, marked) if marked else None
         found = find_lattices(self.grey, self.min_corners_seen, only, vouched=vouched)
         if not found and self.grey.dtype != np.uint8:
-            # Beyond 8 bits the squares of a board may be a hundredth of the range of brightness.
+            # In images of more than 8 bits a board may use a hundredth of the range of brightness.
             seen = [item.lattice for item in find_lattices(equalised(self.grey), self.min_corners_seen, only)]
-            # What is hot beside a board moves corners of the equalised image: they are placed on one that is only
-            # brighter.
+            # Equalisation shifts corners beside bright objects: they are fitted on a linearly stretched image.
             self.grey = stretched(self.grey, [lattice.pixels for lattice in seen])
             found = fitted(self.grey, seen, Sought(self.min_corners_seen, only, vouched))
         return found
 
 
 class Finder(ABC):
-    """How an image is searched for the boards of one pattern. Adding one is a file, and a line in `registry`."""
+    """Finds the boards of one pattern. A new one needs a module and a line in `registry`."""
 
     @abstractmethod
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
-        """Return what is seen of `boards`, those of this finder's pattern that may be there, corners completed.
+        """Return the detections of `boards`, the listed ones with this finder's pattern, with missed corners added.
 
-        A detection is named where the image tells which board it is, or by nobody's name: see `detect_boards`. What a
-        calibrated camera (`search.camera`) can tell is used: which points were missed, how lines bend.
+        A detection has an id if the image determines it, see `detect_boards`. A calibrated camera (`search.camera`)
+        predicts missed points and the curvature of lines.
         """

@@ -1,4 +1,4 @@
-"""Chessboards: the lattices of the image, on the boards' grids where that is known."""
+"""Chessboards: the lattices of the image, on the grids of the listed boards where their position is known."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from rigkit.detection.subpixel.resampled import Resampled
 from rigkit.detection.targets.base import Finder, Search
 
 SEEN_OF_LINE = 0.5
-"""Part of a missed row or column whose corners are seen on one side of a lattice rather than on the other: measured 0.5
-and more there (motion of 15 px), none beyond the border."""
+"""Smallest difference in the share of a missed row's corners found on one side of a lattice and on the other. On the
+right side it is 0.5 and more (motion of 15 px), beyond the border 0."""
 
 
 class ChessboardFinder(Finder):
-    """All lattices that no other target has taken, whatever their size."""
+    """Returns all lattices that no other finder has used, of any size."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
         if search.camera is not None:
-            # It says where corners are in the image itself.
+            # The camera predicts corners in the image itself, not in resampled parts.
             return _in_image(search.grey, search.lattices, boards, search.camera, quick=search.quick)
         out = _in_image(
             search.grey, [item for item in search.lattices if item.picture is None], boards, quick=search.quick
@@ -39,7 +39,7 @@ class ChessboardFinder(Finder):
         for item in search.lattices:
             if (picture := item.picture) is not None:
                 there = _in_image(search.grey, [item], boards, picture=picture, quick=search.quick)
-                # What is too much aslant there may still be seen in the image itself.
+                # Corners that are too oblique in the resampled part may be found in the image itself.
                 out += [completed(search.grey, _out_of(picture, found), boards, None) for found in there]
         return out
 
@@ -53,8 +53,11 @@ def _in_image(
     picture: Resampled | None = None,
     quick: bool,
 ) -> list[BoardDetection]:
-    """Return the boards that the lattices `found` in an image are, on their grids, completed: in `picture`, where that
-    is given, and as they lie there. How a board ends is seen in the image itself."""
+    """Return the lattices `found` in an image as detections on the boards' grids, with missed corners added.
+
+    With `picture`, corners are added in that resampled part, in whose pixels the result is; the borders of boards are
+    evaluated in the image itself.
+    """
     sizes = tuple(dict.fromkeys(board.size for board in boards))
     lattices = [known_part(item, sizes) for item in found]
     placed = _placed(grey, lattices, boards, camera)
@@ -66,14 +69,14 @@ def _in_image(
 
 
 def _out_of(picture: Resampled, found: BoardDetection) -> BoardDetection:
-    """Return what was found in a part of an image as it lies in the image."""
+    """Return a detection in a resampled part of an image in pixels of the image."""
     return replace(found, pixels=picture.back(found.pixels), sigma_px=picture.sigma_factor * found.sigma_px)
 
 
 def _placed(
     grey: GreyImage, lattices: Sequence[RefinedLattice], boards: Sequence[Board], camera: Camera | None
 ) -> list[RefinedLattice]:
-    """Return the grids with those that are parts of a board in their place, where that is known."""
+    """Return the lattices, those of parts of a board on the grid of the whole board where their position is known."""
     sizes = tuple(dict.fromkeys(board.size for board in boards))
     tried = [(item, place_part(grey, item, sizes) or _with_missed_line(grey, item, boards)) for item in lattices]
     placed = [item for _, item in tried if item is not None]
@@ -84,9 +87,9 @@ def _placed(
 
 
 def _with_missed_line(grey: GreyImage, item: RefinedLattice, boards: Sequence[Board]) -> RefinedLattice | None:
-    """Return a lattice that lacks one row or column of a board on the board's grid; None where that place is open.
+    """Return a lattice that lacks one row or column of a board on the board's grid; None if its position is ambiguous.
 
-    Blur and motion hide how a board ends (`place_part`), but the corners missed are seen on one side of the two.
+    With blur and motion the border of the board is not visible (`place_part`), but some of the missed corners are.
     """
     options = []
     for board in boards:

@@ -1,4 +1,4 @@
-"""How each pattern is searched for. Adding one is one file and one line here."""
+"""The finder of each pattern. A new one needs a module and a line here."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ FINDERS: dict[str, Finder] = {
     Circles.type: CirclesFinder(),
     Chessboard.type: ChessboardFinder(),
 }
-"""In this order: what is known by its marks first, chessboards, which are what is left, last."""
+"""In this order: boards with markers first; chessboards, which use the remaining lattices, last."""
 
 
 def check_searchable(boards: Sequence[Board]) -> None:
-    """Raise InputError where no finder looks for the pattern of one of `boards`: it would be missing in every image."""
+    """Raise InputError if there is no finder for the pattern of one of `boards`."""
     for board in boards:
         if board.pattern.type not in FINDERS:
             raise InputError(
