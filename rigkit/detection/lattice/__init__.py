@@ -1,1 +1,1 @@
-"""From loose corners to grids: links, growth, where a grid splits."""
+"""Lattices from loose corners: links, growth, splitting and joining."""

@@ -1,7 +1,7 @@
-"""Growing a lattice ring by ring: fills holes, reaches the edges of the board, and never jumps to another board.
+"""Growth of a lattice ring by ring, filling holes, up to the border of the board.
 
-Each empty cell next to known corners is predicted from its neighbourhood; a saddle near the prediction is taken if it
-is a corner with the polarity and the directions that the lattice demands and if the edges to its neighbours are seen.
+Each empty cell next to known corners is predicted from its neighbourhood. A saddle near the prediction is added if it
+is a corner of the expected polarity and directions, and if there are edges to its neighbours.
 """
 
 from __future__ import annotations
@@ -29,52 +29,52 @@ from rigkit.kernels.front import near_any
 from rigkit.kernels.growth import FitRules, GridBuckets, GrowthRules, grown
 
 MAX_RINGS = 60
-"""More rings than any board has rows or columns."""
+"""Upper bound of the rings, more than any board has rows or columns."""
 
 ROOM = 6
-"""Empty rows and columns around a lattice for it to grow into, before it is given more."""
+"""Empty rows and columns added around a lattice at a time, into which it grows."""
 
 FIT_WIDTH, FIT_RADIUS = 1.3, 3
-"""Standard deviation of the weight and reach of the predictions, cells."""
+"""Standard deviation of the Gaussian weight of the predictions, and their radius, cells."""
 
 MIN_PREDICTING = 3
-"""Known corners that foretell another."""
+"""Smallest number of corners of a prediction."""
 
 MAX_GROWN, MAX_FAILED_GROWTHS = 96, 16
-"""So many lattices are grown, or so many in a row without a board: those of boards come first, being larger, and
-clutter can make hundreds, of one square each."""
+"""Largest number of lattices that are grown, and of successive ones that are no boards: boards come first, being
+larger, while clutter may give hundreds of single squares."""
 
 GROWTH_REACH = 0.25
-"""A corner lies within this of its prediction, in cells."""
+"""Largest distance of a corner from its prediction, in cells."""
 
 MAX_SADDLES_TRIED = 6
-"""Saddles tried for a cell."""
+"""Largest number of saddles tried per cell."""
 
 RING = 0.3
-"""Radius of the ring in heights of the cell: well inside the four squares."""
+"""Radius of the ring in heights of the cell, so that it is within the four squares."""
 
 MIN_RING_PX, MAX_RING_PX = 2.2, 9.0
 
 ODD, CENTRE = 0.35, 0.35
-"""As `ring.MAX_ODD` and `ring.MAX_CENTRE`, for a saddle whose place and directions the lattice foretells: the edge of a
-shadow may cross it, and the ring may reach beyond the squares of flat or small cells."""
+"""As `ring.MAX_ODD` and `ring.MAX_CENTRE`, but larger, as the lattice predicts position and directions of the saddle: a
+shadow edge may cross it, and the ring may extend beyond the squares of oblique or small cells."""
 
 LINE_SINE = float(np.sin(np.radians(25.0)))
-"""How well the ring's lines must follow the lattice."""
+"""Sine of the largest angle between the ring's lines and the lattice."""
 
 MIN_AREA_PX2 = 1.0
-"""Cells of fewer px^2 are none."""
+"""Smallest area of a cell, px^2."""
 
 GROWN_AGAIN_PX = 1.4
-"""Corners nearer than this are one: found again on a coarser level."""
+"""Corners closer than this are the same, found on two levels."""
 
 
 def grow_all(
     lattices: Iterable[Lattice], saddles: Saddles, level: Level, plausible: Callable[[Lattice], bool]
 ) -> list[Lattice]:
-    """Return the lattices grown from `lattices` one by one to `saddles`, without what others have grown over.
+    """Return the lattices grown from `lattices` to `saddles`, one by one, skipping those that others cover already.
 
-    Those that are not `plausible`, as soon as there is enough of them to tell, are left out.
+    Lattices that are not `plausible` are left out.
     """
     out: list[Lattice] = []
     taken = np.zeros((0, 2))
@@ -106,9 +106,9 @@ def _covered(lattice: Lattice, corners: FloatArray) -> bool:
 def _grown(
     lattice: Lattice, saddles: GridBuckets, level: Level, plausible: Callable[[Lattice], bool]
 ) -> tuple[Lattice, bool]:
-    """Return `lattice` with all corners that can be added one after the other, and whether it is `plausible`.
+    """Return the grown `lattice`, and whether it is `plausible`; brightness is read from `level`.
 
-    Brightness is read from `level`. A lattice that is not promising may not be fully grown.
+    Large lattices are tested early; one that is not plausible may not be fully grown.
     """
     rings, judged = MAX_RINGS, False
     while rings > 0:
@@ -116,20 +116,13 @@ def _grown(
             if not plausible(lattice):
                 return lattice, False
             judged = True
+        # The kernel changes these arrays until it reaches their border or adds no more (rings -1).
         wide = lattice.padded((ROOM, ROOM), (ROOM, ROOM))
-        rings = _grow(wide, saddles, level, rings)
+        sheet = (wide.pixels, wide.contrast, 1.0 if wide.rising else -1.0)
+        rings = grown(*sheet, level.smooth, level.scale, level.offset, saddles, _rules(), rings)
         if wide.count > lattice.count:
             lattice = wide.trimmed()
     return lattice, judged or plausible(lattice)
-
-
-def _grow(lattice: Lattice, saddles: GridBuckets, level: Level, rings: int) -> int:
-    """Grow a `lattice` that nobody has looked at yet IN PLACE, by at most so many `rings`, each from all known before.
-
-    Returns the rings that are left when it has reached the border of its arrays, -1 when it has grown all it can.
-    """
-    sheet = (lattice.pixels, lattice.contrast, 1.0 if lattice.rising else -1.0)
-    return grown(*sheet, level.smooth, level.scale, level.offset, saddles, _rules(), rings)
 
 
 @cache

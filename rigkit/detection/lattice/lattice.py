@@ -1,7 +1,7 @@
-"""Linked corners as lattices: rows and columns for every board.
+"""Lattices: linked corners in rows and columns.
 
-Grid directions 0, 1, 2, 3 are +column, +row, -column, -row; with the angle growing from u to v they follow each other
-like the arms of a corner, so every lattice comes out right-handed (columns, rows, away from the viewer).
+Grid directions 0, 1, 2, 3 are +column, +row, -column, -row, in the order of the arms of a corner, with the angle
+growing from u to v. Every lattice is therefore right-handed (columns, rows, away from the viewer).
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from rigkit.detection.saddles.saddle import Corners
 from rigkit.kernels.growth import components_of
 
 MANY = 200
-"""Lattices of so many corners are judged by a part of them before anything else is done with them."""
+"""Lattices with so many corners are first tested by a sample."""
 
 BLOCKS = ((3, 3, 1), (2, 4, 0), (4, 2, 0))
-"""Rows, columns and missing corners of the least that shows a board: squares of random brightness that happen to
-alternate hang together in crooked chains."""
+"""Rows, columns and missing corners of the smallest blocks that indicate a board: squares of random brightness that
+happen to alternate form crooked chains."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Corners of one board, or of a part of it, which do not change: what is asked of them often is kept.
+    """Corners of one board, or of a part of it; immutable, so that properties are cached.
 
     Attributes
     ----------
     pixels : (R, C, 2) full resolution, NaN where no corner is known.
     contrast : (R, C) grey levels, NaN likewise.
-    rising : whether brightness grows with the angle across the +column edge of the corner (0, 0); it alternates over
+    rising : whether brightness increases with the angle across the +column edge of corner (0, 0); it alternates over
         the lattice like the squares.
     """
 
@@ -54,7 +54,7 @@ class Lattice:
 
     @cached_property
     def solid(self) -> bool:
-        """Whether it has all corners of BLOCKS rows and columns somewhere, or of a larger block all but one."""
+        """Whether it contains one of BLOCKS."""
         if self.count == self.known.size and min(self.size) >= 3:
             return True
         known = self.known.astype(np.uint8)
@@ -70,23 +70,23 @@ class Lattice:
         return (self.pixels.shape[1], self.pixels.shape[0])
 
     def signs(self) -> FloatArray:
-        """Return (R, C): +1 where brightness grows with the angle across the +column edge, else -1."""
+        """Return (R, C): +1 where brightness increases with the angle across the +column edge, else -1."""
         signs = np.full(self.pixels.shape[:2], self.sign_at(0, 0))
         signs[1::2, ::2] *= -1.0
         signs[::2, 1::2] *= -1.0
         return signs
 
     def sign_at(self, row: int, column: int) -> float:
-        """Return +1 where brightness grows with the angle across the +column edge of a corner, else -1."""
+        """Return +1 if brightness increases with the angle across the +column edge of a corner, else -1."""
         return 1.0 if self.rising != ((row + column) % 2 == 1) else -1.0
 
     def padded(self, rows: tuple[int, int], columns: tuple[int, int]) -> Lattice:
-        """Return the lattice with so many empty rows and columns before and after it."""
+        """Return the lattice with numbers of empty rows and columns added before and after."""
         odd = (rows[0] + columns[0]) % 2 == 1
         return Lattice(padded(self.pixels, rows, columns), padded(self.contrast, rows, columns), self.rising != odd)
 
     def filled(self, other: Lattice) -> Lattice:
-        """Return the lattice with the corners of `other`, of the same size, where it has none."""
+        """Return the lattice with missing corners taken from `other`, of the same size."""
         known = self.known
         return Lattice(
             np.where(known[..., None], self.pixels, other.pixels),
@@ -100,7 +100,7 @@ class Lattice:
         return Lattice(self.pixels[rows, columns], self.contrast[rows, columns], self.rising != odd)
 
     def without(self, drop: BoolArray) -> Lattice:
-        """Return the lattice with the corners `drop` (R, C) forgotten."""
+        """Return the lattice without the corners `drop` (R, C)."""
         pixels = np.where(drop[..., None], np.nan, self.pixels)
         return Lattice(pixels, np.where(drop, np.nan, self.contrast), self.rising)
 
@@ -132,15 +132,15 @@ class Lattice:
 
 
 def turned(values: FloatArray, quarter_turns: int) -> FloatArray:
-    """Return what belongs to the corners of a lattice (R, C, ...) for `Lattice.turned`; np.rot90 takes ten times as
-    long."""
+    """Return `values` (R, C, ...) of the corners of a lattice as for `Lattice.turned`, ten times as fast as
+    np.rot90."""
     for _ in range(quarter_turns % 4):
         values = values.swapaxes(0, 1)[:, ::-1]
     return values
 
 
 def padded(values: FloatArray, rows: tuple[int, int], columns: tuple[int, int]) -> FloatArray:
-    """Return `values` (R, C, ...) with so many rows and columns of NaN before and after."""
+    """Return `values` (R, C, ...) with numbers of rows and columns of NaN added before and after."""
     height, width = values.shape[:2]
     out = np.full((rows[0] + height + rows[1], columns[0] + width + columns[1], *values.shape[2:]), np.nan)
     out[rows[0] : rows[0] + height, columns[0] : columns[0] + width] = values
@@ -151,10 +151,7 @@ Margins = tuple[tuple[int, int], tuple[int, int]]
 
 
 def margins(one: tuple[int, int], two: tuple[int, int], shift: IntArray) -> tuple[Margins, Margins]:
-    """Return the rows and columns to pad two lattices with that lie `shift` (columns, rows) off each other.
-
-    `one` and `two` are their (columns, rows).
-    """
+    """Return the padding of two lattices of sizes `one` and `two`, the second shifted by `shift` (columns, rows)."""
     low = np.minimum(0, shift)
     size = np.maximum(one, shift + np.array(two)) - low
     first, second = (
@@ -165,12 +162,12 @@ def margins(one: tuple[int, int], two: tuple[int, int], shift: IntArray) -> tupl
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LatticeStack:
-    """Several lattices one below the other in common arrays, with GAP empty rows between: one call serves them all.
+    """Several lattices one below the other in common arrays, with GAP empty rows between, to be processed at once.
 
     Attributes
     ----------
     pixels : (R, C, 2), contrast : (R, C), NaN where unknown; signs : (R, C) as `Lattice.signs`, 0 outside.
-    parts : where each lattice lies.
+    parts : rows and columns of each lattice.
     """
 
     GAP: ClassVar[int] = 4
@@ -195,7 +192,7 @@ class LatticeStack:
 
 
 def build_lattices(corners: Corners, links: Links) -> Iterator[Lattice]:
-    """Return the lattices that closed squares of four linked corners make up, the largest first."""
+    """Yield the lattices formed by closed squares of four linked corners, the largest first."""
     count, label, grid, turn, members = components_of(links.state)
     sizes = np.bincount(label[label >= 0], minlength=count)
     ends = np.cumsum(sizes)
@@ -207,9 +204,9 @@ def build_lattices(corners: Corners, links: Links) -> Iterator[Lattice]:
 
 
 def _lattice(corners: Corners, mine: IntArray, cells: IntArray, turn: int) -> Lattice | None:
-    """Return the lattice of the corners `mine` (N,) in the `cells` (N, 2), without those that share one.
+    """Return the lattice of the corners `mine` (N,) in the `cells` (N, 2), without corners in the same cell.
 
-    `turn` is the arm of the first corner that points to +column. None where less than a square is left.
+    `turn` is the arm of the first corner that points to +column. None if fewer than four corners remain.
     """
     cells = cells - cells.min(axis=0)
     columns, rows = (int(last) + 1 for last in cells.max(axis=0))

@@ -1,8 +1,8 @@
-"""Which corners are neighbours along an edge of a chessboard.
+"""Links between corners that are neighbours along an edge of a chessboard.
 
-Only local evidence counts, so any number of boards, any perspective and any lens will do. The two corners lie in the
-direction of each other's arms, and one sees the edge rise where the other sees it fall. The brightness along the way is
-dark on one side and bright on the other as the arms say.
+Links use local evidence only, for any number of boards, any perspective and any lens. Each corner is in the direction
+of an arm of the other, the two arms have opposite polarity, and the edge between them is dark and bright on the sides
+that the arms predict.
 """
 
 from __future__ import annotations
@@ -19,24 +19,25 @@ from rigkit.detection.saddles.saddle import Corners
 from rigkit.kernels import front
 
 NEIGHBOURS = 48
-"""Nearest corners looked at: enough to reach across a board that is foreshortened four times, past those that noise
-adds along its narrow squares."""
+"""Nearest corners considered: enough on a board foreshortened four times, with false corners between its narrow
+squares."""
 
 ARM_COSINE = np.cos(np.radians(18.0))
-"""How well the chord must follow the arms at both ends; fisheye rows bend by less within a square."""
+"""Cosine of the largest angle between the chord and the arms at both ends; fisheye rows bend less within a square."""
 
 CONTRAST_RATIO = 0.25
-"""Neighbours differ less than this in contrast, also across a shadow's edge."""
+"""Smallest ratio of the contrasts of neighbours, also across a shadow edge."""
 
 LENGTH_RATIO = 2.1
-"""Opposite neighbours differ less than this in distance, in any perspective a board can be read in."""
+"""Largest ratio of the distances to opposite neighbours, in any perspective."""
 
 EDGE_PLACES = np.array([0.5, 0.35, 0.65, 0.2, 0.8])
 MIN_EDGE_PLACES = 4
-"""An edge shows the right side dark at this many of these parts of its length. Their order rejects clutter soonest."""
+"""Positions along an edge that are tested, in the order that rejects clutter soonest, and the smallest number of them
+at which the expected side is dark."""
 
 LATERAL_LENGTHS, MIN_LATERAL_PX, MAX_LATERAL_PX = 0.12, 1.0, 4.0
-"""How far to the sides of an edge the brightness is read: a part of its length, within bounds."""
+"""Distance from an edge at which brightness is read: a part of its length, within bounds."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -45,7 +46,7 @@ class Links:
 
     Attributes
     ----------
-    state : (N, 4) along each arm 4 * the neighbour + the arm of it that points back, -1 for none.
+    state : (N, 4) of each arm 4 * neighbour + the neighbour's arm that points back; -1 for none.
     """
 
     state: IntArray
@@ -62,9 +63,9 @@ class Links:
 
 
 def find_links(corners: Corners, level: Level, length_ratio: float = LENGTH_RATIO) -> Links:
-    """Return the mutual neighbours among `corners`; the brightness is read from `level` (the finest).
+    """Return the mutual neighbours among `corners`; brightness is read from `level` (the finest).
 
-    `length_ratio` : most that the distances of opposite neighbours differ by.
+    `length_ratio` : largest ratio of the distances to opposite neighbours.
     """
     count = len(corners)
     if count < 4:
@@ -98,6 +99,6 @@ def _link_rules(length_ratio: float) -> front.LinkRules:
 
 
 def _bounds(contrast: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the least and the most contrast of what corners of `contrast` (N,) may be linked with, by half octaves."""
+    """Return bounds of the contrast of possible neighbours of corners of `contrast` (N,), rounded to half octaves."""
     band = np.floor(2.0 * np.log2(np.maximum(contrast, 1e-6)))
     return CONTRAST_RATIO * 2.0 ** (0.5 * band), 2.0 ** (0.5 * (band + 1.0)) / CONTRAST_RATIO

@@ -1,4 +1,4 @@
-"""Local polynomial fits to a lattice of corners: where the next corner is, which way the rows run, how they bend."""
+"""Local polynomial fits to a lattice of corners: positions of predicted corners, directions and curvature of rows."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rigkit.kernels.lattice import line_gaps
 
 
 class Prediction(NamedTuple):
-    """How a corner is foretold from those around it.
+    """Parameters of the prediction of a corner from its neighbours.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class Prediction(NamedTuple):
 
 
 STIFF, FLEXIBLE = Prediction(2, (0.02, 1.0)), Prediction(3, (1e-3, 1e-2))
-"""One is steady with few neighbours, the other follows the rim of a fisheye."""
+"""STIFF is stable with few neighbours, FLEXIBLE follows the rows at the rim of a fisheye."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -39,7 +39,7 @@ class LocalFit:
     pixels : position at the cell itself.
     sides : (M, 2, 2) first derivatives, along the column direction and along the row direction.
     curvatures : (M, 2, 2) second derivatives likewise.
-    support : (M,) number of corners behind the fit.
+    support : (M,) number of corners of the fit.
     gain : (M,) standard deviation of `pixels` for corners of standard deviation 1.
     """
 
@@ -66,21 +66,21 @@ class LocalFit:
         return self.curvatures[:, 1]
 
     def of(self, chosen: BoolArray) -> LocalFit:
-        """Return the same of the cells chosen (M,)."""
+        """Return the fits of the cells chosen (M,)."""
         return LocalFit(*(getattr(self, name)[chosen] for name in self.__slots__))
 
     def areas(self) -> FloatArray:
-        """Return the areas (M,) of the cells, px^2, negative where they are folded over."""
-        return _cross(*self.sides.transpose(1, 2, 0))
+        """Return the areas (M,) of the cells, px^2, negative if they are folded over."""
+        a, b = self.sides.transpose(1, 2, 0)
+        return np.asarray(a[0] * b[1] - a[1] * b[0])
 
     def shorter_px(self) -> FloatArray:
         """Return the shorter sides (M,) of the cells, px."""
         return np.asarray(np.linalg.norm(self.sides, axis=2).min(axis=1))
 
     def cell_px(self) -> FloatArray:
-        """Return the sides (M,) of squares as large as the cells, px, at least 1."""
-        side: FloatArray = np.sqrt(np.maximum(self.areas(), 1.0))
-        return side
+        """Return the square roots (M,) of the areas of the cells, px, at least 1."""
+        return np.asarray(np.sqrt(np.maximum(self.areas(), 1.0)))
 
     def curvature(self) -> FloatArray:
         """Return the curvature of the column and the row line at the cells, (M, 2) 1/px, positive towards +90 degrees.
@@ -92,18 +92,12 @@ class LocalFit:
         return curvature
 
     def gaps(self) -> FloatArray:
-        """Return how far the neighbouring column and row lines lie from those through the cells, (M, 2, 2) px.
+        """Return the distances (M, 2, 2), px, of the neighbouring column and row lines from those through the cells.
 
-        First index: the column line, the row line; second: before and after, in the direction of +90 degrees. A cell
-        without sides has no neighbours: NaN.
+        First index: the column line, the row line; second: before and after, in the direction of +90 degrees. NaN for a
+        cell whose sides are zero.
         """
         return line_gaps(self.sides, self.curvatures)
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the cross products of vectors (2, M)."""
-    cross: FloatArray = a[0] * b[1] - a[1] * b[0]
-    return cross
 
 
 def fit_cells(
@@ -121,10 +115,10 @@ def fit_cells(
     Parameters
     ----------
     lattice : (R, C, 2) pixels, NaN where unknown.
-    cells : (R, C) bool, the M cells wanted, row by row.
+    cells : (R, C) bool, the M cells to be fitted, row by row.
     width : standard deviation in cells of the Gaussian weight.
-    ridge : pull on the second and third derivatives, as variances of a corner (squared cells): keeps what few
-        neighbours leave open from running wild.
+    ridge : regularisation of the second and third derivatives, as variances of a corner (squared cells), for cells
+        with few neighbours.
     leave_out : ignore the corner of the cell itself, to predict it from its neighbours.
     """
     return _local_fit(fit(lattice, cells, _rules(degree, radius, leave_out, width, ridge)))
@@ -137,12 +131,11 @@ def _rules(degree: int, radius: int, leave_out: bool, width: float, ridge: tuple
 
 def _local_fit(rows: FloatArray) -> LocalFit:
     """Return the fit from `rows` (M, 12): the fields of `LocalFit` one after the other."""
-    # By themselves in memory, as kernels take them.
+    # Contiguous, as kernels require.
     sides, curvatures = (np.ascontiguousarray(rows[:, k : k + 4]).reshape(-1, 2, 2) for k in (2, 6))
     return LocalFit(rows[:, :2], sides, curvatures, rows[:, 10], rows[:, 11])
 
 
 def predicted(lattice: FloatArray, cells: BoolArray) -> LocalFit:
-    """Return the fit that says where unknown corners (`cells`) are: of second degree and so damped that a few corners
-    on one side are enough."""
+    """Return the fit that predicts unknown corners (`cells`), of degree 2 and damped for few neighbours on one side."""
     return fit_cells(lattice, cells, degree=2, ridge=(1e-3, 1.0))

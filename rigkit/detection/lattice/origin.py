@@ -1,9 +1,9 @@
-"""Which corner of a lattice is the first, as far as one image can tell.
+"""The convention for the first corner of a lattice in a single image.
 
-Convention: the square diagonally outside the first corner, at grid (-1..0, -1..0), is BLACK, and the board has its
-known size, columns x rows (columns >= rows where no size is known). That leaves one choice where columns + rows is odd,
-two where it is even (the board looks the same turned by 180 degrees), and up to four for square boards. What is left is
-settled by the image: the choice whose columns and rows run most nearly to the right and down.
+The square diagonally outside the first corner, at grid (-1..0, -1..0), is BLACK, and the board has its known size,
+columns x rows (columns >= rows without a known size). This leaves one choice if columns + rows is odd, two if it is
+even (the board is symmetric under rotation by 180 degrees), and up to four for square boards. Among these the one whose
+columns and rows point most nearly to the right and down is chosen.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from rigkit.detection.lattice.lattice import Lattice
 
 
 def quarter_turns(lattice: Lattice, sizes: Sequence[tuple[int, int]] = ()) -> int:
-    """Return by how many quarter turns `lattice` follows the convention; `sizes` are the known (columns, rows)."""
+    """Return the quarter turns after which `lattice` follows the convention; `sizes` are the known (columns, rows)."""
     columns, rows = lattice.size
     turned = [(columns, rows), (rows, columns), (columns, rows), (rows, columns)]
     fits = [size in sizes for size in turned]
     if not any(fits):
         fits = [size[0] >= size[1] for size in turned]
-    # The first corners of the four turns, and whether the edge that becomes +column has the sign of the old +column.
+    # Whether brightness rises across the +column edge of the first corner after each of the four turns.
     rising = [
         lattice.sign_at(0, 0) > 0.0,
         lattice.sign_at(rows - 1, 0) < 0.0,
@@ -38,7 +38,7 @@ def quarter_turns(lattice: Lattice, sizes: Sequence[tuple[int, int]] = ()) -> in
 
 
 def _downwards(lattice: Lattice) -> list[float]:
-    """Return how far columns and rows together run to the right and down after 0 to 3 quarter turns, in cells."""
+    """Return the extent of columns plus rows to the right and down after 0 to 3 quarter turns, in cells."""
     pixels = lattice.pixels
     (x1, y1), (x2, y2) = _mean(pixels[:, 1:] - pixels[:, :-1]), _mean(pixels[1:] - pixels[:-1])
     longest = max(math.hypot(x1, y1), math.hypot(x2, y2), 1e-9)

@@ -1,4 +1,4 @@
-"""How evenly the rows and columns of a lattice run: how neighbouring steps along them differ."""
+"""Differences of successive steps along the rows and columns of a lattice."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from rigkit.kernels import lattice as native
 
 
 class SpacingChange(NamedTuple):
-    """How the steps before and after the inner corners of the rows differ, relative to the shorter step.
+    """Difference of the steps before and after inner corners of the rows, relative to the shorter step.
 
     Attributes
     ----------
-    typical : the median of each inner column, NaN where nothing is known; seen : the number of corners behind it.
+    typical : median over each inner column, NaN where unknown; seen : its number of corners.
     every : the (upper) median of all, NaN likewise.
     """
 
@@ -23,9 +23,11 @@ class SpacingChange(NamedTuple):
 
 
 def spacing_changes(pixels: FloatArray) -> tuple[SpacingChange, SpacingChange]:
-    """Return how uneven the rows of `pixels` (R, C, 2) are, and its columns; NaN where no corner is known."""
+    """Return the differences along the rows and along the columns of `pixels` (R, C, 2), NaN where unknown."""
     typical, seen, every = native.uneven_steps(pixels)
     inner = max(pixels.shape[1] - 2, 0)
-    return SpacingChange(typical[:inner], seen[:inner], every[0]), SpacingChange(
-        typical[inner:], seen[inner:], every[1]
+    rows, columns = slice(0, inner), slice(inner, None)
+    return (
+        SpacingChange(typical[rows], seen[rows], every[0]),
+        SpacingChange(typical[columns], seen[columns], every[1]),
     )

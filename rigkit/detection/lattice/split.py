@@ -1,7 +1,7 @@
-"""Where one lattice is really several boards, and where several lattices are really one board.
+"""Splitting lattices that contain several boards, and joining lattices that are parts of one board.
 
-Boards whose squares touch grow together into one lattice with a discontinuity there: it is split. A ruler across a
-board cuts its lattice in two that continue each other: they are joined.
+Boards whose squares touch grow into one lattice with a discontinuity, where it is split. An object across a board cuts
+its lattice into parts that continue each other, which are joined.
 """
 
 from __future__ import annotations
@@ -22,50 +22,51 @@ from rigkit.detection.lattice.spacing import SpacingChange, spacing_changes
 
 MIN_TURN = 0.16
 TURN_FACTOR = 3.5
-"""A lattice folds at a row or column where neighbouring steps differ by more than this (relative to the step), and by
-more than this factor times what is typical of it: perspective and fisheyes bend everywhere, a discontinuity once."""
+"""A lattice is split at a row or column where successive steps differ by more than MIN_TURN (relative to the step) and
+TURN_FACTOR times their typical difference: perspective and fisheyes bend rows everywhere, a discontinuity at one
+place."""
 
 MIN_FOR_TYPICAL = 5
-"""Columns or rows needed to say what is typical."""
+"""Smallest number of columns or rows for a typical difference."""
 
 MIN_TURNED_ROWS = 4
-"""Rows that must fold at a column."""
+"""Smallest number of rows with a difference at a column."""
 
 CONTINUES_CELLS = 0.1
-"""A column that goes on smoothly lies this near to where the others say, in cells."""
+"""Largest median distance, in cells, between a column and its prediction by the columns that it continues."""
 
 GAP, SLANTED = 2, 3
-"""Parts of one board are at most so many steps apart along a row or column, or along both where so many corners see one
-of the other part: separate boards have their outer squares and margins between, or touch at a corner."""
+"""Largest gap between parts of one board, in steps along a row or column, or along both for SLANTED corners or more:
+separate boards have outer squares and margins between them, or touch at a corner."""
 
 FAR_GAP, FAR_MEETS_CELLS, FAR_OUT, FAR_FACING = 3, 0.1, 24, 2
-"""A step more if so many corners of the other part, and not only the nearest, are where they should be, and if two see
-one of the first along their row or column."""
+"""A larger gap is allowed if the nearest FAR_OUT corners of the other part agree with their predictions within
+FAR_MEETS_CELLS, and FAR_FACING of them have a corner of the first part along their row or column."""
 
 DIAGONAL, JOIN_REACH = 1.5, 3.3
-"""A diagonal step is so many times as long as a side, and a little more; the nearest corners of parts a step further
-apart are so many sides apart, at most."""
+"""Upper bounds of a diagonal step, and of the distance between the nearest corners across the larger gap, in sides."""
 
 NEAREST_IN, NEAREST_OUT = 16, 6
-"""Corners of the one part that carry its rows over, and of the other that must meet them."""
+"""Corners of one part that extrapolate its grid, and of the other part that must agree."""
 
 ALIKE = 0.5
-"""Sides of neighbouring cells across the gap differ less than this, relative to the longer side."""
+"""Largest difference of the sides of neighbouring cells across the gap, relative to the longer side."""
 
 MEETS_CELLS, MEETS_AT_ALL = 0.15, 0.42
-"""Corners of the other part lie this near to where a homography of the one says, in cells; within the larger of the
-two, a lens may have bent the rows, and the parts are asked what lies between them."""
+"""Largest distances, in cells, between corners of the other part and their predictions by a homography of the first. Up
+to the smaller one the parts agree; up to the larger one, due to lens distortion, `_agree` decides."""
 
 AGREES_CELLS, BETWEEN = 0.12, 8
-"""So far apart is what the two parts say of the cells between them, in cells, for the cells that both know best."""
+"""Largest median distance, in cells, between the predictions by two parts of the cells between them, and the number of
+such cells: those with the smallest standard deviations."""
 
 LOOSE_CELLS, MAX_HELD_GAIN = 0.08, 8.0
-"""A corner that hangs on to a lattice is this near to where the others say, in cells for a prediction as good as a
-corner itself, and by a prediction whose standard deviation is at most so many times that of a corner."""
+"""Largest distance of a loose corner from its prediction by a lattice, in cells and for the standard deviation of a
+corner, and largest standard deviation of the prediction over that of a corner."""
 
 
 def split_at_turns(lattice: Lattice) -> list[Lattice]:
-    """Return the parts of `lattice` between its folds; the corners on a fold belong to no board."""
+    """Return the parts of `lattice` between its discontinuities; corners on a discontinuity are dropped."""
     columns, rows = lattice.size
     along_rows, along_columns = spacing_changes(lattice.pixels)
     at = _sharpest_turn(rows, along_rows)
@@ -73,16 +74,16 @@ def split_at_turns(lattice: Lattice) -> list[Lattice]:
         return [part for half in _halves(lattice, at) for part in split_at_turns(half)]
     at = _sharpest_turn(columns, along_columns)
     if at is not None:
-        # A quarter turn makes the row into a column, numbered from the other end.
+        # After a quarter turn the row is a column, numbered from the other end.
         halves = _halves(lattice.turned(1), rows - 1 - at)
         return [part.turned(3) for half in halves for part in split_at_turns(half)]
     return [lattice]
 
 
 def _halves(lattice: Lattice, at: int) -> tuple[Lattice, Lattice]:
-    """Return what lies on either side of the column `at`, which goes with the one side whose rows it continues.
+    """Return the parts on either side of column `at`, which belongs to the part whose rows it continues.
 
-    A column on the discontinuity itself continues both, and is dropped.
+    If it continues both or none, it is dropped.
     """
     columns, rows = lattice.size
     every = slice(0, rows)
@@ -93,7 +94,7 @@ def _halves(lattice: Lattice, at: int) -> tuple[Lattice, Lattice]:
 
 
 def _continues(lattice: Lattice, part: slice, at: int) -> bool:
-    """Return whether the corners of column `at` are where the columns `part` say."""
+    """Return whether the corners of column `at` agree with their predictions by the columns `part`."""
     pixels = np.full(lattice.pixels.shape, np.nan)
     pixels[:, part] = lattice.pixels[:, part]
     cells = np.zeros(lattice.known.shape, bool)
@@ -105,18 +106,18 @@ def _continues(lattice: Lattice, part: slice, at: int) -> bool:
 
 
 def split_necks(lattice: Lattice) -> list[Lattice]:
-    """Return the boards in `lattice`, without corners that are not where the others say.
+    """Return the boards in `lattice`, without corners that contradict the others.
 
-    Boards that touch at an odd angle hang together by a few corners that are none. So the broad parts of a lattice, of
-    nine corners in a square, belong together if they continue each other; the corners between them go to the part that
-    foretells them.
+    Boards that touch at an angle are connected by a few wrong corners. The broad parts of a lattice, blocks of 3 x 3
+    corners, are therefore kept together only if they continue each other; other corners are added to the part that
+    predicts them.
     """
     known = lattice.known
     if known.all() and min(known.shape) >= 2:
         return [lattice]
     groups: list[BoolArray] = []
     for broad in _broad_parts(known):
-        # Mostly there is one, which nothing is compared with.
+        # Usually there is only one.
         part = _LatticePart.of(lattice.without(~broad)) if groups else None
         for number, group in enumerate(groups):
             if part is not None and _same_board(_LatticePart.of(lattice.without(~group)), part):
@@ -129,7 +130,7 @@ def split_necks(lattice: Lattice) -> list[Lattice]:
 
 
 def _broad_parts(known: BoolArray) -> list[BoolArray]:
-    """Return the parts of `known` (R, C) that squares of nine corners (or else of four) make up, the largest first."""
+    """Return the parts of `known` (R, C) covered by blocks of 3 x 3 corners (or else 2 x 2), the largest first."""
     for side in (3, 2):
         square = np.ones((side, side), np.uint8)
         fits = cv2.erode(known.astype(np.uint8), square, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT, borderValue=0)
@@ -152,7 +153,7 @@ def _same_board(one: _LatticePart, two: _LatticePart) -> bool:
 
 
 def _absorb(lattice: Lattice, groups: list[BoolArray]) -> None:
-    """Add the other corners of `lattice`, ring by ring, to those of the `groups` (IN PLACE) that foretell them."""
+    """Add the other corners of `lattice`, ring by ring, to the `groups` (IN PLACE) that predict them."""
     loose = lattice.known & ~np.any(groups, axis=0) if groups else np.zeros_like(lattice.known)
     while loose.any():
         off = np.full((len(groups), *loose.shape), np.inf)
@@ -173,7 +174,8 @@ def _absorb(lattice: Lattice, groups: list[BoolArray]) -> None:
 
 
 def _sharpest_turn(rows: int, uneven: SpacingChange) -> int | None:
-    """Return the column at which so many rows, as `uneven` as that, fold; None if they do not."""
+    """Return the column with the largest difference of steps if it is a discontinuity of most of the `rows`, else
+    None."""
     least = max(MIN_TURNED_ROWS, 0.4 * rows)
     steps = enumerate(zip(uneven.typical, uneven.seen, strict=True), start=1)
     judged = [(bend, -column) for column, (bend, count) in steps if count >= least]
@@ -185,7 +187,7 @@ def _sharpest_turn(rows: int, uneven: SpacingChange) -> int | None:
 
 
 def join_parts(lattices: Sequence[Lattice]) -> list[Lattice]:
-    """Return `lattices` with those joined that continue each other's rows and columns across a short gap."""
+    """Return `lattices`, joining those that continue each other's rows and columns across a short gap."""
     ordered = [item for item in sorted(lattices, key=lambda item: -item.count) if item.count >= 6]
     if len(ordered) < 2:
         return ordered
@@ -234,7 +236,7 @@ class _LatticePart:
 
 
 def _near(parts: Sequence[_LatticePart]) -> list[tuple[int, int]]:
-    """Return the pairs whose bounding boxes come within FAR_GAP sides of a cell of the first, at its largest."""
+    """Return the pairs whose bounding boxes are within FAR_GAP of the longest sides of the first part's cells."""
     if len(parts) < 2:
         return []
     low, high = np.array([item.low for item in parts]), np.array([item.high for item in parts])
@@ -244,7 +246,7 @@ def _near(parts: Sequence[_LatticePart]) -> list[tuple[int, int]]:
 
 
 def _joined(one: _LatticePart, two: _LatticePart) -> Lattice | None:
-    """Return both lattices in one, None if `two` does not continue `one`."""
+    """Return both lattices joined, None if `two` does not continue `one`."""
     squared = _squared_gaps(one, two)
     nearest = divmod(int(squared.argmin()), len(two.pixels))
     separation = math.sqrt(squared[nearest])
@@ -275,10 +277,10 @@ def _joined(one: _LatticePart, two: _LatticePart) -> Lattice | None:
 
 
 def _agree(pixels: FloatArray, one: BoolArray, two: BoolArray) -> bool:
-    """Return whether two parts of the corners `pixels` (R, C, 2) say the same of the cells between them.
+    """Return whether two parts of the corners `pixels` (R, C, 2) predict the same positions of the cells between them.
 
-    Each goes on as a smooth surface to half way, whatever the lens: the stiffer one bears corners that the ruler covers
-    in part, the more pliant one rows that bend strongly.
+    Smooth surfaces extrapolate each part for any lens: the stiffer one tolerates partly covered corners, the more
+    flexible one follows strongly bent rows.
     """
     reach = np.ones((2 * GAP + 1, 2 * GAP + 1), np.uint8)
     between = (cv2.dilate(one.astype(np.uint8), reach) > 0) & (cv2.dilate(two.astype(np.uint8), reach) > 0)
@@ -306,7 +308,8 @@ def _squared_gaps(one: _LatticePart, two: _LatticePart) -> FloatArray:
 
 
 def _carried_over(one: _LatticePart, two: _LatticePart, squared: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the FAR_OUT nearest corners of `two` and their (column, row) as the NEAREST_IN of `one` say, or infinity.
+    """Return the FAR_OUT nearest corners of `two` and their (column, row) extrapolated from `one`; infinity if
+    impossible.
 
     `squared` (N, M) are the `_squared_gaps`.
     """
@@ -321,7 +324,7 @@ def _carried_over(one: _LatticePart, two: _LatticePart, squared: FloatArray) -> 
 
 
 def _alike(one: _Cell, two: _Cell) -> bool:
-    """Return whether the cell `two` is much the same as `one` after some quarter turn."""
+    """Return whether the cell `two` is similar to `one` after some quarter turn."""
     most = ALIKE * max(abs(x) for side in one for x in side)
     (u1, v1), (u2, v2) = two
     for _ in range(4):
@@ -332,13 +335,16 @@ def _alike(one: _Cell, two: _Cell) -> bool:
 
 
 def _facing(one: Lattice, two: Lattice, steps: int, shape: int = cv2.MORPH_CROSS) -> int:
-    """Return how many corners of `two` have one of `one` at most so many steps along row or column (or both)."""
+    """Return how many corners of `two` have a corner of `one` within `steps` along row or column (or both)."""
     reach = cv2.getStructuringElement(shape, (2 * steps + 1, 2 * steps + 1))
     return int(np.count_nonzero((cv2.dilate(one.known.astype(np.uint8), reach) > 0) & two.known))
 
 
 def _united(one: Lattice, two: Lattice, shift: IntArray, near: bool, far: bool) -> Lattice | None:
-    """Return `two`, moved by `shift` (columns, rows), put into `one`; None if they overlap, differ or are far apart."""
+    """Return `one` joined with `two` shifted by `shift` (columns, rows).
+
+    None if they overlap, have different colours, or have a too large gap.
+    """
     first, second = (item.padded(*m) for item, m in zip((one, two), margins(one.size, two.size, shift), strict=True))
     if first.rising != second.rising or (first.known & second.known).any():
         return None
