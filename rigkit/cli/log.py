@@ -62,9 +62,18 @@ class _InFile(logging.FileHandler):
 
 
 class _OnStderr(logging.Handler):
-    """Writes to what `sys.stderr` is at that moment; a stderr that is closed loses notes, not results."""
+    """Writes to the current `sys.stderr`, and each warning once a run: a damaged file may be read several times. A
+    stderr that is closed loses notes, not results."""
+
+    def __init__(self, level: int) -> None:
+        super().__init__(level)
+        self._warnings: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno == logging.WARNING:
+            if record.getMessage() in self._warnings:
+                return
+            self._warnings.add(record.getMessage())
         try:
             print("\n".join(map(printable, self.format(record).split("\n"))), file=sys.stderr)
         except (OSError, ValueError):

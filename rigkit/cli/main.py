@@ -19,7 +19,7 @@ from typing import Any
 from rigkit.cli.examples import EXAMPLES, FIRST_STEPS
 from rigkit.cli.log import add_log_arguments, logged_run, logging_to
 from rigkit.cli.surroundings import SURROUNDINGS, Terminated, open_streams, say, settle_stderr, signals_interrupt
-from rigkit.core.errors import ExitCode, RigkitError, interruption, printable
+from rigkit.core.errors import ExitCode, InputError, RigkitError, interruption, printable
 
 VERBS: dict[str, str] = {
     "demo": "render a small capture and run everything on it",
@@ -115,6 +115,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             if not arguments:
                 say("no verb given; this is what there is", before=build_parser(None).format_help())
                 return ExitCode.BAD_INPUT
+            if "" in arguments:
+                # As a path it would be the current folder.
+                raise InputError("an argument is empty: '', as a variable of the shell that is not set; give a value")
             args = build_parser(verb).parse_args(arguments)
             with logging_to(verbose=args.verbose, log_file=args.log_file):
                 return logged_run(args)

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.reconstruction.mesh import MeshOptions, mesh_cloud
 
-    output = args.output or args.cloud.with_name(f"{args.cloud.stem}-mesh.ply")
+    output = args.output or args.cloud.parent / f"{args.cloud.stem}-mesh.ply"
     options = options_of(MeshOptions, args, output=output)
     mesh = mesh_cloud(args.cloud, options, progress=progress_on_stderr())
     if args.json:

@@ -38,6 +38,17 @@ def test_a_file_that_is_no_session_is_not_said_to_be_one(
     Path("notes.txt").write_text("9x6, 30 mm\n")
     assert main(["calibrate", "notes.txt", "--square-mm", "30"]) == 2
     assert "none of these: a folder of images, a video, a session's file" in capsys.readouterr().err
+    Path("calibration.json").write_text('{"schema": "rigkit.calibration/1"}\n')
+    assert main(["calibrate", "calibration.json"]) == 2
+    assert "none of these: a folder of images, a video, a session's file" in capsys.readouterr().err
+    assert main(["validate", "calibration.json"]) == 2
+    assert 'JSON; a TOML file with schema = "rigkit.dataset/' in capsys.readouterr().err
+
+
+def test_an_empty_argument_is_not_the_current_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["calibrate", "", "--board", "9x6x25"], ["mesh", ""], ["mesh", "."]):
+        assert main(words) == 2
+        assert ("an argument is empty" in (printed := capsys.readouterr().err)) == ("" in words), printed
 
 
 def test_a_camera_of_a_rig_that_sees_no_board(

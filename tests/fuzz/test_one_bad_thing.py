@@ -81,6 +81,10 @@ def test_videos(capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFix
     cut("film.avi", "half.avi")
     frames_of_video(Path("half.avi"), Path("half"), [BOARD])
     assert "half.avi" in caplog.text and "of 8 frames can be decoded" in caplog.text
+    # The board is looked for in the video first, and once more for the frames.
+    caplog.clear()
+    main(["calibrate", "half.avi", "--square-mm", "30"])
+    assert caplog.text.count("can be decoded") > 1 and capsys.readouterr().err.count("can be decoded") == 1
 
 
 def test_frames_go_over_no_other_files(place: Path) -> None:

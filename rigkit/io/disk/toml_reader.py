@@ -234,16 +234,17 @@ def read_toml(path: str | Path, schema: Schema) -> TomlTable:
     Raises InputError: no such file, not TOML (with the line), no schema, another schema or another version, values of
     another kind.
     """
-    source = Path(path)
+    source, wanted = Path(path), schema["properties"]["schema"]["const"]
     text = read_text(source, max_bytes=MAX_TOML_BYTES)
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
+        if text.lstrip().startswith("{"):
+            raise InputError(f'{source}: JSON; a TOML file with schema = "{wanted}" is needed here') from error
         raise InputError(f"{source}: not valid TOML: {damage(error)}; correct that line") from error
     except (ValueError, RecursionError) as error:
         fault = "nested too deep" if isinstance(error, RecursionError) else "a number of thousands of digits"
         raise InputError(f"{source}: not readable TOML: {fault}; correct the file") from error
-    wanted = schema["properties"]["schema"]["const"]
     found = values.get("schema")
     if found is None:
         raise InputError(f"{source}: 'schema' is missing; add schema = {toml_text(wanted)} as the first line")

@@ -67,14 +67,14 @@ def calibrate_sources(
     # An image alone is told what would do instead.
     if len(sources) > 1 or first.is_dir() or is_video(first) or first.suffix.lower() in IMAGE_ENDINGS:
         return calibrate_folders(sources, folder_options, options, progress=progress)
+    if not first.exists():
+        raise InputError(f"calibrate: '{first}' does not exist; give a folder of images, a video or a session's file")
+    # Reading refuses an archive, and whatever else is no text; JSON is a result.
+    if first.suffix.lower() != ".toml" and (read_text(first).lstrip().startswith("{") or has_options):
+        raise InputError(
+            f"calibrate: '{first}' is none of these: a folder of images, a video, a session's file (.toml)"
+        )
     if has_options:
-        if not first.exists():
-            raise InputError(
-                f"calibrate: '{first}' does not exist; give a folder of images, a video or a session's file"
-            )
-        if first.suffix.lower() != ".toml":
-            read_text(first)  # Raises InputError for an archive, and whatever else is no text.
-            raise InputError(f"calibrate: '{first}' is none of these: a folder of images, a video, a session's file")
         raise InputError(
             f"calibrate: '{first}' states its board and model already; leave out --board, --square-mm and --model"
         )
