@@ -183,7 +183,7 @@ def _end_with_parent() -> None:
 
 
 def over_items(
-    function: Callable[[Item], Result], items: Sequence[Item], *, jobs: int = 1, cluster: str | None = None
+    function: Callable[[Item], Result], items: Sequence[Item], *, jobs: int | None = 1, cluster: str | None = None
 ) -> Iterator[tuple[int, Result]]:
     """Yield (index, function(item)) of every item, in any order.
 
@@ -191,7 +191,7 @@ def over_items(
 
     Parameters
     ----------
-    jobs : processes on this machine.
+    jobs : processes on this machine; None: one a core.
     cluster : address of a Dask scheduler to use instead, such as "tcp://host:8786".
     """
     if not items:

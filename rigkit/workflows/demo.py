@@ -1,4 +1,4 @@
-"""A capture with known truth, rendered, and everything run on it."""
+"""`rigkit demo`: renders a capture with known truth, calibrates it and validates it."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoOptions(NamesFiles):
-    """Where the demo goes."""
+    """Options of the demo."""
 
     output: Path = Path("rigkit-demo")
-    """Folder, new or empty, for the capture; the results go to `out` in it."""
+    """New or empty folder for the capture; the results go into its subfolder `out`."""
     seed: int = 1
-    """Of the random scene."""
+    """Seed of the random scene."""
     jobs: int | None = None
-    """Processes; None: one a core."""
+    """Number of processes; None: one a core."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DemoResult:
-    """What the demo came to, the folder of its results, and the exact baseline of every pair in mm."""
+    """The validation of the demo, the folder of its results, and the exact baseline of every pair, mm."""
 
     validation: DatasetValidation
     output: Path
@@ -48,7 +48,7 @@ class DemoResult:
 def run_demo(options: DemoOptions | None = None, *, progress: Progress = silent) -> DemoResult:
     """Render the demo's capture, calibrate its camera and validate its pairs.
 
-    Raises InputError where the folder has something in it, or cannot be written.
+    Raises InputError if the folder is not empty or cannot be written.
     """
     options = options or DemoOptions()
     if options.seed < 0:

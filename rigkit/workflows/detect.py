@@ -1,4 +1,4 @@
-"""Every chessboard of every image, with pictures of what was found."""
+"""`rigkit detect`: the boards of images, folders and videos, as a corners file and overlays."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import CheckFailed, InputError
 from rigkit.core.printing import brief, counted
-from rigkit.core.processes import process_count, worker_pool
+from rigkit.core.processes import over_items, process_count
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.doubtful import doubtful_grid
@@ -37,18 +37,18 @@ from rigkit.workflows.inputs.paths import NamesFiles
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectOptions(NamesFiles):
-    """What may be in the images, and where the results go."""
+    """The boards that images may show, and where the results go."""
 
     boards: tuple[Path, ...] = ()
-    """Boards that may be there, files or words such as 9x6x25; without any, boards of every size are looked for."""
+    """Board files, or words such as 9x6x25; empty: chessboards of every size are detected."""
     camera: Path | None = None
     """Calibration of the camera of all images: finds corners that were missed on `boards`, places all more finely."""
     min_corners: int = 12
     """Fewest corners of a board whose size is not given."""
     output: Path | None = None
-    """Corners file to write; None: none."""
+    """Corners file to write, or None."""
     overlay: Path | None = None
-    """Folder for a picture of each image with its corners; None: no pictures."""
+    """Folder for a picture of each image with its corners, or None."""
     force: bool = False
     """Replace files that exist; what was read is never replaced."""
     jobs: int | None = None
@@ -61,9 +61,9 @@ class DetectionResult:
 
     Attributes
     ----------
-    found : by image, in the order given.
-    failures : by image, why it could not be read.
-    doubtful : by image, what is seen but not trusted where no board is found, or that boards alike are seen twice.
+    found : boards by image, in the order given.
+    failures : errors by image that cannot be read.
+    doubtful : doubts in words by image: an untrusted grid where no board is found, or two boards with the same marks.
     """
 
     found: Mapping[str, tuple[BoardDetection, ...]]
@@ -75,7 +75,7 @@ class DetectionResult:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _DetectJob:
-    """What one process needs to know of one image."""
+    """One image to search, as it is sent to a process."""
 
     image: Path
     overlay: Path | None
@@ -89,12 +89,10 @@ def detect_in_images(
 ) -> DetectionResult:
     """Detect the boards of images, folders of images, and videos, and write what `options` ask for.
 
-    Of a video those frames are looked at that are worth keeping (`rigkit.workflows.inputs.frames`).
+    Of a video, the frames that `rigkit.workflows.inputs.frames` keeps are searched. An image that cannot be read goes
+    into `failures`; its error is raised only if no image can be read.
 
-    An image that cannot be read is among the failures and does not end the rest; its error is raised where there is no
-    other image.
-
-    Raises InputError: no such file, no image in a folder, or a file that cannot be written: said before the work;
+    Raises InputError, before the work: no such file, no image in a folder, or a file that cannot be written;
     CheckFailed: no image shows a board.
     """
     options = options or DetectOptions()
@@ -102,7 +100,7 @@ def detect_in_images(
         raise InputError(
             f"--min-corners {options.min_corners}: a chessboard of less than 3x3 corners cannot be recognised"
         )
-    processes = process_count(options.jobs)
+    process_count(options.jobs)  # complaints before the work
     boards = tuple(board_of_words(str(board)) for board in options.boards)
     given = [Path(path) for path in paths]
     videos, bad = _frames_of(list(filter(is_video, given)), boards, progress)
@@ -121,7 +119,7 @@ def detect_in_images(
     tasks = [
         _DetectJob(image, overlay, boards, camera, options) for image, overlay in zip(images, overlays, strict=True)
     ]
-    outcomes, doubtful = _over_images(tasks, processes, progress)
+    outcomes, doubtful = _over_images(tasks, options.jobs, progress)
     failures = bad | {name: outcome for name, outcome in outcomes.items() if isinstance(outcome, InputError)}
     found = {name: outcome for name, outcome in outcomes.items() if not isinstance(outcome, InputError)}
     if failures and not found:
@@ -135,7 +133,7 @@ def detect_in_images(
 
 
 def _nothing_found(images: Sequence[Path], boards: Sequence[Board], doubtful: Mapping[str, str]) -> str:
-    """Say what images show instead of what was looked for, where that is known, and otherwise what may be wrong."""
+    """Return why no board was found: what images show instead if that is known, else what to check."""
     looked_for = " or ".join(f"'{board.board_id}'" for board in boards) if boards else "chessboard"
     lead = f"no {'board ' if boards else ''}{looked_for} found in {counted(len(images), 'image')}"
     shown = None if boards else suggestion(images).words
@@ -149,7 +147,7 @@ def _nothing_found(images: Sequence[Path], boards: Sequence[Board], doubtful: Ma
 def _frames_of(
     videos: Sequence[Path], boards: Sequence[Board], progress: Progress
 ) -> tuple[dict[Path, VideoFrames], dict[str, InputError]]:
-    """Return the frames kept of each video, and why there are none of others."""
+    """Return the frames kept of each video, and the errors of videos that give none."""
     kept, bad = {}, {}
     for path in videos:
         try:
@@ -160,7 +158,10 @@ def _frames_of(
 
 
 def images_in(paths: Sequence[Path]) -> Iterator[Path]:
-    """Yield images, and those in folders by name, each once; raises InputError where there is none."""
+    """Yield images, and those of folders sorted by name, each once.
+
+    Raises InputError for a path that does not exist or a folder without images.
+    """
     seen: set[Path] = set()
     for path in paths:
         inside = [path]
@@ -178,7 +179,7 @@ def images_in(paths: Sequence[Path]) -> Iterator[Path]:
 
 
 def _overlay_paths(images: Sequence[Path], folder: Path | None) -> list[Path | None]:
-    """Return where each overlay goes; images of one name in several folders get their folder's name as well."""
+    """Return the path of each overlay; the folder's name is added where images of several folders share a name."""
     if folder is None:
         return [None] * len(images)
     common = Counter(image.stem for image in images)
@@ -192,32 +193,24 @@ Outcome: TypeAlias = tuple[BoardDetection, ...] | InputError
 
 
 def _over_images(
-    tasks: Sequence[_DetectJob], processes: int, progress: Progress
+    tasks: Sequence[_DetectJob], jobs: int | None, progress: Progress
 ) -> tuple[dict[str, Outcome], dict[str, str]]:
-    """Return the detections per image in their order, whatever the number of processes, and what is seen in images
-    without any."""
-    jobs = min(processes, len(tasks))
-    found: dict[str, Outcome] = {}
-    doubtful: dict[str, str] = {}
-
-    def collect(results: Any) -> None:
-        for task, (result, seen) in zip(tasks, results, strict=True):
-            found[str(task.image)] = result
-            if seen is not None:
-                doubtful[str(task.image)] = seen
-            progress("detecting", len(found), len(tasks))
-
-    if jobs == 1:
-        collect(map(_detect, tasks))
-    else:
-        with worker_pool(jobs) as pool:
-            collect(pool.map(_detect, tasks, chunksize=max(1, min(8, len(tasks) // (4 * jobs)))))
-    return found, doubtful
+    """Return the detections by image and the doubts by image (see `_detect`), both in the order of `tasks`."""
+    results: dict[int, tuple[Outcome, str | None]] = {}
+    for place, result in over_items(_detect, tasks, jobs=jobs):
+        results[place] = result
+        progress("detecting", len(results), len(tasks))
+    ordered = [(str(task.image), *results[place]) for place, task in enumerate(tasks)]
+    found = {name: outcome for name, outcome, _ in ordered}
+    return found, {name: doubt for name, _, doubt in ordered if doubt is not None}
 
 
 def _detect(job: _DetectJob) -> tuple[Outcome, str | None]:
-    """Detect the boards of one image and write its overlay; return the error where the image is of no use. The second
-    result is what is seen, but not trusted, where there is no board, and else what is seen twice."""
+    """Detect the boards of one image and write its overlay.
+
+    Return the boards, or the error where the image cannot be used; and a doubt in words: an untrusted grid where no
+    board is found, or two boards with the same marks.
+    """
     cv2.setNumThreads(1)
     try:
         image = _read(job)

@@ -36,21 +36,21 @@ from rigkit.workflows.inputs.paths import NamesFiles
 
 HAND_EYE_SCHEMA = "rigkit.hand_eye/1"
 POSE_NAMES = (("cam_from_hand", "base_from_board"), ("cam_from_base", "hand_from_board"))
-"""What the two poses are called where the hand carries the camera, and where it carries the board."""
+"""Names of the two poses if the hand carries the camera, and if it carries the board."""
 PLANAR_AMBIGUITY = 1.5
 """Two poses of one board whose errors differ by less than this factor are ambiguous."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HandEyeOptions(NamesFiles):
-    """What is needed besides the images and the robot's poses."""
+    """Camera, board and conventions of a hand-eye calibration."""
 
     camera: Path
-    """The camera's calibration, ours or another tool's."""
+    """The camera's calibration, of rigkit or another tool."""
     board: Path
     """The board's file, or words such as 9x6x25."""
     board_on_hand: bool = False
-    """The hand carries the board and the camera stands, not the reverse."""
+    """The hand carries the board and the camera is fixed, not the reverse."""
     inverse: bool = False
     """The robot's poses are hand_from_base, not base_from_hand."""
     output: Path | None = None
@@ -61,7 +61,7 @@ class HandEyeOptions(NamesFiles):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HandEyeCalibration:
-    """The hand-eye calibration, and why some of the images could not be read."""
+    """The hand-eye calibration, and the errors of images that cannot be read."""
 
     result: HandEye
     unreadable: tuple[InputError, ...]
@@ -71,15 +71,15 @@ class HandEyeCalibration:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlacedCamera:
-    """The pose of a camera against a board.
+    """The pose of a camera relative to a board.
 
     Attributes
     ----------
-    pose : with its covariance, which counts the noise of the corners, the size of the squares where the board's file
-        says how well that is known, and, as `lens_known` says, the lens.
+    pose : with its covariance, from the noise of the corners, the sigma of the squares if the board's file states one,
+        and the covariance of the lens if `lens_known`.
     image : the image that shows the board.
-    rms_px : of the corners.
-    ambiguous : whether the board fits as well when it is tilted the other way.
+    rms_px : reprojection error of the corners, rms.
+    ambiguous : whether a second pose, with the board tilted the other way, fits almost as well.
     lens_known : whether the calibration has a covariance.
     """
 
@@ -97,11 +97,11 @@ def calibrate_hand_eye(
 ) -> HandEyeCalibration:
     """Return the hand-eye calibration from the robot's poses (CSV, by image) and images of a board, or folders of them.
 
-    One image of many that cannot be read does not end the rest.
+    Images that cannot be read go into `unreadable`.
 
-    Raises InputError: files that cannot be read or written, images without a pose, a board that looks the same turned,
-    poses and images that do not belong together; CheckFailed: no image shows the board; DegenerateError: too few
-    images, or turns about one axis only.
+    Raises InputError: files that cannot be read or written, images without a pose, a board that is symmetric under a
+    half turn, poses that contradict the images; CheckFailed: no image shows the board; DegenerateError: too few images,
+    or rotations about one axis only.
     """
     paths = list(images_in([Path(path) for path in images]))
     ensure_writable(options.output, force=options.force, inputs=[poses, *paths, options.camera, options.board])
@@ -137,9 +137,9 @@ def calibrate_hand_eye(
 
 
 def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) -> PlacedCamera:
-    """Return where a camera is against a board that is laid down, from one image.
+    """Return the pose of a camera relative to a board, from one image.
 
-    Raises InputError for files that cannot be read, CheckFailed where the image does not show the board.
+    Raises InputError for files that cannot be read, CheckFailed if the image does not show the board.
     """
     known, near = board_of_words(str(board)), import_near_camera(camera)
     lens = far_camera(near)
@@ -178,14 +178,14 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
 
 
 def _with_fixed_pupil(camera: Camera, view: BoardView) -> BoardView:
-    """Return a view as the central camera has it, without what the pupil's motion does to it."""
+    """Return the view with its pixels moved to where a camera with a fixed entrance pupil sees the points."""
     if not isinstance(camera, NearCamera):
         return view
     return replace(view, pixels=board_with_fixed_pupil(camera, view.pixels, view.points()))
 
 
 def _known(camera: str | Path) -> UncertainCamera | None:
-    """Return a camera as its file knows it; None of another tool's, which does not say how sure it is."""
+    """Return the camera with the covariance of its file; None for another tool's file, which has none."""
     try:
         return uncertain_camera(load_calibration(camera))
     except InputError:
@@ -211,7 +211,7 @@ def _view_of(path: Path, seen: Sequence[BoardDetection], board: Board) -> BoardV
 
 
 def hand_eye_text(result: HandEye, options: HandEyeOptions) -> str:
-    """Return the result as its file has it."""
+    """Return the content of the result's file."""
     first, second = POSE_NAMES[options.board_on_hand]
     data = {
         "schema": HAND_EYE_SCHEMA,

@@ -1,4 +1,4 @@
-"""Images as an ideal camera would have taken them: one, a folder or a video, or two of a rig whose rows correspond."""
+"""`rigkit rectify`: images, folders or videos resampled to an ideal camera, or stereo pairs with corresponding rows."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from rigkit.workflows.inputs.paths import NamesFiles
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _VideoFrame:
-    """A frame of a video, for an image's file."""
+    """A frame of a video, used like an image file."""
 
     video: Video
     number: int
@@ -48,7 +48,7 @@ class _VideoFrame:
 
 
 Jobs = list[tuple[list[tuple[Path | _VideoFrame, Path]], RectifyMap]]
-"""Of each map: the images, and where they go."""
+"""For each map: pairs of (source, output file), and the map."""
 _log = logging.getLogger(__name__)
 
 EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".webp")
@@ -56,32 +56,32 @@ EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".webp")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RectifyOptions(NamesFiles):
-    """The view, and where to write it. A stereo pair's baseline decides its view, all but the projection."""
+    """The ideal camera, and where to write. For a stereo pair only the projection can be chosen."""
 
     output: Path
-    """Image to write (of a pair, NAME-1 and NAME-2 beside it), or, without an ending, the folder to write into: images
-    keep their names (frames of a video are 000000.png and so on), those of a rig have a folder a camera there."""
+    """Image to write (for a pair: NAME-1 and NAME-2), or a folder (a name without an ending). In a folder, images keep
+    their names, frames of a video are 000000.png, 000001.png, ..., and a rig has a folder for each camera."""
     projection: Literal["perspective", "cylindrical", "equirectangular"] = "perspective"
-    """Of the view."""
+    """Projection of the ideal camera."""
     hfov_deg: float | None = None
-    """From the left edge to the right; None: suits the lens."""
+    """Horizontal field of view; None: chosen for the lens."""
     angles_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Yaw (to the right), pitch (up), roll (clockwise) of the view."""
+    """Yaw (to the right), pitch (up) and roll (clockwise) of the ideal camera."""
     size_px: tuple[int, int] | None = None
-    """Of the result; None: keeps the source's resolution."""
+    """Width and height; None: keeps the resolution of the source."""
     interpolation: Literal["spline", "lanczos", "linear", "nearest"] = "spline"
-    """Between pixels: spline keeps positions to a thousandth of a pixel, linear is quick."""
+    """Interpolation: spline keeps positions to a thousandth of a pixel, linear is fast."""
     crop: bool = False
-    """Cut to the largest rectangle of which every pixel is seen, by both cameras of a pair."""
+    """Crop to the largest rectangle that the camera (of a pair: both cameras) sees completely."""
     maps: Path | None = None
-    """npz file for the geometry: the target's K and rotation, maps for cv2.remap, and of a pair P1, P2 and Q (mm)."""
+    """npz file for the geometry: K and rotation of the ideal camera, maps for cv2.remap, for a pair P1, P2, Q (mm)."""
     force: bool = False
-    """Replace files that exist; what was read is never replaced."""
+    """Replace existing files; input files are never replaced."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RectifiedImage:
-    """An image that was written, its map, and the share of it (0 to 1) that the camera sees."""
+    """A written image, its map, and the fraction of its pixels that the camera sees."""
 
     path: Path
     map: RectifyMap
@@ -92,12 +92,12 @@ class RectifiedImage:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RectificationResult:
-    """The images that were written.
+    """The written images.
 
     Attributes
     ----------
-    failures : by image, why it could not be rectified.
-    pair : the geometry of a stereo pair.
+    failures : errors by image that could not be rectified.
+    pair : geometry of a stereo pair, else None.
     """
 
     images: tuple[RectifiedImage, ...]
@@ -110,12 +110,10 @@ class RectificationResult:
 def rectify_image(
     image: str | Path, camera: str | Path, options: RectifyOptions, *, progress: Progress = silent
 ) -> RectificationResult:
-    """Write an image, or all of a folder or a video, as an ideal camera would have taken them; `camera` is the
-    calibration's file.
+    """Resample an image, or all images of a folder or video, to an ideal camera; `camera` is the calibration file.
 
-    An image that cannot be read, or has another size, is among the failures and does not end the rest; its error is
-    raised where there is no other. Raises InputError for a view that the camera does not have, a damaged calibration,
-    or a file that cannot be written.
+    An image that cannot be read or has another size goes into `failures`; its error is raised if it is the only image.
+    Raises InputError for a view outside the camera's field, a damaged calibration, or a file that cannot be written.
     """
     if holds_several(image) and options.output.suffix:
         what = "folder" if Path(image).is_dir() else "video"
@@ -143,7 +141,7 @@ def rectify_image(
 
 
 def holds_several(source: str | Path) -> bool:
-    """Say whether it is a folder or a video, not an image."""
+    """Return whether `source` is a folder or a video."""
     return Path(source).is_dir() or is_video(source)
 
 
@@ -155,20 +153,18 @@ def rectify_stereo_images(
     *,
     progress: Progress = silent,
 ) -> RectificationResult:
-    """Write images taken at once by two cameras of a rig so that a point has the same row in both. Pairs of which an
-    image cannot be read or is missing are left out, as by `rectify_image`.
+    """Rectify simultaneous images of two cameras of a rig, so that a point has the same row in both. Images that cannot
+    be read or have no partner go into `failures`.
 
-    Raises InputError: cameras that are not there, angles or a size of the view, a damaged rig, or a file that cannot be
-    written.
+    Raises InputError: unknown cameras, given angles or size, a damaged rig, or a file that cannot be written.
 
     Parameters
     ----------
     images : two images; two folders; one folder of both cameras' images (left01, right01, or folders left and right);
-        or two videos. Images of one name or number, and frames of one number, belong together, as for
-        `calibrate_folders`. Where both are called as the cameras are, the names decide which image is whose; else the
-        order does.
-    rig : file of the rig, ours or another tool's.
-    options : the view, without angles or a size.
+        or two videos. Images of the same name or number are paired, as are frames of the same number. If both are
+        named after the cameras, the names assign them to the cameras, else their order does.
+    rig : file of the rig, of rigkit or another tool.
+    options : the view, without angles and size.
     names : the two cameras; None: the rig's first two.
     """
     if options.hfov_deg is not None or options.size_px is not None or any(options.angles_deg):
@@ -206,7 +202,7 @@ def rectify_stereo_images(
 def _pairs(
     images: tuple[str | Path, str | Path] | str | Path, names: tuple[str, str], stack: ExitStack
 ) -> tuple[Sequence[Sequence[Path | _VideoFrame]], dict[str, InputError]]:
-    """Return each camera's images, in one order, and why others have no partner."""
+    """Return the paired images of each camera, and the errors of images without a partner."""
     if isinstance(images, (str, Path)):
         cameras = cameras_in([Path(images)])
         missing = [name for name in names if name not in cameras]
@@ -248,7 +244,7 @@ def _pairs(
 
 
 def _sources(source: Path, stack: ExitStack) -> Sequence[Path | _VideoFrame]:
-    """Return an image, those of a folder, or the frames of a video, which is open until `stack` ends."""
+    """Return an image, the images of a folder, or the frames of a video, which stays open until `stack` closes."""
     if source.is_dir():
         return list(images_in([source]))
     if not is_video(source):
@@ -268,7 +264,7 @@ def _file(source: Path | _VideoFrame) -> Path:
 
 
 def _require_sizes(sources: Sequence[Path | _VideoFrame], size_px: tuple[int, int], calibration: str | Path) -> None:
-    """Refuse a video, or an image that is alone, of another size, before the map: that takes as long as it is large."""
+    """Raise InputError for a video or a single image of another size, before the map is computed."""
     first = sources[0]
     if isinstance(first, _VideoFrame):
         require_size(first.video.size_px, f"video '{first.video.source}'", size_px, calibration)
@@ -281,13 +277,13 @@ def _is_folder(output: Path) -> bool:
 
 
 def _outputs(images: Sequence[Path | _VideoFrame], folder: Path) -> list[tuple[Path | _VideoFrame, Path]]:
-    """Return (image, where it goes): with its name into the folder."""
+    """Return (source, output file in `folder`)."""
     names = [one.name if cv2.haveImageWriter(one.name) else f"{Path(one.name).stem}.png" for one in images]
     return [(one, folder / name) for one, name in zip(images, names, strict=True)]
 
 
 def _ensure_all(outputs: list[Path], options: RectifyOptions, inputs: tuple[str | Path, ...]) -> None:
-    """Refuse what cannot be written, before the work."""
+    """Raise InputError for files that cannot be written."""
     for path in outputs:
         if not cv2.haveImageWriter(str(path)):
             raise InputError(f"'{path}': images of the kind '{path.suffix}' cannot be written; take .png, .tif or .jpg")
@@ -295,7 +291,7 @@ def _ensure_all(outputs: list[Path], options: RectifyOptions, inputs: tuple[str 
 
 
 def _coverage(jobs: Jobs) -> list[float]:
-    """Return the part of each map that its camera sees; raises InputError for too large images and views of nothing."""
+    """Return the fraction of each map that its camera sees; raises InputError for too large images and for zero."""
     for job, remap in jobs:
         require_pixels(remap.target.size_px, f"rectified image '{job[0][1]}' (--size)")
     covered = [float(remap.coverage().mean()) for _, remap in jobs]
@@ -307,7 +303,7 @@ def _coverage(jobs: Jobs) -> list[float]:
 def _write(
     jobs: Jobs, covered: Sequence[float], calibration: str | Path, options: RectifyOptions, progress: Progress
 ) -> tuple[tuple[RectifiedImage, ...], dict[str, InputError]]:
-    """Resample and write the images of each map, one after the other; two images of a pair come together or not."""
+    """Resample and write the images of each map in turn; both images of a pair are written together or not at all."""
     total, done, failures = len(jobs[0][0]), [], {}
     resamplers = [remap.resampler(options.interpolation) for _, remap in jobs]
     for i in range(total):
@@ -334,7 +330,7 @@ def _rectified(
     calibration: str | Path,
     resample: Callable[[Image], Image],
 ) -> bytes:
-    """Return the file of one image; raises InputError that names it."""
+    """Return the file content of one resampled image; raises InputError that names it."""
     if isinstance(source, Path):
         image = read_image_of(source, size_px, calibration)
     else:
@@ -351,7 +347,7 @@ def _rectified(
 
 
 def _write_maps(maps: list[RectifyMap], pair: StereoRectification | None, options: RectifyOptions) -> None:
-    """Write the geometry as npz, where it is asked for."""
+    """Write the geometry to `options.maps`, if given."""
     if options.maps is None:
         return
     target = maps[0].target

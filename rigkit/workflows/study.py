@@ -1,4 +1,4 @@
-"""Synthetic studies: in one process, several, or on a Dask cluster; an interrupted run goes on where it stopped."""
+"""`rigkit simulate`: synthetic studies in one process, several, or on a Dask cluster; interrupted runs are resumed."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ class StudyOptions(NamesFiles):
     """How to run studies, and where their tables and figures go."""
 
     output: Path | None = None
-    """Folder for tables, figures and the parts of a run that was interrupted; None: nothing is written."""
+    """Folder for tables, figures and the finished chunks of an interrupted run; None: nothing is written."""
     trials: int | None = None
-    """Instead of the number in the file."""
+    """Number of trials; None: that of the file."""
     jobs: int = 1
-    """Processes; the numbers stay the same."""
+    """Number of processes; results do not depend on it."""
     dask: str | None = None
     """Address of a Dask scheduler to use instead of processes."""
     figure: Literal["png", "pdf", "svg"] = "png"
     """Format of the figures."""
     force: bool = False
-    """Replace files that exist; the studies themselves are never replaced."""
+    """Replace existing files; the study files are never replaced."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StudyResult:
-    """A study, its table, and the files that were written."""
+    """A study, its table, and the written files."""
 
     study: Study
     table: StudyTable
@@ -67,9 +67,9 @@ class StudyResult:
 def run_studies(
     paths: Sequence[str | Path], options: StudyOptions | None = None, *, progress: Progress = silent
 ) -> Iterator[StudyResult]:
-    """Yield the result of every study file, each written as soon as it is there.
+    """Yield the result of every study file; each is written as soon as it is complete.
 
-    Raises InputError before the work where a file cannot be read or written, or two studies have the same name.
+    Raises InputError, before the first study runs, if a file cannot be read or written or two studies share a name.
     """
     options = options or StudyOptions()
     process_count(options.jobs)  # complaints before the work
@@ -102,7 +102,7 @@ def run_studies(
 
 
 def _files_of(study: Study, options: StudyOptions) -> dict[str, Path]:
-    """Return where the files of a study go, by their ending."""
+    """Return the paths of a study's files by ending."""
     if options.output is None:
         return {}
     return {
@@ -111,7 +111,7 @@ def _files_of(study: Study, options: StudyOptions) -> dict[str, Path]:
 
 
 def study_key(study: Study) -> str:
-    """Return a name for everything that determines the study's numbers, rigkit's own code among it."""
+    """Return a hash of everything that determines the study's results, including rigkit's code."""
     text = json.dumps(study.to_dict() | {"name": "", "title": "", "code": source_hash()}, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -119,16 +119,16 @@ def study_key(study: Study) -> str:
 def run_study(
     study: Study, *, jobs: int = 1, dask: str | None = None, parts: Path | None = None, progress: Progress = silent
 ) -> list[Errors]:
-    """Return the errors of every chunk of a study; the numbers do not depend on who computes them.
+    """Return the errors of every chunk of a study; they do not depend on `jobs` and `dask`.
 
-    Raises InputError: Dask is asked for but not installed, or a cluster cannot be reached.
+    Raises InputError: Dask is not installed, or its scheduler cannot be reached.
 
     Parameters
     ----------
     jobs : processes on this machine.
     dask : address of a Dask scheduler to use instead, such as "tcp://host:8786".
-    parts : folder for finished chunks. What an earlier run of the same study left there is used; everything is removed
-        when the study is complete.
+    parts : folder for finished chunks. Chunks of an earlier run of the same study are used; they are removed when the
+        study is complete.
     """
     total = chunk_count(study)
     key = study_key(study)
@@ -159,7 +159,7 @@ def _part(parts: Path | None, key: str, index: int) -> Path:
 
 
 def _read(path: Path) -> Errors | None:
-    """Return a finished chunk, or None where there is none (or none that can be read: it is computed again)."""
+    """Return a finished chunk, or None if it is missing or cannot be read."""
     try:
         return np.asarray(np.load(path), dtype=np.float32)
     except (OSError, ValueError, EOFError):

@@ -1,4 +1,4 @@
-"""Public captures with measured truth: found on this machine or fetched, and held against their hashes."""
+"""`rigkit fetch`: public captures with measured truth, found on this machine or downloaded, and checked by hash."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from rigkit.io.disk.writing import ensure_folder_writable, write_atomic
 from rigkit.io.manifests.public_set import PublicSet, load_public_set
 
 CATALOGUE = "datasets/public"
-"""Where the descriptions are, from the folder of the project or any folder below it."""
+"""Folder of the descriptions, in the current folder or one above it."""
 PLACE = "RIGKIT_DATA"
-"""Environment variable: a folder of captures, with each set where its `folder` says."""
+"""Environment variable: folder of captures; each set is in its `folder` there."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -29,11 +29,11 @@ class FetchedSet:
 
     Attributes
     ----------
-    described : what it is.
-    folder : where its files are.
-    present : files that are there and have their hash, by path in the set.
+    described : description of the set.
+    folder : folder of its files.
+    present : existing files, with the right hash, by path in the set.
     fetched : those of them that were downloaded now.
-    missing : files that are not there and that nobody can fetch yet.
+    missing : files that do not exist and have no address to download from.
     """
 
     described: PublicSet
@@ -53,9 +53,9 @@ class FetchedSet:
 
 
 def public_sets(catalogue: Path | None = None) -> dict[str, PublicSet]:
-    """Return the public captures that are described in a folder, by name; None: datasets/public of the project.
+    """Return the descriptions of public captures in a folder, by name; None: datasets/public of the project.
 
-    Raises InputError where there is no such folder or none is described in it.
+    Raises InputError if there is no such folder or it has no descriptions.
     """
     folder = catalogue or _catalogue()
     found = [load_public_set(path) for path in sorted(folder.glob("*.toml"))] if folder.is_dir() else []
@@ -65,8 +65,7 @@ def public_sets(catalogue: Path | None = None) -> dict[str, PublicSet]:
 
 
 def set_folder(described: PublicSet, root: Path | None = None) -> Path:
-    """Return where the files of a set are or go: in `root`, in the folder that RIGKIT_DATA names, or in the cache of
-    this user."""
+    """Return the folder of a set: in `root`, else in that of RIGKIT_DATA, else in the user's cache."""
     if root is None and PLACE in os.environ:
         root = Path(os.environ[PLACE])
     if root is None:
@@ -77,9 +76,9 @@ def set_folder(described: PublicSet, root: Path | None = None) -> Path:
 
 
 def fetch_public_set(described: PublicSet, root: Path | None = None, *, progress: Progress = silent) -> FetchedSet:
-    """Return a public capture with all its files that are here or can be fetched; each has the hash described.
+    """Return a public capture after downloading its missing files; every file has the described hash.
 
-    Raises InputError: a file that is here has another hash, or cannot be downloaded.
+    Raises InputError: an existing file has another hash, or a file cannot be downloaded.
     """
     folder = set_folder(described, root)
     if root is not None and root.exists() and not root.is_dir():
@@ -112,7 +111,7 @@ def fetch_public_set(described: PublicSet, root: Path | None = None, *, progress
 
 
 def _require(path: Path, expected: str) -> None:
-    """Raise InputError where the file has another hash."""
+    """Raise InputError if the file has another hash."""
     _require_hash(path.read_bytes(), str(path), expected, "remove the file and fetch it anew")
 
 
@@ -123,7 +122,7 @@ def _require_hash(data: bytes, source: str, expected: str, remedy: str) -> None:
 
 
 def _download(url: str, path: Path, expected: str | None) -> None:
-    """Fetch one file; it appears whole and with its hash, where one is known, or not at all."""
+    """Download one file completely, and with the expected hash if one is given, or raise InputError."""
     ensure_folder_writable(path.parent)
     if url.startswith("file://"):
         source = Path(url.removeprefix("file://"))
@@ -134,7 +133,7 @@ def _download(url: str, path: Path, expected: str | None) -> None:
     import pooch
     import requests
 
-    # What it says of a file whose hash is not known is not for the user: the members of an archive have theirs.
+    # pooch warns of files without a hash; the members of an archive are checked later.
     pooch.get_logger().setLevel("ERROR")
     try:
         pooch.retrieve(url, expected and f"sha256:{expected}", fname=path.name, path=path.parent)
@@ -151,7 +150,7 @@ def _write(data: bytes, source: str, path: Path, expected: str | None) -> None:
 
 
 def _members(url: str, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
-    """Fetch a .tar or .zip and yield what its members hold; the archive itself is not kept."""
+    """Download a .tar or .zip and yield (name, content) of its members `names`; the archive is not kept."""
     with tempfile.TemporaryDirectory(prefix="rigkit-") as place:
         path = Path(place) / "archive"
         _download(url, path, None)
@@ -171,7 +170,7 @@ def _read_zip(path: Path, names: set[str]) -> Iterator[tuple[str, bytes]]:
 
 def _read_tar(path: Path, names: set[str], url: str) -> Iterator[tuple[str, bytes]]:
     try:
-        # As a stream: going back would unpack it anew for every member.
+        # As a stream: seeking back would decompress it again for every member.
         with tarfile.open(path, "r|*") as archive:
             for entry in archive:
                 found = archive.extractfile(entry) if entry.name in names else None
@@ -182,7 +181,7 @@ def _read_tar(path: Path, names: set[str], url: str) -> Iterator[tuple[str, byte
 
 
 def _catalogue() -> Path:
-    """Return datasets/public of the project that this folder, or the package's sources, are in."""
+    """Return datasets/public of the project that contains the current folder or this module."""
     for start in (Path.cwd(), Path(__file__).resolve()):
         for folder in (start, *start.parents):
             if (folder / CATALOGUE).is_dir():

@@ -1,1 +1,1 @@
-"""`rigkit calibrate`: of one camera, of a rig, and what to photograph next for it."""
+"""`rigkit calibrate` for one camera or a rig, and the pictures to take next."""

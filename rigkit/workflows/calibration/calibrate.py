@@ -1,4 +1,4 @@
-"""From a session of one camera to its calibration."""
+"""Calibration of one camera from its session."""
 
 from __future__ import annotations
 
@@ -38,25 +38,24 @@ from rigkit.workflows.outputs.provenance import made
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrateOptions(NamesFiles):
-    """Where the results of a calibration go."""
+    """Outputs of a calibration, and what is known beforehand."""
 
     output: Path | None = None
-    """File for the calibration (of a rig: for the mount, with the cameras' files beside it); None: nothing is
-    written."""
+    """File for the calibration (for a rig: of the rig, with the cameras' files beside it); None: nothing is written."""
     report: Path | None = None
-    """File for a page to look at; None: no page."""
+    """File for the HTML page, or None."""
     force: bool = False
-    """Replace files that exist; what the calibration reads is never replaced."""
+    """Replace existing files; input files are never replaced."""
     cache: Cache = Cache.READ
-    """What becomes of the corners kept beside the session."""
+    """How to use the corner cache beside the session."""
     corners: Path | None = None
-    """File of corners (ours, or another detector's) to use instead of looking for them; None: they are looked for."""
+    """File of corners (rigkit's or another detector's) to use; None: corners are detected."""
     known: Known = field(default_factory=Known)
-    """Of a rig: files of lenses that stay as they are, or of a rig to which the others of the session are added."""
+    """For a rig: files of fixed lenses, or of a rig to which the session's other cameras are added."""
     pupil: str = "auto"
-    """Whether entrance pupils may move, as `rigkit.calibrate` has it."""
+    """Entrance pupil: "auto", "central" or "moving", as for `rigkit.calibrate`."""
     exports: tuple[str, ...] = ()
-    """Other tools' formats to write the camera in, beside `output` (`rigkit.workflows.inputs.formats`)."""
+    """Formats of other tools to write as well, beside `output` (`rigkit.workflows.inputs.formats`)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -65,10 +64,10 @@ class SessionCalibration:
 
     Attributes
     ----------
-    session : what was calibrated.
-    calibration : the camera, how sure it is, and what to think of it.
-    unreadable : by name of the image, why it was left out where it cannot be read.
-    written : the files that were written: the calibration, then the page.
+    session : the session.
+    calibration : camera, covariance and verdicts.
+    unreadable : errors by name of images that cannot be read.
+    written : files written: the calibration, then exports and the page.
     """
 
     session: Session
@@ -85,9 +84,9 @@ class SessionCalibration:
 def calibrate_session(
     session: Session | str | Path, options: CalibrateOptions | None = None, *, progress: Progress = silent
 ) -> SessionCalibration:
-    """Calibrate the camera of a session, given its file or the session as loaded, and write what `options` ask for.
+    """Calibrate the camera of a session (loaded, or its file) and write the files of `options`.
 
-    Raises InputError: no image shows a board of the session, or a file cannot be written (said before the work);
+    Raises InputError: no image shows a board of the session, or a file cannot be written (checked first);
     DegenerateError: the views do not determine the camera.
     """
     options = options or CalibrateOptions()
@@ -113,14 +112,14 @@ def calibrate_session(
 
 
 def corners_of(session: Session, options: CalibrateOptions, *, progress: Progress = silent) -> SessionCorners:
-    """Return the corners of a camera's images: from the file that `options` name, or found."""
+    """Return the corners of a camera's images, from the file `options.corners` or detected."""
     if options.corners is not None:
         return given_corners(session, options.corners)
     return session_corners(session, cache=options.cache, progress=progress)
 
 
 def session_inputs(session: Session | RigSession, options: CalibrateOptions) -> list[Path]:
-    """Return every file that a calibration reads, and that its results never replace."""
+    """Return all files that a calibration reads; results never replace them."""
     cameras = session.cameras.values() if isinstance(session, RigSession) else [session]
     out = [path for own in cameras for path in (*own.images, own.corners_path)]
     # A session made in Python need not have a file.
@@ -134,7 +133,7 @@ def calibration_from(
 ) -> Calibration:
     """Return the calibration of a session from its corners.
 
-    Raises InputError where no image shows a board of the session, DegenerateError where the views do not determine the
+    Raises InputError if no image shows a board of the session, DegenerateError if the views do not determine the
     camera.
     """
     views, size_px, dropped = session_views(session, corners)
@@ -159,7 +158,7 @@ def calibration_from(
     if verdicts[0].severity is Severity.BAD:
         shown = misread(session.images, session.boards)
         if shown is not None and 2 * len(views) < len(session.images):
-            # What little passes for the board declared lies in wrong places.
+            # The few views of the declared board are misread.
             raise InputError(f"{session.path}: {shown}")
         if shown is not None:
             verdicts = (verdicts[0], Finding.bad(shown), *verdicts[1:])

@@ -1,4 +1,4 @@
-"""From a session, of one camera or several, or from folders of images, to the calibration."""
+"""Calibration from any source: a session file of one camera or several, folders of images, or videos."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration, ca
 from rigkit.workflows.inputs.folder_session import boards_seen, session_of_folders
 from rigkit.workflows.inputs.frames import (
     frames_folder,
-    frames_of_video,
     frames_of_videos,
     timestamps_next_to,
     with_frames,
@@ -40,31 +39,31 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FolderOptions(NamesFiles):
-    """What is needed besides the folders of images."""
+    """Options for folders of images and videos."""
 
     boards: tuple[str, ...] = ()
-    """COLUMNSxROWSxMM (inner corners along and across, mm a square), or files of boards."""
+    """COLUMNSxROWSxMM (inner corners, mm a square), or board files."""
     square_mm: float | None = None
-    """Side of a square (of a tag, or the distance of two circles) where the images say the rest of the board."""
+    """Side of a square (of a tag, or the spacing of circles); the images show the rest of the board."""
     model: str | None = None
-    """A camera model, or "auto"; None: the same."""
+    """Camera model, or "auto"; None means "auto"."""
     timestamps: Path | None = None
-    """Which frames of several videos are of one moment; None: timestamps.csv beside them, if it is there."""
+    """File that synchronises several videos; None: timestamps.csv beside them, if it exists."""
 
 
 def calibrate_sources(
     sources: Sequence[Path], folder_options: FolderOptions, options: CalibrateOptions, *, progress: Progress = silent
 ) -> SessionCalibration | RigSessionCalibration:
-    """Calibrate what a person names: the file of a session, or folders of images, or videos.
+    """Calibrate from a session file, folders of images, or videos.
 
-    A folder that holds a session is calibrated by it where `folder_options` say nothing of boards and model.
-    Raises as `calibrate_folders` and `calibrate_session_file` do.
+    A folder with a session file is calibrated by it, unless `folder_options` give boards or a model. Raises as
+    `calibrate_folders` and `calibrate_session_file`.
     """
     first = sources[0]
     has_options = folder_options != FolderOptions(timestamps=folder_options.timestamps)
     if len(sources) == 1 and not has_options and (first / SESSION_NAME).is_file():
         first = first / SESSION_NAME
-    # An image alone is told what would do instead.
+    # For a single image, that function says what to give instead.
     if len(sources) > 1 or first.is_dir() or is_video(first) or first.suffix.lower() in IMAGE_ENDINGS:
         return calibrate_folders(sources, folder_options, options, progress=progress)
     if not first.exists():
@@ -84,11 +83,11 @@ def calibrate_sources(
 def calibrate_session_file(
     path: str | Path, options: CalibrateOptions, *, progress: Progress = silent
 ) -> SessionCalibration | RigSessionCalibration:
-    """Calibrate the camera or the rig of a session's file.
+    """Calibrate the camera or the rig of a session file.
 
-    Without `options.output` the result lies beside the session. The report Path("") lies beside the result.
+    Without `options.output` the result is written beside the session; the report Path("") beside the result.
 
-    Raises as `calibrate_session` and `calibrate_rig_session` do.
+    Raises as `calibrate_session` and `calibrate_rig_session`.
     """
     listed = load_rig_session(path) if is_rig_session(path) else load_session(path)
     session = with_frames(listed, progress)
@@ -96,7 +95,7 @@ def calibrate_session_file(
     report = output.with_suffix(".html") if options.report == Path() else options.report
     options = replace(options, output=output, report=report)
     if session is not listed:
-        # The videos are read as well as the frames in their place.
+        # The videos are inputs as well as the frames that replace them.
         ensure_writable((output, report), force=options.force, inputs=session_inputs(listed, options))
     if isinstance(session, Session) and options.known.files:
         raise InputError("one camera has no mounts to find; `rigkit pose` says where it is against a board")
@@ -107,7 +106,7 @@ def calibrate_session_file(
 
 
 def default_output(session: Session | RigSession) -> Path:
-    """Return where the result goes unless somebody says otherwise: beside the session."""
+    """Return the default path of the result, beside the session."""
     return session.rig_path if isinstance(session, RigSession) else session.calibration_path
 
 
@@ -118,14 +117,13 @@ def calibrate_folders(
     *,
     progress: Progress = silent,
 ) -> SessionCalibration | RigSessionCalibration:
-    """Calibrate the camera, or the rig, whose images lie in folders.
+    """Calibrate the camera or the rig whose images are in folders or videos.
 
-    Also writes a session's file for the next time: beside `options.output`, or in the one folder that holds all images.
-    A session's file that is there is kept where it says the same; another one is refused, or replaced with
-    `options.force`. Where the calibration fails, no file changes but that of the corners, kept for the next try
-    (`options.cache`).
+    Also writes a session file, beside `options.output` or in the common folder of all images. An existing session file
+    is kept if it states the same; else it is refused, or replaced with `options.force`. If the calibration fails, no
+    file changes except the corner cache (`options.cache`).
 
-    Raises InputError: no board told, no images, a file that cannot be written, and as `calibrate_session_file`;
+    Raises InputError: no board given, no images, a file that cannot be written, and as `calibrate_session_file`;
     DegenerateError: the views do not determine a camera.
     """
     given = [inside for folder in folders for inside in _videos_inside(Path(folder))]
@@ -158,7 +156,7 @@ def calibrate_folders(
 
 
 def _boards(places: Sequence[Path], declared: FolderOptions, progress: Progress) -> tuple[str, ...]:
-    """Return the boards that are told, or those that images show, with squares as large as is told."""
+    """Return the declared boards, or those that the images show, with squares of `declared.square_mm`."""
     if declared.boards and declared.square_mm is not None:
         raise InputError("calibrate: --board says how large squares are; leave --square-mm out")
     if declared.square_mm is None:
@@ -170,8 +168,8 @@ def _boards(places: Sequence[Path], declared: FolderOptions, progress: Progress)
 
 @contextmanager
 def _errors_about(given: Sequence[str | Path], session: Path) -> Iterator[None]:
-    """Let errors of the block name the folders and videos that a person gave, not the session that was made of them:
-    after a failure it is gone again."""
+    """Let errors of the block name the given folders and videos instead of the session made from them, which is removed
+    after a failure."""
     with about(*given):
         try:
             yield
@@ -182,8 +180,7 @@ def _errors_about(given: Sequence[str | Path], session: Path) -> Iterator[None]:
 
 
 def _session_path(places: Sequence[Path], output: Path | None) -> Path:
-    """Return where the session is written: named after the result where that has a name, so that two results in one
-    folder have a session each."""
+    """Return the path of the session file, named after `output`: two results in one folder have a session each."""
     if output is not None:
         return usable_path(usable_path(output).with_name(f"{output.stem}-session.toml"))
     place = places[0] if len(places) == 1 else Path(os.path.commonpath([p.absolute() for p in places]))
@@ -197,7 +194,7 @@ def _folders_of(
     options: CalibrateOptions,
     progress: Progress,
 ) -> list[Path]:
-    """Return the folders of images, those of videos' frames in the place of the videos."""
+    """Return the folders of images; videos are replaced by folders of their frames."""
     videos = [place for place in places if is_video(place)]
     if not videos:
         return list(places)
@@ -212,19 +209,16 @@ def _folders_of(
     folder = frames_folder(videos)
     if options.output is not None:
         folder = options.output.parent / folder.name
-    if len(videos) == 1:
-        frames_of_video(videos[0], folder, seen, progress=progress)
-        return [folder]
-    cameras = {video.stem: video for video in videos}
+    cameras = {"": videos[0]} if len(videos) == 1 else {video.stem: video for video in videos}
     if len(cameras) < len(videos):
         raise InputError("calibrate: two videos have the same name, which names a camera; rename one")
-    times = timestamps or timestamps_next_to(videos)
+    times = None if len(videos) == 1 else timestamps or timestamps_next_to(videos)
     frames_of_videos(cameras, folder, seen, timestamps=times, progress=progress)
     return [folder / name for name in cameras]
 
 
 def _videos_inside(place: Path) -> list[Path]:
-    """Return the videos of a folder that holds some and no images, in its place."""
+    """Return the videos of a folder that has videos but no images, else `place` itself."""
     if is_video(place) or not place.is_dir():
         return [place]
     inside = sorted(path for path in place.iterdir() if path.is_file())
@@ -234,7 +228,7 @@ def _videos_inside(place: Path) -> list[Path]:
 
 
 def _has_content(path: Path, text: str) -> bool:
-    """Say whether the file is there and says this, whatever its comments are."""
+    """Return whether the file exists and has this text, apart from comments."""
     if not path.is_file():
         return False
     try:

@@ -1,4 +1,4 @@
-"""From a session of several cameras, or of boards on one mount, to the rig and what was measured of it."""
+"""Calibration of a rig from its session: several cameras, or one camera and boards on one mount."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class RigSessionCalibration:
 
     Attributes
     ----------
-    session : what was calibrated.
-    rig : the cameras, how they stand, and what to think of it.
-    checks : what a person measured beside what came out.
-    unreadable : by name of the image, why it was left out where it cannot be read.
-    written : the files that were written.
+    session : the session.
+    rig : cameras, their poses, covariance and verdicts.
+    checks : comparison with the distances and angles that a person measured.
+    unreadable : errors by name of images that cannot be read.
+    written : files written.
     """
 
     session: RigSession
@@ -61,18 +61,17 @@ class RigSessionCalibration:
 
     @property
     def passed(self) -> bool:
-        """Whether everything that was measured agrees."""
+        """Whether all measurements agree."""
         return all(check.passed for check in self.checks)
 
 
 def calibrate_rig_session(
     session: RigSession | str | Path, options: CalibrateOptions | None = None, *, progress: Progress = silent
 ) -> RigSessionCalibration:
-    """Calibrate the rig of a session, given its file or the session as loaded, and write what `options` ask for.
+    """Calibrate the rig of a session (loaded, or its file) and write the files of `options`.
 
-    Raises InputError: a camera's images show no board, nothing says which were taken together, boards cannot be
-    identified, or a file cannot be written (said before the work); DegenerateError: the views do not determine a
-    camera.
+    Raises InputError: a camera's images show no board, the images cannot be assigned to moments, boards cannot be told
+    apart, or a file cannot be written (checked first); DegenerateError: the views do not determine a camera.
     """
     options = options or CalibrateOptions()
     if not isinstance(session, RigSession):
@@ -123,20 +122,20 @@ def _targets(session: RigSession, options: CalibrateOptions) -> list[Path]:
 
 
 def _of_the_rig(session: RigSession, options: CalibrateOptions) -> dict[str, list[Path]]:
-    """Return the files by format, of those asked for, that hold the whole rig."""
+    """Return, by requested format that holds a whole rig, its files."""
     if options.output is None or len(session.cameras) < 2:
         return {}
     return foreign_rig_paths(list(session.cameras), options.output, options.exports)
 
 
 def _of_cameras(session: RigSession, options: CalibrateOptions) -> list[str]:
-    """Return the formats, of those asked for, that get a file a camera: a rig's file has the lenses as well."""
+    """Return the requested formats that hold one camera a file; a rig's file has the lenses already."""
     whole = _of_the_rig(session, options)
     return [kind for kind in options.exports if kind not in whole]
 
 
 def _beside(session: RigSession, target: Path, name: str) -> Path:
-    """Return where the calibration of one camera goes."""
+    """Return the path of one camera's calibration."""
     return own_file(target, name) if len(session.cameras) > 1 else target
 
 
@@ -145,7 +144,7 @@ def _boards_file(target: Path) -> Path:
 
 
 def calibrate_camera(path: Path, *, progress: Progress = silent) -> Calibration:
-    """Return the calibration of one camera from its session, with boards on one mount or without; nothing is written.
+    """Return the calibration of one camera from its session file; nothing is written.
 
     Raises InputError for a session of several cameras, and as `calibrate_rig_session`.
     """
@@ -160,8 +159,8 @@ def calibrate_camera(path: Path, *, progress: Progress = silent) -> Calibration:
 
 
 def shown_cameras(rig: RigCalibration, session: RigSession) -> dict[str, Calibration]:
-    """Return each camera as the page shows it: as calibrated alone, but one camera as its boards on one mount have it,
-    which is what its file says."""
+    """Return the calibrations that the page shows: each camera calibrated alone; a single camera as solved jointly with
+    its boards on one mount, which is what its file has."""
     if len(rig.cameras) == 1:
         (camera,) = rig.cameras
         return {camera.name: judged(camera.calibration, session.cameras[camera.name])}
@@ -169,8 +168,10 @@ def shown_cameras(rig: RigCalibration, session: RigSession) -> dict[str, Calibra
 
 
 def judged(calibration: Calibration, session: Session) -> Calibration:
-    """Return a camera's calibration with the verdicts on it as it is in the rig: there it has another held-out error
-    than alone, and is surer. What its `session` leaves to be chosen is no remedy."""
+    """Return a rig camera's calibration with new verdicts, for its held-out error and covariance in the rig.
+
+    Choices that the `session` leaves automatic are not proposed as remedies.
+    """
     chosen = [name for name in ("model", "board_shape") if getattr(session, name) == "auto"]
     return replace(calibration, verdicts=judge(calibration, in_force=chosen))
 
@@ -182,10 +183,10 @@ def rig_from(
     pupil: str = "auto",
     progress: Progress = silent,
 ) -> RigCalibration:
-    """Return the calibration of a rig's session from the corners of its cameras; `pupil` as of `calibrate_rig`.
+    """Return the calibration of a rig's session from the corners of its cameras; `pupil` as for `calibrate_rig`.
 
-    Raises InputError where a camera's images show no board or nothing says which were taken together, DegenerateError
-    where the views do not determine a camera.
+    Raises InputError if a camera's images show no board or the images cannot be assigned to moments, DegenerateError if
+    the views do not determine a camera.
     """
     corners = {name: replace(own, found=named_as_listed(session, own.found)) for name, own in corners.items()}
     found = {name: own.found for name, own in corners.items()}
@@ -216,9 +217,7 @@ def rig_from(
     rig = named_by_rule(session, rig)
     if not session.rigid_boards:
         ties = [
-            s
-            for (_, own), c in zip(views.items(), rig.single, strict=True)
-            for s in suggest_ties([v for _, v in own], c)
+            s for own, c in zip(views.values(), rig.single, strict=True) for s in suggest_ties([v for _, v in own], c)
         ]
         rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(ties)))
     if rig.verdicts[0].severity is Severity.BAD:
@@ -233,13 +232,13 @@ def rig_from(
 
 
 def _misread(session: RigSession) -> list[str]:
-    """Return in words why corners of boards with marks lie in wrong places, each reason once."""
+    """Return in words why corners of boards with marks are misplaced, each reason once."""
     shown = (misread(own.images, own.boards) for own in session.cameras.values())
     return list(dict.fromkeys(words for words in shown if words is not None))
 
 
 def measured_checks(session: RigSession, rig: RigCalibration) -> list[Check]:
-    """Return what a person measured beside what came out: baselines, angles and distances of boards on one mount."""
+    """Return the comparison with measured baselines, and with angles and distances of boards on one mount."""
     out = []
     for b in session.baselines:
         ours = rig.baseline_mm(b.a, b.b)

@@ -1,4 +1,4 @@
-"""The views that would improve a calibration most, and the frames that would improve a rig, for what it is used for."""
+"""The views that improve a calibration most, and the frames that improve a rig most, for a given task."""
 
 from __future__ import annotations
 
@@ -38,10 +38,9 @@ def next_views(
     length: Task | None = None,
     reach: Reach | None = None,
 ) -> Plan:
-    """Return the views of `boards` that would improve a calibration most, the first near the last one taken; the error
-    before them is what the calibration states.
+    """Return the plan of `count` views of `boards` that improve a calibration most, the first near the last one taken.
 
-    Raises as `plan_views` and `goal_of`.
+    The error before them is that of the calibration's covariance. Raises as `plan_views` and `goal_of`.
     """
     reach = reach or Reach()
     known = Knowledge.beyond_model(calibration)
@@ -53,11 +52,11 @@ def next_views(
 def next_frames(
     watched: Monitored, boards: Sequence[Board], count: int, *, length: Task | None = None, reach: Reach | None = None
 ) -> Plan:
-    """Return the frames that would improve a rig most: of every camera at one moment, of one board. Boards are taken
-    for flat, and images to disagree as those of the calibration do.
+    """Return the plan of `count` frames that improve a rig most. A frame has all cameras at one moment and one board.
 
-    Raises InputError: no board, no frame asked for, or a length of a rig that is not a pair; DegenerateError: no board
-    fits into any image at the distances allowed, or the length is nowhere in view.
+    Boards count as flat, and residuals as large as those of the calibration. Raises InputError: no board, `count` below
+    1, or a length for a rig that is not a pair; DegenerateError: no board fits into any image at the allowed distances,
+    or the length is nowhere in view.
     """
     if not boards or count < 1:
         raise InputError("plan: at least one board and one picture are needed")
@@ -74,17 +73,17 @@ def next_frames(
 
 
 def goal_of(camera: Camera, reach: Reach, task: Task | None) -> Goal:
-    """Return what the views are to improve: a length at a distance, or the projection; raises as `length_goal`."""
+    """Return the goal of a plan: a length at a distance, or without `task` the projection; raises as `length_goal`."""
     if task is None:
         return projection_goal(camera, reach.field_deg)
     return length_goal((camera,), (Rigid3.identity(),), task)
 
 
 def length_goal(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], task: Task) -> Goal:
-    """Return the error of a length seen by a camera, or by two, over the image of the first: its weight is on their
-    parameters, and of two then on both mounts (rad, mm).
+    """Return the goal of measuring a length with one camera or two, averaged over the image of the first.
 
-    Raises InputError for a task of one camera that is no length, DegenerateError where the length is nowhere in view.
+    Its weight matrix is on the parameters of the cameras, then, of two, on both mounts (rad, mm). Raises InputError for
+    a task of one camera that is no length, DegenerateError if the length is nowhere in view.
     """
     if len(cameras) == 1 and task.quantity is not Quantity.LENGTH:
         raise InputError(f"plan: one camera measures no {task.quantity}; give a length at a distance")
@@ -109,10 +108,10 @@ def length_goal(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], task:
 
 
 def length_goals(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], length: Task) -> list[Goal]:
-    """Return the errors of a length that the first camera sees with each of the others, where two see it, or alone;
-    the weights are on what `Layout.of_cameras` has.
+    """Return the goals of measuring a length with the first camera and each other one that sees it, or with one alone.
 
-    Raises DegenerateError where the length is nowhere in view.
+    The weight matrices are on the parameters of `Layout.of_cameras`. Raises DegenerateError if the length is nowhere in
+    view.
     """
     if len(cameras) == 1:
         return [length_goal(cameras, cam_from_rig, length)]

@@ -1,4 +1,4 @@
-"""Boards that look alike in a rig's session: named in any way before the solution, and by the rule after it."""
+"""Boards that look alike in a rig's session: named arbitrarily before the solution, and by a rule after it."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from rigkit.io.manifests.rig_session import RigSession
 
 
 def require_distinct(session: RigSession) -> None:
-    """Raise InputError where a rig of cameras has boards that nothing tells apart: alike, and not on one mount."""
-
+    """Raise InputError if a rig of several cameras has boards that look alike and are not on one mount."""
     if len(session.cameras) < 2:
         return
     for kind in board_kinds(next(iter(session.cameras.values())).boards):
@@ -31,8 +30,10 @@ def require_distinct(session: RigSession) -> None:
 
 
 def named_as_listed(session: RigSession, found: Mapping[str, FoundCorners]) -> dict[str, FoundCorners]:
-    """Return the corners with a name for every whole board of a group that has none: which of those that look alike is
-    which, the solution finds out from how they stand to each other."""
+    """Return the corners with a board id for every whole board of a group that has none.
+
+    The solution finds out which of the boards that look alike is which, from their relative poses.
+    """
     boards = {b.board_id: b for own in session.cameras.values() for b in own.boards}
     groups = [[boards[name] for name in group.boards] for group in session.rigid_boards]
     if not groups:
@@ -53,7 +54,7 @@ def named_as_listed(session: RigSession, found: Mapping[str, FoundCorners]) -> d
 
 
 def _vacant(detection: BoardDetection, group: list[Board], taken: set[str | None]) -> BoardDetection | None:
-    """Return the detection as the first board of its size in the group that has none yet."""
+    """Return the detection named as the first board of its size in the group whose id is not `taken`, or None."""
     for turns in (0, 1):
         turned = detection.turned(turns)
         for board in group:
@@ -65,9 +66,9 @@ def _vacant(detection: BoardDetection, group: list[Board], taken: set[str | None
 
 
 def named_by_rule(session: RigSession, rig: RigCalibration) -> RigCalibration:
-    """Return the rig with boards that look alike called as `identification.board_ids` says.
+    """Return the rig with boards that look alike named by the rule of `identification.board_ids`.
 
-    It looks at the first image that shows the most of them, and follows the session's layout or the order listed.
+    The rule is applied to the first image that shows the most of them, with the session's layout or the listed order.
     """
     boards = {b.board_id: b for own in session.cameras.values() for b in own.boards}
     names: dict[str, str] = {}
@@ -80,19 +81,19 @@ def named_by_rule(session: RigSession, rig: RigCalibration) -> RigCalibration:
         most = max(images, key=lambda image: sum(v.image == image for v in views))
         shown = {v.board_id: v.cam_from_board.matrix() for v in views if v.image == most}
         owner = {i: k for k, kind in enumerate(kinds) for i in kind.ids}
-        # Of one kind, boards listed across have another frame: their names stay as they are.
+        # Boards of one kind that are listed turned have another frame: they keep their names.
         loose = [i for i in shown if boards[i].size == kinds[owner[i]].board.size and len(kinds[owner[i]].ids) > 1]
         located = [LocatedBoard(owner[i], pose, None if i in loose else i) for i, pose in shown.items()]
         found, _ = assign_board_ids(located, kinds, group.layout or None)
         names |= {old: new for old, new in zip(shown, found, strict=True) if old != new}
-    # Names that nobody has taken over go round, so that every board keeps exactly one.
+    # Names that are free again go to the boards without one, so that every board has exactly one.
     free = [n for n in names if n not in names.values()]
     names |= dict(zip([n for n in names.values() if n not in names], free, strict=True))
     return renamed(rig, names) if names else rig
 
 
 def renamed(rig: RigCalibration, names: Mapping[str, str]) -> RigCalibration:
-    """Return the rig with boards called otherwise, `names` from old to new; they must be of one size and squares."""
+    """Return the rig with boards renamed, `names` from old to new; they must have the same size and squares."""
     boards = {b.board.board_id: b.board for target in rig.board_rigs for b in target.boards}
 
     def target(old: BoardRig) -> BoardRig:

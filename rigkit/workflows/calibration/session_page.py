@@ -1,4 +1,4 @@
-"""The page of a session's calibration: what it needs from the disk is thumbnails of the images, and hashes."""
+"""The page of a session's calibration, with what it reads from files: thumbnails of the images, and hashes."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from rigkit.workflows.inputs.corners import SessionCorners, named_images
 from rigkit.workflows.outputs.provenance import digest_line, digest_of_images, software_facts
 
 MAX_PICTURES = 240
-"""Each is 20 kB on the page: with those of 3000 images it had 64 MB."""
+"""A thumbnail has 20 kB: with 3000 of them the page had 64 MB."""
 
 
 def session_page(session: Session, calibration: Calibration, corners: SessionCorners, files: Mapping[Path, str]) -> str:
-    """Return the page of a session's calibration, which is written to `files` (path -> content) beside it."""
+    """Return the page of a session's calibration; `files` (path -> content) are the results written with it."""
     name = session.path.resolve().parent.name
     section = _section(name, session, calibration)
     lead = f"{session.path.name} with {_boards_in_words(session.boards)}"
@@ -41,8 +41,7 @@ def rig_page(
     corners: Mapping[str, SessionCorners],
     files: Mapping[Path, str],
 ) -> str:
-    """Return the page of a rig, which is written to `files` (path -> content) beside it: what the cameras share, then
-    each camera as `shown`."""
+    """Return the page of a rig, with the calibration `shown` of each camera; `files` as for `session_page`."""
     name = session.path.resolve().parent.name
     sections = [_section(own, session.cameras[own], c) for own, c in shown.items()]
     boards = _boards_in_words(next(iter(session.cameras.values())).boards)
@@ -55,7 +54,7 @@ def rig_page(
 
 
 def _section(name: str, session: Session, calibration: Calibration) -> CalibrationSection:
-    """Return one camera with thumbnails, and with the pictures to take next where there are any to be found."""
+    """Return the section of one camera, with thumbnails and, if a plan exists, the pictures to take next."""
     try:
         plan = next_views(calibration, session.boards)
     except (InputError, DegenerateError):
@@ -70,8 +69,8 @@ def _boards_in_words(boards: Sequence[Board]) -> str:
 
 
 def _thumbnails(session: Session, calibration: Calibration) -> dict[str, bytes]:
-    """Return a small picture of every image that is there, used or left out, with the corners found in it; of many
-    images those that are left out, and those with the largest errors."""
+    """Return thumbnails (JPEG) by image, with the corners found in it: of all images, or, if they are more than
+    MAX_PICTURES, of those left out and those with the largest errors."""
     views: dict[str, list[ViewResult]] = {image: [] for image, _ in calibration.dropped}
     worst = dict.fromkeys(views, np.inf)
     for view in calibration.views:
@@ -85,7 +84,7 @@ def _thumbnails(session: Session, calibration: Calibration) -> dict[str, bytes]:
             try:
                 out[name] = thumbnail_jpeg(read_image(path), views[name], count=len(session.images))
             except InputError:
-                # Corners are kept beside the session: the image itself may have gone bad since.
+                # The corners may be cached, and the image itself damaged since.
                 continue
     return out
 
@@ -93,7 +92,7 @@ def _thumbnails(session: Session, calibration: Calibration) -> dict[str, bytes]:
 def _facts(
     session: Path, files: Mapping[Path, str], images: Mapping[str, Sequence[Path]], corners: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return what somebody needs to know to get the same page again."""
+    """Return versions, hashes and sources that the page states for reproducibility."""
     facts = software_facts() | {session.name: digest_line(session)}
     facts |= {path.name: digest_line(text) for path, text in files.items()}
     for name, paths in images.items():

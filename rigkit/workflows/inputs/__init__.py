@@ -1,1 +1,1 @@
-"""What verbs work on, made ready: images and videos become sessions, frames, corners and boards; files, cameras."""
+"""Inputs of the verbs: sessions, video frames, corners and boards from images and videos; cameras from files."""

@@ -1,4 +1,4 @@
-"""Cameras and rigs from files, of ours and of other tools, told by their content."""
+"""Cameras and rigs from rigkit's files and other tools' files; the format is recognised by the content."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from rigkit.workflows.inputs.formats import READ_FORMATS
 _log = logging.getLogger(__name__)
 
 OURS = re.compile(r'\A\s*\{\s*["}]')
-"""How our files begin, and those of other programs that write JSON."""
+"""Start of a JSON object: rigkit's files, and those of the formats `JSON_TOO`."""
 JSON_TOO = ("mrcal", "py-ocamcalib", "opencv")
 STEREO = re.compile(r'^\s*["<]?M1\b', re.MULTILINE)
-"""What OpenCV's files of pairs have."""
+"""Key that OpenCV's stereo files have and single cameras lack."""
 
 
 def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[int, int] | None = None) -> Camera:
-    """Return the camera of a file, ours or another tool's: the central one, with a warning where its pupil moves.
+    """Return the central camera of a file of rigkit or another tool; warns if the entrance pupil moves.
 
-    `kind` is the format; None: the content tells it. `size_px`, the size of the images, is needed for files of
-    py-OCamCalib and some of MATLAB; all others state it.
+    `kind` is the format; None: recognised by the content. `size_px` is the image size, which files of py-OCamCalib and
+    some of MATLAB do not state.
 
-    Raises InputError for a file that is no camera of that format, holds several, or whose format nobody can tell.
+    Raises InputError for a file of unknown format, one that is no camera of the format, or one with several cameras.
     """
     known = _camera_or_calibration(Path(path), kind, size_px)
     if isinstance(known, Camera):
@@ -52,13 +52,13 @@ def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[i
 
 
 def import_near_camera(path: str | Path) -> Camera:
-    """Return the camera of points in mm of a file as of `import_camera`: where its pupil moves a `NearCamera`."""
+    """Return the camera of a file for points in mm: a `NearCamera` if the pupil moves, else as `import_camera`."""
     known = _camera_or_calibration(Path(path), None, None)
     return known if isinstance(known, Camera) else known.near
 
 
 def _camera_or_calibration(source: Path, kind: str | None, size_px: tuple[int, int] | None) -> Camera | Calibration:
-    """Return what a file holds; of a calibration that is not to be trusted that is said."""
+    """Return the calibration or camera of a file; warns of a calibration with a verdict BAD."""
     text, name = camera_text(source), str(source)
     kind = kind or camera_format(text)
     if kind is None:
@@ -74,20 +74,19 @@ def _camera_or_calibration(source: Path, kind: str | None, size_px: tuple[int, i
 
 
 def camera_text(path: str | Path) -> str:
-    """Return the text of a camera file, of binary ones (COLMAP's, MATLAB's) that of the same cameras; raises as
-    `read_text`."""
+    """Return a camera file as text; binary files of COLMAP and MATLAB are converted. Raises as `read_text`."""
     data = read_bytes(path, "camera file")
     return colmap_cameras_text(data) or matlab_text(data, str(path)) or read_text(path, "camera file")
 
 
 def camera_format(text: str) -> str | None:
-    """Return the format of a camera file's content, one of `READ_FORMATS`; None where none of them looks so."""
+    """Return which of `READ_FORMATS` the content of a camera file has, or None."""
     found = next((kind for kind, known in FOREIGN_FORMATS.items() if known.sign.search(text)), None)
     return "rigkit" if OURS.search(text) and found not in JSON_TOO else found
 
 
 def own_calibration(path: str | Path) -> Calibration | None:
-    """Return a calibration of rigkit's, None for another file; raises InputError for one that cannot be read."""
+    """Return the calibration in a file of rigkit's, None for any other; raises InputError if it cannot be read."""
     if camera_format(camera_text(path)) != "rigkit":
         return None
     known = load_calibration_or_camera(path)
@@ -95,7 +94,7 @@ def own_calibration(path: str | Path) -> Calibration | None:
 
 
 def require_sure(source: Path) -> None:
-    """Raise InputError for another program's file: what a camera is used for needs to know how sure it is."""
+    """Raise InputError for another program's camera file, which has no covariance."""
     if source.is_file() and camera_format(camera_text(source)) not in (None, "rigkit"):
         raise InputError(
             f"'{source}': another program's file does not say how sure it is, so that nobody can tell its own error "
@@ -105,7 +104,7 @@ def require_sure(source: Path) -> None:
 
 
 def called_bad(path: str | Path) -> Finding | None:
-    """Return why a calibration or a rig of ours is not to be trusted, where that was said of it; None else."""
+    """Return the verdict BAD on a calibration or rig of rigkit's; None if it has none."""
     if is_rig_file(path):
         verdicts = load_saved_rig(path).verdicts
     else:
@@ -115,26 +114,27 @@ def called_bad(path: str | Path) -> Finding | None:
 
 
 def bad_of(verdicts: Iterable[Finding]) -> Finding | None:
-    """Return the first verdict on a calibration that says that it is not to be trusted; None where none does."""
+    """Return the first verdict of severity BAD, reworded as said of a calibration in use; None if there is none."""
     bad = next((finding for finding in verdicts if finding.severity is Severity.BAD), None)
     return None if bad is None else replace(bad, message=f"the calibration was called bad: {bad.message}")
 
 
 def warn_if_bad(path: str | Path, verdicts: Iterable[Finding] | None = None) -> None:
-    """Say where a file is used that is not to be trusted; `verdicts` are its own, None: they are read."""
+    """Warn if the file has a verdict BAD; `verdicts` are its own, or None to read them."""
     bad = called_bad(path) if verdicts is None else bad_of(verdicts)
     if bad is not None:
         _log.warning("'%s': %s", path, bad.message)
 
 
 def pupil_note(calibration: Calibration) -> str | None:
-    """Return what is to be said where a lens is taken for one that looks from one point; None where it does."""
+    """Return the note that a moving entrance pupil is neglected; None for a central calibration."""
     if calibration.pupil is None:
         return None
-    return _left_out("this lens", calibration.camera, calibration.pupil.terms, calibration.corners.used[0])
+    return _neglected_pupil("this lens", calibration.camera, calibration.pupil.terms, calibration.corners.used[0])
 
 
-def _left_out(which: str, camera: Camera, pupil: FloatArray, pixels: Pixels) -> str:
+def _neglected_pupil(which: str, camera: Camera, pupil: FloatArray, pixels: Pixels) -> str:
+    """Return the note on a camera, with the largest displacement of its rays at `pixels`, mm."""
     rays = camera.unproject(pixels)[0]
     off = pupil_shift_of_rays_mm(rays, pupil) * np.hypot(rays[:, 0], rays[:, 1])
     return (
@@ -144,21 +144,21 @@ def _left_out(which: str, camera: Camera, pupil: FloatArray, pixels: Pixels) -> 
 
 
 def warn_of_pupils(path: str | Path, rig: SavedRig) -> None:
-    """Say where lenses of a rig's file are taken for ones that look from one point, and do not."""
+    """Warn of the cameras of a rig's file whose moving entrance pupil is neglected."""
     for name, pupil in rig.pupils.items():
         if name in rig.outlines:
-            note = _left_out(f"camera '{name}'", rig.cameras[name][0], pupil.terms, rig.outlines[name])
+            note = _neglected_pupil(f"camera '{name}'", rig.cameras[name][0], pupil.terms, rig.outlines[name])
             _log.warning("'%s': %s", path, note)
 
 
 def warn_of_pupil(path: str | Path, calibration: Calibration) -> None:
-    """Say where the lens of a file is taken for one that looks from one point, and does not."""
+    """Warn if the moving entrance pupil of a file's camera is neglected."""
     if (note := pupil_note(calibration)) is not None:
         _log.warning("'%s': %s", path, note)
 
 
 def is_rig(path: str | Path) -> bool:
-    """Say whether the file is one of several cameras, ours or another tool's; False for what cannot be read."""
+    """Return whether a file of rigkit or another tool holds several cameras; False if it cannot be read."""
     if is_rig_file(path):
         return True
     try:
@@ -172,16 +172,16 @@ def is_rig(path: str | Path) -> bool:
 
 
 def saved_rig(path: str | Path) -> SavedRig:
-    """Return what a rig's file says, of ours or, without a covariance, of another tool's; raises as `import_rig`."""
+    """Return the rig in a file of rigkit or, without a covariance, of another tool; raises as `import_rig`."""
     return load_saved_rig(path) if is_rig_file(path) else SavedRig(cameras=import_rig(path), covariance=None)
 
 
 def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
-    """Return camera and cam_from_rig (mm) by name: of our rig's file, Kalibr's camchain, OpenCV's or MATLAB's pair.
-    The cameras are central, with a warning where a pupil moves.
+    """Return (camera, cam_from_rig in mm) by name from a rig of rigkit, a Kalibr camchain, or a stereo pair of OpenCV
+    or MATLAB. The cameras are central; warns if an entrance pupil moves.
 
-    Kalibr's cameras are called cam0, cam1 ..., those of a pair left and right. Raises InputError for any other file,
-    and a damaged one.
+    Kalibr's cameras are named cam0, cam1, ..., those of a pair left and right. Raises InputError for any other file or
+    a damaged one.
     """
     if is_rig_file(path):
         rig = load_saved_rig(path)
@@ -204,13 +204,15 @@ def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
 
 
 def own_file(rig: Path, camera: str) -> Path:
-    """Return where the calibration of one camera of a rig goes, beside the rig's file."""
+    """Return the path of one camera's calibration, in the folder of the rig's file."""
     return rig.with_name(f"{rig.stem}-{camera}.json")
 
 
 def own_files(rig: Path) -> dict[str, Path]:
-    """Return the files of the calibrations of a rig's cameras, by name; raises InputError where they are not beside the
-    rig's file."""
+    """Return the calibration files of a rig's cameras by name.
+
+    Raises InputError if one is not in the folder of the rig's file.
+    """
     files = {name: own_file(rig, name) for name in load_saved_rig(rig).cameras}
     if missing := [f"'{path.name}'" for path in files.values() if not path.is_file()]:
         raise InputError(
@@ -223,10 +225,10 @@ def own_files(rig: Path) -> dict[str, Path]:
 def import_pair(
     path: str | Path, names: tuple[str, str] | None = None, *, near: bool = False
 ) -> tuple[tuple[str, str], tuple[Camera, Camera], Rigid3]:
-    """Return the names of two cameras of a rig (None: its first two), the cameras, and cam2_from_cam1 (mm); with `near`
-    cameras of points in mm, `NearCamera` where a pupil moves.
+    """Return names, cameras and cam2_from_cam1 (mm) of two cameras of a rig; `names` None: its first two.
 
-    Raises InputError as `import_rig`, and for a camera that is not there.
+    With `near`, cameras are those for points in mm: a `NearCamera` if a pupil moves. Raises InputError as `import_rig`,
+    and for an unknown camera.
     """
     rig = saved_rig(path).near_cameras if near else import_rig(path)
     chosen = names or tuple(rig)[:2]

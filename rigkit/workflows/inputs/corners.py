@@ -1,4 +1,4 @@
-"""The corners of a session's images: found twice and kept beside it, or of a file, and made into views."""
+"""The corners of a session's images, detected (and cached beside the session) or read from a file, and their views."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from rigkit.io.media.images import read_image
 from rigkit.workflows.inputs.identify_board import explained
 
 ODD_SIZES = 3
-"""A few images of another size are left out; where they are this part of all, which of the sizes is meant?"""
+"""A few images of another size are left out; if they are one in three or more, the session is ambiguous."""
 LOOSE = 1.5
-"""A first calibration with a scatter of more than this many times the corners' own sigmas is not the lens."""
+"""A first calibration whose residuals exceed the corners' own sigmas by this factor does not fit the lens."""
 
 _log = logging.getLogger(__name__)
 
 
 class Cache(StrEnum):
-    """What to do with the corners kept beside a session. They save time and never change a result."""
+    """What to do with the corner cache beside a session. It saves time and never changes a result."""
 
     OFF = "off"
-    """They are neither used nor written."""
+    """Neither read nor written."""
     READ = "read"
-    """They are used where they hold."""
+    """Read where it is valid."""
     UPDATE = "update"
-    """They are used where they hold, and new ones are kept."""
+    """Read where it is valid, and written."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -51,9 +51,9 @@ class SessionCorners:
 
     Attributes
     ----------
-    found : by name of the image, as finely as they could be placed.
-    unreadable : by name of the image, why others cannot be read.
-    source : where they come from, in words.
+    found : corners by image name, from the last detection.
+    unreadable : errors by image name.
+    source : where the corners come from, in words.
     """
 
     found: Mapping[str, FoundCorners]
@@ -64,10 +64,9 @@ class SessionCorners:
 def session_views(
     session: Session, corners: SessionCorners
 ) -> tuple[list[BoardView], tuple[int, int], list[tuple[str, str]]]:
-    """Return the views that the corners found give, the images' size, and (image, reason) of those that give none, or
-    of which something is left out.
+    """Return the views of the detected boards, the image size, and (image, reason) for what is left out.
 
-    Raises InputError where there is no view, or the boards clearly have another size than stated.
+    Raises InputError if there is no view, or if the boards clearly have another size than declared.
     """
     found = corners.found
     size_px = _common_size(session, found)
@@ -92,7 +91,7 @@ def session_views(
         raise InputError(f"{session.path}: {wrong}; correct columns and rows in --board or the board file")
     if not views:
         reasons = Counter(reason for _, reason in dropped).most_common(1)[0]
-        # A first calibration that fails is asked for no reason.
+        # Nobody reads why the first calibration fails.
         shown = explained(session.images, session.boards) if corners.source else None
         alone = "look whether that camera saw the boards, else leave it out; or " if session.whose else ""
         raise InputError(
@@ -103,8 +102,10 @@ def session_views(
 
 
 def _common_size(session: Session, found: Mapping[str, FoundCorners]) -> tuple[int, int]:
-    """Return the size that most images with boards have, or most of all where none has one; raises InputError where as
-    many as a third have another."""
+    """Return the most frequent size of the images with boards, or of all images if none shows a board.
+
+    Raises InputError if a third or more have another size.
+    """
     counted_ones = [item for item in found.values() if item.detections] or list(found.values())
     counts = Counter(item.size_px for item in counted_ones).most_common()
     if len(counts) > 1 and ODD_SIZES * counts[1][1] >= len(counted_ones):
@@ -124,11 +125,11 @@ def _common_size(session: Session, found: Mapping[str, FoundCorners]) -> tuple[i
 
 
 def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Progress = silent) -> SessionCorners:
-    """Return the corners of every image by name, from the images or from what is kept beside the session.
+    """Return the corners of every image by name, detected or from the cache beside the session.
 
-    They are found twice: a first calibration, from the corners of the first time, says how lines bend at every corner,
-    which few large squares through a wide lens do not, and what is covered. An image that cannot be read does not end
-    the rest; its error is raised where there is no other image.
+    Corners are detected twice. A first calibration gives the distortion at every corner, which few large squares
+    through a wide lens do not show, and where the board is occluded; the second detection uses it. An image that cannot
+    be read goes into `unreadable`; its error is raised if no image can be read.
     """
     kept = CornerCache(None if cache is Cache.OFF else session.corners_path, session.boards)
     if not session.images:
@@ -140,7 +141,7 @@ def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Pr
     unreadable: dict[str, str] = {}
 
     def look(names: list[str], camera: Camera | None, lens: str | None) -> dict[str, FoundCorners]:
-        """Find the corners in the images of these names and remember them."""
+        """Detect the corners of the images of these names and cache them."""
         words = ("corners", "through the lens")[: 1 if camera is None else 2]
         what = " ".join(words if session.camera is None else (*words, "of", session.camera))
         out = {}
@@ -186,7 +187,7 @@ def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Pr
 
 
 def _hash(path: Path) -> str:
-    """Return the hash of an image; of none for one that cannot be opened, which looking for corners says."""
+    """Return the hash of an image, "" if it cannot be opened: the detection reports that."""
     try:
         return image_hash(path)
     except InputError:
@@ -199,7 +200,7 @@ def _lens_of(session: Session, hashes: Mapping[str, str]) -> str:
 
 
 def _kept_alone(session: Session, kept: CornerCache) -> SessionCorners:
-    """Return the corners kept beside a session whose images are gone."""
+    """Return the cached corners of a session without images."""
     first = {name: item for name in kept.images if (item := kept.get(name, None)) is not None}
     if not first:
         raise InputError(
@@ -220,11 +221,11 @@ def _found_in(path: Path, session: Session, camera: Camera | None) -> FoundCorne
 
 
 def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera | None:
-    """Return a camera calibrated quickly from `found`; None where it cannot be: the calibration proper says why."""
+    """Return a camera calibrated quickly from `found`; None if that fails: the final calibration reports why."""
     try:
         corners = SessionCorners(found=found, unreadable={}, source="")
         views, size_px, _ = session_views(session, corners)
-        # Scaramuzza's model takes any lens; what it does not follow closely, another may.
+        # Scaramuzza's model fits any lens roughly; where it fits badly, another may fit better.
         model = "scaramuzza" if session.model == "auto" else session.model
         first = calibrate(views, size_px, model=model, degree=session.degree, board="flat", folds=0, pupil="central")
         if session.model == "auto" and first.sigma_px > LOOSE * median(s for v in views for s in v.sigma_px.tolist()):
@@ -235,18 +236,18 @@ def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera 
 
 
 def named_images(session: Session) -> dict[str, Path]:
-    """Return the images by name: of two that are called alike in several folders, with the folder."""
+    """Return the image paths by file name; with the folder where images of several folders share a name."""
     common = Counter(path.name for path in session.images)
     home = session.path.resolve().parent
     return {p.name if common[p.name] == 1 else Path(os.path.relpath(p, home)).as_posix(): p for p in session.images}
 
 
 def given_corners(session: Session, path: Path) -> SessionCorners:
-    """Return the corners that a file has of the session's images, which are only read for their size.
+    """Return the corners that a file states for the session's images; the images are only read for their size.
 
-    The file is any that `io.corners.corners_file` reads. It names an image by its path, as seen from here
-    or from the file, or by its own name where only one image of the file and one of the session are called so. Images
-    that it does not name have no corners; those of the file that the session does not list are left out.
+    The file is any that `io.corners.corners_file` reads. It names an image by its path, relative to the current folder
+    or to the file, or by its file name if that is unique in the file and in the session. Images that it does not name
+    have no corners; images that the session does not list are ignored.
 
     Raises InputError for a damaged file, or one that names no image of the session.
     """
@@ -279,7 +280,7 @@ def given_corners(session: Session, path: Path) -> SessionCorners:
 def _entries_of(
     named: Mapping[str, Path], listed: Mapping[str, tuple[BoardDetection, ...]], folder: Path
 ) -> dict[str, str]:
-    """Return name of the image -> what the file calls it."""
+    """Return image name -> its name in the file."""
     by_path = {place.resolve(): entry for entry in listed for place in (folder / entry, Path(entry))}
     common = Counter(Path(entry).name for entry in listed)
     by_name = {Path(entry).name: entry for entry in listed if common[Path(entry).name] == 1}

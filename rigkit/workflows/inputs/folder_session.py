@@ -1,4 +1,4 @@
-"""From folders of images to the session that calibrates them: one camera, or several on one mount."""
+"""The session file for folders of images of one camera, or of several on one mount."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from rigkit.io.media.video import is_video
 from rigkit.workflows.inputs.identify_board import Suggestion, suggestion
 
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
-"""How people call the cameras of a rig."""
+"""Common names of a rig's cameras."""
 NAMED_FIRST = re.compile(rf"(?P<side>{SIDE})(?P<gap>[_-]?)(?P<rest>\d+|(?<=[_-]).*\d)", re.IGNORECASE)
 NAMED_LAST = re.compile(r"(?P<rest>.*\d)(?P<gap>[_-]?)(?P<side>left|right)", re.IGNORECASE)
 MIN_IN_COMMON = 0.5
-"""Of the names of several cameras' images, part that another camera has but for the side: "left_tilted_1" and
-"right_far_1" say where a board was held before one camera."""
+"""Fraction of the image names that another camera must have too, apart from the side. Names such as "left_tilted_1" and
+"right_far_1" describe board positions before one camera."""
 SIDE_FOLDER = re.compile(rf"(.*[ _-])?({SIDE})", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
 class FolderSession:
-    """The session's file, and the content of all files (path -> text) that it needs: itself, and boards."""
+    """The path of a session file, and the content of that file and of its board files (path -> text)."""
 
     path: Path
     files: Mapping[Path, str]
@@ -40,18 +40,18 @@ class FolderSession:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """Files of what stays as it is: lenses, one a camera in their order or one for all of them, and a rig."""
+    """Files of known cameras: lenses (one for each camera in order, or one for all), and a rig."""
 
     lenses: tuple[Path, ...] = ()
     rig: Path | None = None
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All of them."""
+        """All files."""
         return self.lenses if self.rig is None else (*self.lenses, self.rig)
 
     def of_cameras(self, names: Sequence[str]) -> dict[str, Path]:
-        """Return the lens's file of each camera; raises InputError for a number of them that is not that of cameras."""
+        """Return the lens file of each camera; raises InputError if their number is neither 1 nor that of cameras."""
         if not self.lenses:
             return {}
         if len(self.lenses) not in (1, len(names)):
@@ -71,18 +71,18 @@ def session_of_folders(
     output: Path | None = None,
     known: Known | None = None,
 ) -> FolderSession:
-    """Return the session of one folder, or of several that hold a camera's images each, to be kept in the file `path`.
+    """Return the session, to be written to `path`, of one folder of images, or of one folder for each camera.
 
     Raises InputError: no board, a folder without images, or names that a session cannot hold.
 
     Parameters
     ----------
-    folders : of images; see `cameras_in`.
-    boards : files of boards, or words such as 9x6x25: see `rigkit.io.boards.board_words`.
-    path : of the session, to whose folder its paths are relative.
-    model : of all cameras.
-    output : of the calibration, beside the session, if not where the session's name says.
-    known : what stays as it is of several cameras.
+    folders : folders of images; see `cameras_in`.
+    boards : board files, or words such as 9x6x25: see `rigkit.io.boards.board_words`.
+    path : session file; the paths in it are relative to its folder.
+    model : camera model of all cameras.
+    output : file of the calibration; None: named after the session.
+    known : known lenses and rig, of several cameras.
     """
     if not boards:
         raise InputError(_missing_board_message(folders))
@@ -116,14 +116,11 @@ def session_of_folders(
 
 
 def _cameras_in_words(cameras: Mapping[str, Sequence[tuple[Path, str]]], place: Path, known: Known) -> list[str]:
-    """Return the lines of several cameras in a session in folder `place`."""
+    """Return the lines for several cameras of a session in folder `place`."""
     lines = ["# Those of one moment have the same name, or the same number at its end.", ""]
     if known.rig is not None:
-        lines += [
-            "# Its cameras stay as they are, lens and mount.",
-            f"rig = {toml_text(relative_path(known.rig, place))}",
-        ]
-        lines += [""]
+        rig = toml_text(relative_path(known.rig, place))
+        lines += ["# Its cameras stay as they are, lens and mount.", f"rig = {rig}", ""]
     lenses = known.of_cameras(list(cameras))
     for name, patterns in cameras.items():
         lines += ["[[cameras]]", f"id = {toml_text(name)}", f"images = {_listed(patterns, place)}"]
@@ -141,8 +138,10 @@ def _cameras_in_words(cameras: Mapping[str, Sequence[tuple[Path, str]]], place: 
 
 
 def session_to_come(patterns: Mapping[str, str], boards: Sequence[str], place: Path) -> FolderSession:
-    """Return the session in folder `place` of cameras whose images will match `patterns` there, by camera; those of one
-    moment will have one name. Boards and errors as for `session_of_folders`."""
+    """Return the session in folder `place` for images still to be taken, which will match `patterns` (by camera).
+
+    Images of one moment will have the same name. Boards and errors are as for `session_of_folders`.
+    """
     files: dict[Path, str] = {}
     names = [_board_file(words, place, files) for words in boards]
     lines = [f'schema = "{SESSION_SCHEMA}"', f"boards = [{', '.join(map(toml_text, names))}]"]
@@ -159,10 +158,10 @@ def session_to_come(patterns: Mapping[str, str], boards: Sequence[str], place: P
 
 
 def boards_seen(places: Sequence[Path], side_mm: float, progress: Progress = silent) -> tuple[str, ...]:
-    """Return the boards that folders of images, or videos, show, in words, with squares (tags, distances of circles) of
+    """Return, in words, the boards that folders of images or videos show, with squares (tags, circle spacings) of
     `side_mm`.
 
-    Raises InputError where none is seen.
+    Raises InputError if none is recognised.
     """
     shown = _shown(places, progress)
     if shown.words is None:
@@ -183,7 +182,7 @@ def _shown(places: Sequence[Path], progress: Progress = silent) -> Suggestion:
 
 
 def _missing_board_message(folders: Sequence[Path]) -> str:
-    """Return what to say where no board is given: what the images show of it."""
+    """Return the error message for a missing --board, with the board that the images show."""
     shown = _shown(folders)
     if shown.fault is not None:
         return f"calibrate: {shown.fault}"
@@ -196,12 +195,12 @@ def _missing_board_message(folders: Sequence[Path]) -> str:
 
 
 def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
-    """Return the images of every camera as (folder, pattern), by its name; of one camera by "".
+    """Return the images of every camera as (folder, pattern), by camera name; a single camera is named "".
 
-    Several folders are as many cameras. One folder holds several where all its images are called left01, right01 (or
-    cam0_01, 01_left, left_pose_1), or where it has no images but folders left and right (or cam0, cam1).
+    Several folders are one camera each. One folder holds several cameras if all its images are named left01, right01
+    (or cam0_01, 01_left, left_pose_1), or if it has no images but folders left and right (or cam0, cam1).
 
-    Raises InputError for a folder without images, or folders of one name.
+    Raises InputError for a folder without images, or two folders of the same name.
     """
     if len(folders) > 1:
         return _one_each(folders)
@@ -235,7 +234,7 @@ def _one_each(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
 
 
 def _by_names(folder: Path, images: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
-    """Return the cameras that the images' names tell: more than one only where every image has a side."""
+    """Return the cameras by the images' names: several only if every name has a side."""
     sides: dict[str, dict[str, None]] = {}
     found = [NAMED_FIRST.fullmatch(image.stem) or NAMED_LAST.fullmatch(image.stem) for image in images]
     named = [name for name in found if name is not None]
@@ -258,7 +257,7 @@ def _suffixes(images: Iterable[Path]) -> list[str]:
 
 
 def _board_file(words: str, place: Path, files: dict[Path, str]) -> str:
-    """Return a board's file as the session names it; a new one is added to `files`."""
+    """Return the path of a board's file in the session; the file of a board in words is added to `files`."""
     board = board_of_words(words)
     if board_in_words(words) is None:
         return relative_path(Path(words), place)

@@ -1,9 +1,9 @@
-"""Which frames of a video to keep: sharp ones, each with the boards elsewhere than in all others.
+"""Selection of video frames: sharp ones, each with the boards in another place.
 
-A frame is described by how far its boards reach in eight directions of the image, which does not depend on where the
-count of their corners begins and changes with every motion but a turn by the symmetry of the board. Frames are taken as
-they come and only descriptions are kept: of those nearer to each other than a radius the sharpest stays, and the radius
-grows when there are too many (the doubling algorithm of Charikar, Chekuri, Feder and Motwani 2004 for k centres).
+A frame is described by the extent of its largest board in eight image directions. This descriptor does not depend on
+the order of the corners, and every motion changes it except a turn by a symmetry of the board. Frames come as a stream
+and only descriptors are kept: of frames closer than a radius the sharpest stays, and the radius grows when there are
+too many (the doubling algorithm of Charikar, Chekuri, Feder and Motwani 2004 for k centres).
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from rigkit.core.detections import BoardDetection
 DIRECTIONS: FloatArray = np.stack([f(np.arange(8) * (np.pi / 4.0)) for f in (np.cos, np.sin)], axis=-1)
 
 SAME_VIEW = 0.015
-"""Boards that reach equally far in all directions, to this part of their own extent, were hardly moved: of a board that
-spans 23 degrees, tilts 6 degrees apart differ by 0.008 to 0.013, and 11 degrees by 0.017 to 0.024."""
+"""Descriptors that differ by less than this fraction of the board's extent are the same view. For a board that spans 23
+degrees, tilts that differ by 6 degrees give 0.008 to 0.013, by 11 degrees 0.017 to 0.024."""
 
 GROWTH = 1.4
-"""The radius grows by this factor when there are twice as many frames as wanted."""
+"""Factor of the radius when twice as many frames are kept as wanted."""
 
 CLEARLY_SHARPER = 0.9
-"""A frame takes the place of another one near it if its corners are this much more certain."""
+"""A frame replaces a similar one if the sigma of its corners is smaller by this factor."""
 
 BLURRED = 3.0
-"""Frames whose corners are so many times less certain than those of the typical frame kept are left out at the end."""
+"""Frames whose corner sigma exceeds the median of the kept frames by this factor are removed at the end."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class KeptFrame:
-    """A moment: its number, where the boards are by camera (`describe`), and how uncertain their corners are, px."""
+    """A moment: its number, the descriptor by camera (`describe`), and the mean sigma of the corners, px."""
 
     number: int
     views: Mapping[str, FloatArray]
@@ -42,7 +42,7 @@ class KeptFrame:
 
 
 def describe(found: Sequence[BoardDetection]) -> FloatArray | None:
-    """Return how far the largest board reaches in each of DIRECTIONS (8,), px; None without a board."""
+    """Return the extent (8,) of the largest board along each of DIRECTIONS, px; None without a board."""
     if not found:
         return None
     reach: FloatArray = (max(found, key=lambda item: len(item.grid)).pixels @ DIRECTIONS.T).max(axis=0)
@@ -58,7 +58,7 @@ class FrameChoice:
         self._max_frames, self._radius = max_frames, SAME_VIEW
 
     def offer(self, frame: KeptFrame) -> tuple[bool, list[int]]:
-        """Consider `frame`; return whether it is kept, and the numbers of those that are no longer."""
+        """Return whether `frame` is kept, and the numbers of the frames that are removed."""
         near = [k for k, other in self.kept.items() if _frame_distance(frame, other) < self._radius]
         self.near_copies += bool(near)
         if near and frame.sigma_px > CLEARLY_SHARPER * min(self.kept[k].sigma_px for k in near):
@@ -73,7 +73,7 @@ class FrameChoice:
         return frame.number in self.kept, gone
 
     def finish(self) -> list[int]:
-        """Leave out blurred frames, and of the rest those that add least; return the numbers of what is left out."""
+        """Remove blurred frames, then the most similar ones; return the numbers of the removed frames."""
         before = set(self.kept)
         if self.kept:
             limit = BLURRED * float(np.median([frame.sigma_px for frame in self.kept.values()]))
@@ -83,7 +83,7 @@ class FrameChoice:
         return sorted(before - set(self.kept))
 
     def _thin(self) -> list[int]:
-        """Leave out what is near a sharper one; return the numbers of those."""
+        """Remove frames that are similar to a sharper one; return their numbers."""
         ordered = sorted(self.kept.values(), key=lambda frame: frame.sigma_px)
         rest: list[KeptFrame] = []
         for frame in ordered:
@@ -94,8 +94,10 @@ class FrameChoice:
         return sorted(gone)
 
     def _farthest(self) -> list[int]:
-        """Return `max_frames` frames, of which each is as far as can be from those before it (Gonzalez 1985), starting
-        with the one that most cameras see the sharpest."""
+        """Return the numbers of `max_frames` frames by farthest-first traversal (Gonzalez 1985).
+
+        It starts with the frame that the most cameras see, the sharpest of these.
+        """
         frames = list(self.kept.values())
         first = min(range(len(frames)), key=lambda k: (-len(frames[k].views), frames[k].sigma_px))
         chosen, distance = [first], np.array([_frame_distance(frames[first], other) for other in frames])
@@ -106,15 +108,17 @@ class FrameChoice:
 
 
 def _frame_distance(one: KeptFrame, two: KeptFrame) -> float:
-    """Return how far apart two moments are, in extents of the board: by the camera that sees most of a difference; far
-    where one sees the board only once."""
+    """Return the distance of two moments, in extents of the board: the largest of all cameras.
+
+    It is infinite if other cameras see the board.
+    """
     if one.views.keys() != two.views.keys():
         return float(np.inf)
     return max(_moved(view, two.views[name]) for name, view in one.views.items())
 
 
 def _moved(one: FloatArray, two: FloatArray) -> float:
-    """Return by how much of its extent, where that is smaller, a board was moved from one view to the other."""
+    """Return the largest change of a descriptor, as a fraction of the smaller extent of the board."""
     # The second four of DIRECTIONS are opposite to the first.
     extent = min(float((view[:4] + view[4:]).max()) for view in (one, two))
     return float(np.abs(one - two).max()) / max(extent, 1e-9)

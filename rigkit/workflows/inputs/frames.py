@@ -1,6 +1,6 @@
-"""From videos to images: the frames worth keeping of one video, or of several taken at the same time, as PNG files.
+"""Frames of one video, or of several recorded together, selected and written as PNG files.
 
-Everything that takes images takes them: they are named after their place in the video, those of one moment alike.
+A frame is named after its number in the video; frames of one moment share a name.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from rigkit.workflows.inputs.identify_board import explained
 _log = logging.getLogger(__name__)
 
 MAX_FRAMES = 40
-"""Frames kept of a video: a calibration gains little from more that are spread as well."""
+"""Frames kept of a video: a calibration gains little from more."""
 
 SEARCH_PIXELS = 1.3e6
-"""Boards are looked for in frames made smaller than this: a video of 4K takes a ninth of the time."""
+"""Frames are reduced below this size for the board search: a video of 4K takes a ninth of the time."""
 
 SEARCHING = "looking at frames"
-"""What progress is called."""
+"""Name of the stage in progress reports."""
 
 RECORD, FRAMES_SCHEMA = "frames.json", "rigkit.frames/1"
 PNG_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
@@ -48,14 +48,14 @@ PNG_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class VideoFrames:
-    """What was kept of videos.
+    """The frames kept of videos.
 
     Attributes
     ----------
-    folder : where the images are, of several cameras in a folder each.
-    images : by camera, "" for the only one.
-    looked_at, with_boards, near_copies : moments looked at, those that show a board, and those whose boards are where
-        another one has them.
+    folder : folder of the images; several cameras have a folder each in it.
+    images : images by camera, "" for a single one.
+    looked_at, with_boards, near_copies : numbers of moments searched, of those that show a board, and of those whose
+        view repeats another.
     """
 
     folder: Path
@@ -66,7 +66,7 @@ class VideoFrames:
 
 
 def frames_folder(sources: Sequence[Path]) -> Path:
-    """Return where the frames of videos go unless somebody says otherwise: beside the first."""
+    """Return the default folder for the frames of videos, beside the first video."""
     first = sources[0]
     live = first.name.startswith("camera:")
     place = Path() if live else first.parent
@@ -75,7 +75,7 @@ def frames_folder(sources: Sequence[Path]) -> Path:
 
 
 def timestamps_next_to(sources: Sequence[Path]) -> Path | None:
-    """Return the timestamps.csv in the folder of the videos, None where there is none."""
+    """Return timestamps.csv in the folder of several videos, or None."""
     path = sources[0].parent / "timestamps.csv"
     return path if len(sources) > 1 and path.is_file() else None
 
@@ -88,12 +88,12 @@ def frames_of_video(
     max_frames: int = MAX_FRAMES,
     progress: Progress = silent,
 ) -> VideoFrames:
-    """Keep frames of a video, a sequence of files or a live camera (until it has `max_frames`, or Ctrl-C) as PNG files.
+    """Write selected frames of a video, a numbered sequence or a live camera (until `max_frames` or Ctrl-C) as PNG.
 
-    Frames that were kept before, of the same video for the same boards, are used again.
+    Frames that an earlier call kept of the same video for the same boards are used again.
 
-    Raises InputError: the video cannot be read, no frame shows a board, or `folder` cannot be written to, or holds
-    other files.
+    Raises InputError: the video cannot be read, no frame shows a board, or `folder` cannot be written or holds other
+    files.
     """
     return frames_of_videos({"": source}, folder, boards, max_frames=max_frames, progress=progress)
 
@@ -107,12 +107,12 @@ def frames_of_videos(
     max_frames: int = MAX_FRAMES,
     progress: Progress = silent,
 ) -> VideoFrames:
-    """Keep frames of one moment of several cameras, by name; as `frames_of_video`.
+    """Write selected moments of several cameras' videos (by camera name) as `frames_of_video` does.
 
-    `timestamps` says which frames are of one moment (`io.media.video.read_timestamps`); without, those of one number
-    are: the videos began together and lost none.
+    `timestamps` is a file that assigns frames to moments (`io.media.video.read_timestamps`). None: frames of the same
+    number are of one moment.
     """
-    asked = _asked(sources, boards, timestamps, max_frames)
+    asked = _request(sources, boards, timestamps, max_frames)
     kept = _kept_before(folder, asked)
     if kept is not None:
         return kept
@@ -124,7 +124,7 @@ def frames_of_videos(
         if moments is None:
             _warn_of_clocks(videos)
         total = min((v.count for v in videos.values() if v.count), default=0) if moments is None else len(moments)
-        # Who calibrates a live camera says so when there is enough.
+        # Ctrl-C ends the capture of a live camera.
         with suppress(*((KeyboardInterrupt,) if live else ())):
             for number, pictures in _moments(videos, moments):
                 looked_at += 1
@@ -135,7 +135,7 @@ def frames_of_videos(
                     keeper.offer(frame, {name: pictures[name] for name in frame.views})
                 if live and len(keeper.choice.kept) >= max_frames:
                     break
-        # Moments that were told of and had no frame are not waited for.
+        # Moments of the timestamps that have no frame are not searched.
         progress(SEARCHING, looked_at, looked_at)
     images = keeper.finish()
     if not images:
@@ -157,7 +157,7 @@ def frames_of_videos(
 
 
 def _warn_of_clocks(videos: Mapping[str, Video]) -> None:
-    """Say where lengths or rates of videos contradict that frames of one number are of one moment."""
+    """Warn if lengths or frame rates differ, so that frames of one number may not be of one moment."""
     for what, stored in (("frames", "count"), ("frames per second", "rate_hz")):
         known = {name: value for name, video in videos.items() if (value := getattr(video, stored))}
         if len({round(value, 2) for value in known.values()}) > 1:
@@ -173,7 +173,7 @@ def _warn_of_clocks(videos: Mapping[str, Video]) -> None:
 def _moments(
     videos: Mapping[str, Video], moments: Mapping[int, Mapping[str, int]] | None
 ) -> Iterator[tuple[int, dict[str, Image]]]:
-    """Yield the number of each moment and what the cameras show then; those that have no frame are left out."""
+    """Yield the number of each moment and its frames by camera; moments without a frame are skipped."""
     if moments is None:
         number = 0
         while pictures := {name: x for name, v in videos.items() if (x := v.frame(number)) is not None}:
@@ -181,7 +181,7 @@ def _moments(
             number += 1
         return
     for number, frames in moments.items():
-        # A recorder that repeats a frame for lack of a new one has none of this moment.
+        # A recorder repeats the last frame where it has no new one: that is not of this moment.
         fresh = {name: k for name, k in frames.items() if k >= videos[name].next_number}
         pictures = {name: x for name, k in fresh.items() if (x := videos[name].frame(k)) is not None}
         if pictures:
@@ -192,7 +192,7 @@ def _moments(
 def _opened(
     sources: Mapping[str, Path], timestamps: Path | None
 ) -> Iterator[tuple[dict[str, Video], Mapping[int, Mapping[str, int]] | None]]:
-    """Open videos, by camera, and yield them with the moments that `timestamps` tell of, as `_moments` takes them."""
+    """Open videos, by camera, and yield them with the moments of `timestamps`, as `_moments` takes them."""
     with ExitStack() as stack:
         videos = {name: stack.enter_context(Video(path)) for name, path in sources.items()}
         yield videos, None if timestamps is None else read_timestamps(timestamps, list(sources))
@@ -201,7 +201,7 @@ def _opened(
 def moments_of_videos(
     sources: Mapping[str, Path], numbers: Collection[int], timestamps: Path | None = None
 ) -> Iterator[dict[str, Image]]:
-    """Yield what all cameras show at some moments, by their numbers; those that one of them lacks are left out."""
+    """Yield the frames by camera of the moments `numbers`; moments that lack a camera are skipped."""
     with _opened(sources, timestamps) as (videos, moments):
         for number, pictures in _moments(videos, moments):
             if number in numbers and len(pictures) == len(sources):
@@ -209,7 +209,7 @@ def moments_of_videos(
 
 
 def _described(number: int, pictures: Mapping[str, Image], boards: Sequence[Board]) -> KeptFrame | None:
-    """Return where the boards are in the pictures of a moment; None without any."""
+    """Return the descriptors of the boards in the pictures of a moment; None without a board."""
     views, sigmas = {}, []
     for name, picture in pictures.items():
         found = _quick_look(picture, boards)
@@ -221,7 +221,7 @@ def _described(number: int, pictures: Mapping[str, Image], boards: Sequence[Boar
 
 
 def _quick_look(picture: Image, boards: Sequence[Board]) -> list[BoardDetection]:
-    """Return the boards of a picture, looked for in a smaller one; their places and sigmas are those of the picture."""
+    """Return the boards of a picture, detected in a reduced one, in pixels of the full picture."""
     factor = max(1, int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS))))
     if factor > 1:
         height, width = (side // factor for side in picture.shape)
@@ -233,10 +233,9 @@ def _quick_look(picture: Image, boards: Sequence[Board]) -> list[BoardDetection]
 
 
 def with_frames(session: Session | RigSession, progress: Progress = silent) -> Session | RigSession:
-    """Return `session` with the frames worth keeping in the place of the videos among its images.
+    """Return `session` with its videos replaced by selected frames, which are written beside the session.
 
-    They are kept beside the session. Videos of several cameras are taken as of the same time, by the timestamps.csv
-    beside them if there is one.
+    Videos of several cameras are synchronised by the timestamps.csv beside them, if it exists, else by frame number.
     """
     place = beside_session(session.path, "frames")
     own: Mapping[str, Session] = session.cameras if isinstance(session, RigSession) else {"": session}
@@ -258,7 +257,7 @@ def with_frames(session: Session | RigSession, progress: Progress = silent) -> S
 
 
 class _FrameFolder:
-    """Writes what the choice keeps. The newest frame is held back: a sharper one of the same view may follow."""
+    """Writes the frames that the choice keeps, the newest with a delay: a sharper one of the same view may follow."""
 
     def __init__(self, folder: Path, choice: FrameChoice) -> None:
         self.choice = choice
@@ -300,10 +299,10 @@ class _FrameFolder:
                 path.unlink(missing_ok=True)
 
 
-def _asked(
+def _request(
     sources: Mapping[str, Path], boards: Sequence[Board], timestamps: Path | None, max_frames: int
 ) -> dict[str, object]:
-    """Return what the choice depends on: the files by size and time of change, the boards."""
+    """Return what the selection depends on: the files with size and time of change, and the boards."""
     files = [*sources.values(), *([timestamps] if timestamps else [])]
     state = {str(path.name): [s.st_size, s.st_mtime_ns] for path in files if path.is_file() and (s := path.stat())}
     digest = hashlib.sha256(repr([(b.size, b.pattern) for b in boards]).encode()).hexdigest()
@@ -316,8 +315,10 @@ def _asked(
 
 
 def _take_folder(folder: Path, live: bool) -> None:
-    """Make the folder one of kept frames; raises InputError where it holds anything else, or frames that nobody can
-    take again."""
+    """Mark the folder as one of kept frames.
+
+    Raises InputError if it holds anything else, or frames of a live camera, which cannot be taken again.
+    """
     ensure_folder_writable(folder)
     own = (folder / RECORD).is_file()
     if folder.is_dir() and any(folder.iterdir()) and (live or not own):
@@ -335,7 +336,7 @@ def _record(done: VideoFrames, asked: Mapping[str, object]) -> None:
 
 
 def _kept_before(folder: Path, asked: Mapping[str, object]) -> VideoFrames | None:
-    """Return what was kept in `folder` before, None where that is for something else or no longer there."""
+    """Return the frames that an earlier call for the same `asked` kept in `folder`, or None."""
     if not (folder / RECORD).is_file():
         return None
     try:

@@ -1,4 +1,4 @@
-"""What board images or videos show: everything but the scale, which a rule must tell."""
+"""Identification of the board in images or videos, up to scale."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from rigkit.io.media.images import read_image
 from rigkit.io.media.video import Video, is_video
 
 ENOUGH_IMAGES = 12
-"""Images that are looked at, evenly spread: what more of them show is the same board."""
+"""Images that are searched, evenly spread: more of them show the same board."""
 
 EXPLAINING_IMAGES = 4
-"""Images looked at to say what is wrong with a session."""
+"""Images that are searched to explain what is wrong with a session."""
 
 MIN_SHARE_OF_IMAGES = 0.5
-"""A board is in this part of the images, at least, or something else may be in them."""
+"""Fraction of the images that must show a board for it to be the one."""
 
 FRAME_STRIDE = 10
-"""Frames from one that is looked at to the next, of a video that does not say how many it has."""
+"""Step between searched frames of a video of unknown length."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -40,14 +40,14 @@ class IdentifiedBoard:
 
     Attributes
     ----------
-    board : with squares, or tags, of 1 mm.
-    seen, looked_at : names of the images that show it, and of all looked at.
-    words : as `--board` takes them, but for the length: "aprilgrid:6x6xMM,spacing=0.3".
-    beside : the words of other boards that the images show.
-    unreadable : why other images could not be read.
-    alike : names of images that show two of these boards: nothing tells whose marks are whose.
-    elsewhere : the words of a board that other images show, and their names, as far as they were looked at.
-    either_pattern : it may as well be of the other ChArUco pattern (`BoardGuess.either_pattern`).
+    board : the board, with squares or tags of 1 mm.
+    seen, looked_at : names of the images that show it, and of all searched.
+    words : the argument of `--board`, with MM for the length: "aprilgrid:6x6xMM,spacing=0.3".
+    beside : arguments of `--board` for other boards in the same images.
+    unreadable : errors of images that cannot be read.
+    alike : names of images that show two copies of the board, whose marks cannot be told apart.
+    elsewhere : the argument of `--board` for a board that other images show, and the names of these images.
+    either_pattern : both ChArUco patterns fit (`BoardGuess.either_pattern`).
     """
 
     board: Board
@@ -66,8 +66,8 @@ class IdentifiedBoard:
 def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) -> IdentifiedBoard:
     """Return the board that images, or frames of videos, show.
 
-    Raises InputError: no image, or none that can be read; CheckFailed: no board is seen, or none that tells its size:
-    the frame cuts a chessboard in every image.
+    Raises InputError: no image, or none that can be read; CheckFailed: no board is seen, or its size is undetermined
+    because every image cuts it.
     """
     if not paths:
         raise InputError("board identify: no images; give some, or a folder")
@@ -84,9 +84,9 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     progress("reading", ENOUGH_IMAGES, ENOUGH_IMAGES)
     guess = guess_board(list(images.values()), progress)
     names = tuple(Path(name).name for name in images)
-    otherwise = _otherwise(list(images.items()), guess)
-    if otherwise is not None:
-        raise CheckFailed(otherwise)
+    mirrored = _mirrored_unless(guess, list(images.items()))
+    if mirrored is not None:
+        raise CheckFailed(mirrored)
     if guess is None:
         if unreadable:
             raise InputError(f"no board is seen in {counted(len(names), 'image')}, and {unreadable[0]}")
@@ -111,8 +111,7 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
 
 
 def _elsewhere(rest: Sequence[tuple[str, GreyImage]]) -> tuple[str, tuple[str, ...]] | None:
-    """Return the board, in words, that images show which do not show the one told, and their names; None where not most
-    of them show one."""
+    """Return the board in words that most of the remaining images show, and their names; None if there is none."""
     if len(rest) < MIN_IMAGES_OF_GUESS:
         return None
     guess = guess_board([image for _, image in rest])
@@ -126,7 +125,7 @@ def _elsewhere(rest: Sequence[tuple[str, GreyImage]]) -> tuple[str, tuple[str, .
 
 
 def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
-    """Return in words why images do not show the boards declared; None where that is not known."""
+    """Return in words why images do not show the declared boards; None if unknown."""
     mirrored = _mirrored(paths, [board for board in boards if board.identified])
     if mirrored is not None:
         return mirrored
@@ -144,10 +143,10 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
 
 
 def misread(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
-    """Return in words why corners of boards with marks lie in wrong places; None where that is not known.
+    """Return in words why corners of boards with marks are misplaced; None if unknown.
 
-    Marks of another board may be at home on the one declared, and those of two boards alike are each other's. Of
-    chessboards the size of the grids tells (`rigkit.calibration.views.usable.other_size`).
+    The images may show another board with the same marks, or two copies of the board. Chessboards are checked by their
+    size (`rigkit.calibration.views.usable.other_size`).
     """
     if not any(board.identified for board in boards):
         return None
@@ -155,7 +154,7 @@ def misread(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
 
 
 def _alike(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
-    """Say that images show two boards with the same marks; None where they do not."""
+    """Return a message if an image shows two boards with the same marks, else None."""
     for name, image in _pictures(paths, EXPLAINING_IMAGES):
         message = None if isinstance(image, InputError) else duplicate_boards(image, boards)
         if message is not None:
@@ -164,8 +163,10 @@ def _alike(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
 
 
 def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
-    """Say that images are mirrored, where boards with marks are seen in them only when they are flipped; None else. A
-    chessboard in a mirror is a chessboard: nothing tells."""
+    """Return a message if boards with marks are only seen in flipped images, else None.
+
+    A mirrored chessboard is a chessboard: it does not show.
+    """
     if not boards:
         return None
     names = []
@@ -180,12 +181,14 @@ def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
             return None
         if flipped:
             names.append(name)
-    return _in_a_mirror(names[0]) if names else None
+    return _mirror_message(names[0]) if names else None
 
 
-def _otherwise(pictures: Sequence[tuple[str, GreyImage]], guess: BoardGuess | None) -> str | None:
-    """Say that images are mirrored, where boards with marks are seen in them when that is undone, and without it only
-    `guess`, which may be wrong: nothing, few chessboards, or some with something in their squares."""
+def _mirrored_unless(guess: BoardGuess | None, pictures: Sequence[tuple[str, GreyImage]]) -> str | None:
+    """Return a message if the flipped images show boards with marks and `guess` is doubtful, else None.
+
+    A guess is doubtful if it is None, a chessboard in few images, or one with marks in its squares.
+    """
     if guess is not None and (
         guess.board.pattern.type != Chessboard.type
         or (not guess.marked and len(guess.images) >= MIN_SHARE_OF_IMAGES * len(pictures))
@@ -194,12 +197,12 @@ def _otherwise(pictures: Sequence[tuple[str, GreyImage]], guess: BoardGuess | No
     some = pictures[:: max(1, -(-len(pictures) // EXPLAINING_IMAGES))]
     marks = guess_board([_flipped(image) for _, image in some])
     if marks is not None and marks.board.identified and len(marks.images) >= MIN_SHARE_OF_IMAGES * len(some):
-        return _in_a_mirror(some[marks.images[0]][0])
+        return _mirror_message(some[marks.images[0]][0])
     return None
 
 
 def _doubtful(pictures: Sequence[tuple[str, GreyImage]]) -> str | None:
-    """Say what is seen in images that may be a board; None for nothing."""
+    """Return a description of the first doubtful grid in images, or None."""
     for name, image in pictures[:: max(1, -(-len(pictures) // EXPLAINING_IMAGES))]:
         words = doubtful_grid(image)
         if words is not None:
@@ -211,7 +214,7 @@ def _flipped(image: GreyImage) -> GreyImage:
     return image[:, ::-1].copy()
 
 
-def _in_a_mirror(name: str) -> str:
+def _mirror_message(name: str) -> str:
     return (
         f"the images are mirrored: '{Path(name).name}' shows its board only when it is flipped left to right; "
         "switch off mirroring in the camera or the program that writes them, or flip all of them"
@@ -220,14 +223,14 @@ def _in_a_mirror(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """What images show of boards that nobody has described.
+    """The boards that images show, as far as they determine them.
 
     Attributes
     ----------
-    words : as `--board` takes them; None where they do not tell.
-    part : what they do show, in words, where it is not enough.
-    fault : what is wrong with the images, in words.
-    doubt : what is seen in them that may be a board, in words.
+    words : argument of `--board`; None if undetermined.
+    part : description of a board that is only partly determined.
+    fault : what is wrong with the images.
+    doubt : description of what may be a board.
     """
 
     words: str | None = None
@@ -241,9 +244,9 @@ def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion
     guess, pictures, unreadable = _guess(paths, progress)
     if unreadable is not None and not pictures:
         return Suggestion(fault=str(unreadable))
-    otherwise = _otherwise(pictures, guess)
-    if otherwise is not None:
-        return Suggestion(fault=otherwise)
+    mirrored = _mirrored_unless(guess, pictures)
+    if mirrored is not None:
+        return Suggestion(fault=mirrored)
     if guess is None:
         return Suggestion(doubt=_doubtful(pictures))
     if not guess.determined:
@@ -254,8 +257,11 @@ def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion
 
 
 def _partial_board_words(guess: BoardGuess) -> str:
-    """Say what images show of a board, where that is not all: a chessboard that has one of several sizes, or the only
-    one at least, a ChArUco board with more rows, or an AprilGrid whose edges are aside of where they were printed."""
+    """Return a description of a board that is only partly determined.
+
+    It is a chessboard of one of several sizes or of a minimum size, a ChArUco board with an unknown number of rows, or
+    an AprilGrid whose printed or exposed edges are displaced.
+    """
     if not guess.sizes:
         either = [guess.board, *filter(None, [guess.either])]
         return (
@@ -280,8 +286,8 @@ def _partial_board_words(guess: BoardGuess) -> str:
 def _guess(
     paths: Sequence[Path], progress: Progress = silent
 ) -> tuple[BoardGuess | None, list[tuple[str, GreyImage]], InputError | None]:
-    """Return the board that a few images show, or more of them where those do not tell, what was looked at, and why the
-    first of the others cannot be read."""
+    """Return the board that a few images show (more images if those do not determine it), the images searched, and the
+    error of the first image that cannot be read."""
     guess: BoardGuess | None = None
     unreadable: InputError | None = None
     pictures: list[tuple[str, GreyImage]] = []
@@ -309,11 +315,8 @@ def _guess(
 def _pictures(
     paths: Sequence[Path], max_images: int, between: bool = False
 ) -> Iterator[tuple[str, GreyImage | InputError]]:
-    """Yield the names and grey levels of about `max_images` images, evenly spread over `paths`, or why one cannot be
-    read; of those that lie between these.
-
-    Of videos frames are taken.
-    """
+    """Yield (name, grey image or error) of about `max_images` images, evenly spread over `paths`; `between`: of those
+    halfway between these. Videos give frames."""
     step = max(1, -(-len(paths) // max_images))
     for path in paths[step // 2 if between else 0 :: step]:
         try:
@@ -326,7 +329,7 @@ def _pictures(
 
 
 def _frames(path: Path, max_images: int) -> Iterator[tuple[str, GreyImage]]:
-    """Yield so many frames of a video, evenly spread over it."""
+    """Yield `max_images` frames of a video, evenly spread."""
     with Video(path) as video:
         step = max(1, video.count // max_images) if video.count else FRAME_STRIDE
         for k in range(max_images):

@@ -1,4 +1,4 @@
-"""The cameras of a rig's session that are known before: lenses, or lenses and mounts, from files."""
+"""Known cameras of a rig's session: lenses, or lenses with mounts, from files."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ _log = logging.getLogger(__name__)
 
 
 def with_known(session: RigSession, known: Known) -> RigSession:
-    """Return the session with what files tell; what it says itself of them is replaced.
+    """Return the session with the lens files and rig file of `known` in place of its own.
 
-    Raises InputError for a number of files that is not that of the cameras.
+    Raises InputError if the number of lens files does not fit the cameras.
     """
     if known.lenses:
         session = replace(session, lenses=known.of_cameras(list(session.cameras)))
@@ -42,9 +42,9 @@ def with_known(session: RigSession, known: Known) -> RigSession:
 
 
 def with_known_first(session: RigSession) -> RigSession:
-    """Return the session with the cameras of the known rig first, in its order: its frame stays that of its first.
+    """Return the session with the cameras of the known rig first, in its order, so that the rig's frame stays the same.
 
-    What of the rig has no images is warned of.
+    Warns of cameras of the rig that have no images.
     """
     if session.known_rig is None:
         return session
@@ -61,11 +61,10 @@ def with_known_first(session: RigSession) -> RigSession:
 
 
 def known_cameras(session: RigSession) -> KnownCameras | None:
-    """Return what the files of a session know of its cameras, with their covariances where they have one; None where it
-    names no file.
+    """Return the known cameras of a session, with the covariances that their files have; None if it names no file.
 
-    Raises InputError for files that are no cameras, a rig of which the first camera is not in the session, or one that
-    leaves nothing to find.
+    Raises InputError for files without cameras, a rig whose first camera is not in the session, or one that has all
+    cameras of the session.
     """
     if session.known_rig is None and not session.lenses:
         return None
@@ -103,7 +102,7 @@ def _covariance(
     mounted: Sequence[str],
     alone: dict[str, FloatArray | None],
 ) -> FloatArray:
-    """Return the covariance of all that is known, in the order that `KnownCameras` has; exact where no file says."""
+    """Return the covariance of all known parameters, in the order of `KnownCameras`; zero where no file states one."""
     layout = Layout.of_cameras(camera for camera, _ in cameras.values())
     lenses = dict(zip(cameras, layout.cameras, strict=True))
     total = layout.cameras[-1].stop + 6 * max(len(mounted) - 1, 0)
@@ -118,7 +117,7 @@ def _covariance(
 
 
 def _places_in(cameras: Mapping[str, tuple[Camera, object]], mounted: Sequence[str]) -> IntArray:
-    """Return where the lenses and mounts of some cameras stand in the covariance of all `cameras`."""
+    """Return the indices, in the covariance of `cameras`, of the lenses and mounts of those named `mounted`."""
     layout = Layout.of_cameras(camera for camera, _ in cameras.values())
     chosen = [list(cameras).index(name) for name in mounted]
     runs = [layout.cameras[k] for k in chosen] + [layout.mount(k) for k in chosen[1:]]
@@ -126,7 +125,7 @@ def _places_in(cameras: Mapping[str, tuple[Camera, object]], mounted: Sequence[s
 
 
 def _saved(path: Path, names: Sequence[str]) -> SavedRig:
-    """Return a rig of ours, or another tool's, whose cameras have numbers for names, with the first of `names`."""
+    """Return a saved rig; the numbered cameras of another tool's get the first of `names`."""
     rig = saved_rig(path)
     warn_of_pupils(path, rig)
     if is_rig_file(path) or set(rig.cameras) & set(names):
@@ -135,7 +134,7 @@ def _saved(path: Path, names: Sequence[str]) -> SavedRig:
 
 
 def _lens(path: Path, name: str, names: Sequence[str]) -> tuple[Camera, FloatArray | None]:
-    """Return a camera and its covariance, None where the file has none; of a rig that of the name."""
+    """Return the camera of a file (of a rig's file, the one called `name`) and its covariance, or None."""
     if is_rig(path):
         rig = _saved(path, names)
         if name not in rig.cameras:

@@ -1,4 +1,4 @@
-"""Options that name files."""
+"""Base class of options that hold paths."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 class NamesFiles:
-    """Base of options (frozen dataclasses): a path that is given as text becomes one, before any work is done."""
+    """Base of option dataclasses: converts strings in fields of type Path."""
 
     __slots__ = ()
 

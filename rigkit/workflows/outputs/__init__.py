@@ -1,1 +1,1 @@
-"""What several verbs write: folders of results, provenance, cameras for other tools."""
+"""Outputs of several verbs: folders of results, provenance, cameras in other tools' formats."""

@@ -1,4 +1,4 @@
-"""Cameras and rigs in other tools' formats."""
+"""Writing cameras and rigs in other tools' formats."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rigkit.workflows.inputs.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
 from rigkit.workflows.inputs.paths import NamesFiles
 
 RIG_ENDINGS = {"colmap": ".json"}
-"""Where the file of a rig ends otherwise than that of a camera."""
+"""File endings of rigs that differ from those of cameras."""
 
 _log = logging.getLogger(__name__)
 
@@ -37,18 +37,18 @@ class ExportCameraOptions(NamesFiles):
     output: Path
     """File to write."""
     kind: str | None = None
-    """Format, one of `CAMERA_FORMATS`; None: ours where the name ends on .json."""
+    """Format, one of `CAMERA_FORMATS`; None: rigkit's, for a name that ends in .json."""
     source_kind: str | None = None
-    """Format of the camera given; None: told by its content."""
+    """Format of the source; None: recognised by its content."""
     size_px: tuple[int, int] | None = None
-    """Of the images, where the file does not say it (py-OCamCalib's)."""
+    """Image size, for files that do not state it (py-OCamCalib)."""
     force: bool = False
-    """Replace a file that exists; what was read is never replaced."""
+    """Replace an existing file; the source is never replaced."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ExportedCamera:
-    """What was written: the camera given, the format, and the file's largest error against the camera, in px."""
+    """The source camera, the format written, and the largest difference of the file from the camera, px."""
 
     camera: Camera
     kind: str
@@ -59,7 +59,7 @@ class ExportedCamera:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ExportedRig:
-    """What was written of a rig: the format, the largest error of a camera against the one given, in px, the files."""
+    """The format written, the largest difference of a camera from its source, px, and the files."""
 
     kind: str
     max_error_px: float
@@ -69,9 +69,10 @@ class ExportedRig:
 
 
 def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedCamera:
-    """Write the camera of a file in another format; what a user of the new file should know goes to the log.
+    """Write the camera of a file in another format; notes for users of the new file go to the log.
 
-    Raises InputError for no camera, a format that cannot follow it, or a file that cannot be written.
+    Raises InputError for a source that is no camera, a format that cannot represent it, or a file that cannot be
+    written.
     """
     kind = options.kind or ("rigkit" if options.output.suffix == ".json" else None)
     if kind not in CAMERA_FORMATS:
@@ -93,11 +94,11 @@ def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedC
 
 
 def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence[str] = ()) -> ExportedRig:
-    """Write a rig's file (ours, or another tool's) in another format; `names` picks cameras, in their order. A single
-    one that is picked may be written in ours.
+    """Write a rig's file (of rigkit or another tool) in another format; `names` selects cameras and their order.
 
-    Formats with a file a camera get OUT-NAME. Raises InputError for no rig, a format without rigs, a camera that is
-    not there, or a file that cannot be written.
+    A single selected camera may be written in rigkit's format. Formats with one file for each camera get OUT-NAME.
+    Raises InputError for a source that is no rig, a format without rigs, an unknown camera, or a file that cannot be
+    written.
     """
     kind = options.kind or ("rigkit" if options.output.suffix == ".json" and len(names) == 1 else None)
     if kind is None:
@@ -129,11 +130,10 @@ def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence
 
 
 def foreign_rig_files(rig: Rig, beside: Path, kinds: Sequence[str], outlines: Outlines) -> dict[Path, str]:
-    """Return the files (path -> content) of a rig in those of the formats that have rigs of so many cameras, named
-    after the rig's file `beside` which they lie, with the `outlines` of what cameras saw; what a user of them should
-    know goes to the log.
+    """Return the files (path -> content) of a rig in each of the formats `kinds` that can hold it.
 
-    A format that cannot follow this rig is left out, which the log says: the calibration is not lost for it.
+    They are named after the rig's file `beside` and fitted inside the `outlines` of the images that corners covered.
+    Notes for their users go to the log; so does a warning about a format that cannot represent this rig.
     """
     files: dict[Path, str] = {}
     for kind, places in foreign_rig_paths(list(rig), beside, kinds).items():
@@ -148,7 +148,7 @@ def foreign_rig_files(rig: Rig, beside: Path, kinds: Sequence[str], outlines: Ou
 
 
 def foreign_rig_paths(names: Sequence[str], beside: Path, kinds: Sequence[str]) -> dict[str, list[Path]]:
-    """Return by format where `foreign_rig_files` go, for a rig of cameras of these names."""
+    """Return the paths of `foreign_rig_files` by format, for cameras of these names."""
     out = {}
     for kind in kinds:
         known = RIG_FORMATS.get(kind)
@@ -159,15 +159,15 @@ def foreign_rig_paths(names: Sequence[str], beside: Path, kinds: Sequence[str]) 
 
 
 def _of_camera(path: Path, name: str) -> Path:
-    """Return where the file of one camera goes; "" stands for all of them."""
+    """Return the path for one camera; `path` itself for "", which stands for all cameras."""
     return path.with_name(f"{path.stem}-{name}{path.suffix}") if name else path
 
 
 def foreign_files(calibration: Calibration, beside: Path, kinds: Sequence[str]) -> dict[Path, str]:
     """Return the files (path -> content) of a camera in other tools' formats, named after its calibration's file
-    `beside` which they lie; what a user of them should know goes to the log.
+    `beside`. Notes for their users go to the log.
 
-    Raises InputError for a format that cannot follow the camera.
+    Raises InputError for a format that cannot represent the camera.
     """
     files = {}
     outline = outline_of_corners(calibration) if kinds else None
@@ -181,7 +181,7 @@ def foreign_files(calibration: Calibration, beside: Path, kinds: Sequence[str]) 
 
 
 def foreign_paths(beside: Path, kinds: Sequence[str]) -> list[Path]:
-    """Return where `foreign_files` go; raises InputError for a format that nobody knows."""
+    """Return the paths of `foreign_files`; raises InputError for an unknown format."""
     unknown = [kind for kind in kinds if kind not in FOREIGN_ENDINGS]
     if unknown:
         raise InputError(f"export: '{unknown[0]}' is none of the known formats {', '.join(FOREIGN_ENDINGS)}")
@@ -189,7 +189,7 @@ def foreign_paths(beside: Path, kinds: Sequence[str]) -> list[Path]:
 
 
 def _foreign(camera: Camera, kind: str, outline: Pixels | None) -> Written:
-    """Return the camera in a format that is written, held against it inside the `outline`."""
+    """Return the camera in another format, compared with the original inside the `outline`."""
     write = FOREIGN_FORMATS[kind].write
     assert write is not None
     return write(camera, outline)

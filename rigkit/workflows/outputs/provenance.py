@@ -1,4 +1,4 @@
-"""What somebody needs to know to get the same page again: versions, the time, hashes of the files."""
+"""Provenance of results: versions, time, and hashes of the input files."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from rigkit.core.errors import InputError
 from rigkit.io.corners.corner_cache import image_hash
 
 PACKAGES = ("numpy", "opencv-contrib-python-headless")
-"""Whose versions every result depends on."""
+"""Packages whose versions all results depend on."""
 
 
 def software_facts(*packages: str) -> dict[str, str]:
-    """Return the time, and the versions of rigkit, Python, and the packages in use (`packages` beside the usual)."""
+    """Return the time and the versions of rigkit, Python, PACKAGES and further `packages`."""
     facts = {"rigkit": version("rigkit"), "Python": platform.python_version()}
     facts |= {name: version(name) for name in (*PACKAGES, *packages)}
     return facts | {"written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")}
 
 
 def made(session: Path, images: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
-    """Return by what, when and from what a calibration's file is made, as it stands in it: the SHA-256 of the session,
-    and one of the images of every camera (""): of what `sha256sum` prints of those that can be read."""
+    """Return the provenance that a calibration file states: rigkit's version, the time, the SHA-256 of the session, and
+    for each camera the SHA-256 of what `sha256sum` prints for its readable images."""
     inputs = {} if not session.is_file() else {session.name: hashlib.sha256(session.read_bytes()).hexdigest()}
     for name, paths in images.items():
         pairs = _hashes(paths)
@@ -38,7 +38,7 @@ def made(session: Path, images: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
 
 
 def digest_line(source: Path | str | bytes) -> str:
-    """Return the SHA-256 of a file, of a text as UTF-8, or of bytes, in words."""
+    """Return "SHA-256 ..." of a file, of a text as UTF-8, or of bytes."""
     return f"SHA-256 {digest_of(source)}"
 
 
@@ -50,13 +50,13 @@ def digest_of(source: Path | str | bytes) -> str:
 
 
 def digest_of_images(paths: Sequence[Path]) -> str | None:
-    """Return one SHA-256 of the images that can be read, in words that say how to compute it; None where none can."""
+    """Return one SHA-256 of all readable images, with how to compute it in words; None if none is readable."""
     pairs = _hashes(paths)
     return f"{len(pairs)} files; SHA-256 of what `sha256sum` prints of them: {_digest_of(pairs)}" if pairs else None
 
 
 def _hashes(paths: Sequence[Path]) -> list[tuple[str, str]]:
-    """Return name and SHA-256 of the images that can be read: one that is gone or a link to nothing took no part."""
+    """Return (name, SHA-256) of the readable images."""
     pairs = []
     for path in paths:
         with suppress(InputError):

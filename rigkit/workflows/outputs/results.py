@@ -1,4 +1,4 @@
-"""Folders of results: which one, and files written into it all together or not at all."""
+"""Folders of results; files are written into them all together or not at all."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from rigkit.core.errors import InputError
 from rigkit.io.disk.writing import FORCE, ensure_folder_writable, ensure_writable, write_together
 
 CALIBRATIONS = "calibrations"
-"""Folder of results for cameras that were calibrated on the way."""
+"""Subfolder of results for cameras that were calibrated for them."""
 
 
 def free_folder(name: str, *, force: bool) -> Path:
-    """Return the first of out/NAME, out/NAME-2, ... that is not there yet; out/NAME itself with `force`."""
+    """Return the first of out/NAME, out/NAME-2, ... that does not exist; with `force` out/NAME."""
     base = Path("out") / name
     if force:
         return base
@@ -23,8 +23,7 @@ def free_folder(name: str, *, force: bool) -> Path:
 
 
 def require_folder(folder: Path, *, force: bool) -> None:
-    """Raise InputError, before the work, where `folder` holds results and `force` is not given, or files could not be
-    written there."""
+    """Raise InputError if `folder` is not empty and `force` is not given, or if it cannot be written."""
     if folder.is_dir() and any(folder.iterdir()) and not force:
         raise InputError(f"folder '{folder}' is not empty; {FORCE} to replace results in it, or another folder")
     if folder.exists() and not folder.is_dir():
@@ -35,10 +34,9 @@ def require_folder(folder: Path, *, force: bool) -> None:
 def write_results(
     folder: Path, files: Mapping[str, str | bytes], *, force: bool, inputs: Iterable[str | Path] = ()
 ) -> tuple[Path, ...]:
-    """Write all files (relative path -> content) into `folder`, or none, and return where they are.
+    """Write all files (relative path -> content) into `folder`, or none; return their paths.
 
-    Raises InputError where one would replace one of `inputs`, or would lie outside of `folder` because something in it
-    is a link.
+    Raises InputError if a file would replace one of `inputs`, or would be outside of `folder` because of a link in it.
     """
     placed = {folder / name: data for name, data in files.items()}
     whole = folder.resolve()
@@ -48,7 +46,7 @@ def write_results(
                 f"cannot write '{path}': a link in '{folder}' leads out of it, to '{path.parent.resolve()}'; remove "
                 "the link, or give another folder"
             )
-    # A calibration made anew was not read before: with `force` it takes the place of the one that the manifest names.
+    # A new calibration was computed without reading the old one, so with `force` it may replace that.
     new = {path.resolve() for path in placed if path.relative_to(folder).parts[0] == CALIBRATIONS}
     ensure_writable(placed, force=force, inputs=[path for path in inputs if Path(path).resolve() not in new])
     write_together(placed, force=force)

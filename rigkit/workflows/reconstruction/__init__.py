@@ -1,1 +1,1 @@
-"""Clouds and meshes: of a data set's pairs, of any scene, of a rig."""
+"""Clouds and meshes from the pairs of a data set, from any scene, or from a rig."""

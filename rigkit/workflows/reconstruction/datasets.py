@@ -1,12 +1,11 @@
-"""Data sets at work: the options that every verb on one takes, its cameras, and each pair for itself.
+"""What the verbs on a data set share: options, loading its cameras, and running a function over its pairs.
 
-Cameras are calibrated first where a calibration file is missing; pairs are independent and run in several processes. A
-camera or a pair that comes to nothing does not take the others with it.
+Cameras without a calibration file are calibrated first. Pairs run independently, in several processes. A camera or pair
+that fails does not stop the others.
 """
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import logging
 import os
@@ -23,7 +22,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.errors import InputError, InternalError, RigkitError, interruption
-from rigkit.core.processes import process_count, worker_pool
+from rigkit.core.processes import over_items, process_count
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibrations.calibration_file import calibration_text, load_calibration_or_camera
 from rigkit.io.disk.reading import about
@@ -43,24 +42,24 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetOptions(NamesFiles):
-    """What every workflow on a data set takes."""
+    """Options of every workflow on a data set."""
 
     pairs: tuple[str, ...] = ()
-    """Only these pairs; all of them where none is named."""
+    """Names of the pairs to use; empty: all."""
     output: Path | None = None
     """Folder for the results; None: nothing is written."""
     force: bool = False
-    """Replace results that are there; what was read is never replaced."""
+    """Replace existing results; input files are never replaced."""
     recalibrate: bool = False
-    """Calibrate the cameras from their sessions even where the manifest names a calibration that is there."""
+    """Calibrate the cameras from their sessions even if their calibration files exist."""
     chain: Literal["raw", "rectified"] = "raw"
-    """Captured pixels, or perspective views of them."""
+    """Use captured pixels, or perspective views of them."""
     support: Support = "patch"
-    """What directions are estimated from, see `direction_field`."""
+    """Corners that directions are estimated from, see `direction_field`."""
     det_scale: str = "area"
     """Scale of DET3UDIR, see `affines_from_directions`."""
     jobs: int | None = None
-    """Processes; None: one a core."""
+    """Number of processes; None: one a core."""
 
 
 Options = TypeVar("Options", bound=DatasetOptions)
@@ -69,11 +68,11 @@ Options = TypeVar("Options", bound=DatasetOptions)
 def ready_dataset(
     dataset: Dataset | str | Path, options: DatasetOptions, reserved: Iterable[str] = (), *, measured: bool = False
 ) -> Dataset:
-    """Return the pairs asked for of a data set, given its folder or manifest or the data set as loaded.
+    """Return the data set with the pairs that `options` select; `dataset` is loaded, or its folder or manifest.
 
-    Raises InputError for what can be known before the work: no such pair, no image of any pair, fewer than one process,
-    a pair's name that cannot be a folder beside the files called `reserved`, a folder that results cannot go to. With
-    `measured` also where nothing was measured of any pair.
+    Raises InputError: no such pair; no image of any pair; fewer than one process; a pair's name that is one of the file
+    names `reserved`, or too long for a folder; results that cannot be written. With `measured`, also if no pair has a
+    measured truth.
     """
     process_count(options.jobs)
     known = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
@@ -103,26 +102,26 @@ def ready_dataset(
 
 
 def write_for(dataset: Dataset, options: DatasetOptions, files: Mapping[str, str | bytes]) -> None:
-    """Write the results (relative path -> content) where `options` say, if they say so."""
+    """Write the results (relative path -> content) into `options.output`; do nothing if that is None."""
     if options.output is not None:
         write_results(options.output, files, force=options.force, inputs=dataset.inputs)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoadedCamera:
-    """A camera, and its whole calibration; None where the file does not say more (another tool's camera)."""
+    """A camera with its calibration; None for another tool's file, which holds the camera only."""
 
     camera: Camera
     calibration: Calibration | None
 
     @property
     def near(self) -> Camera:
-        """The camera of points in mm: where its pupil moves a `NearCamera`."""
+        """The camera for points in mm: a `NearCamera` if its entrance pupil moves."""
         return self.camera if self.calibration is None else self.calibration.near
 
     @property
     def known(self) -> UncertainCamera | None:
-        """The camera of points in mm with what its calibration leaves open, where that is known."""
+        """The camera for points in mm with its covariance; None if the calibration is unknown."""
         return None if self.calibration is None else uncertain_camera(self.calibration, near=True)
 
 
@@ -132,10 +131,10 @@ class LoadedCameras:
 
     Attributes
     ----------
-    known : by id, those that can be used; also some that no pair names.
-    failed : by id, why others cannot be used.
-    files : relative path -> content of the calibrations that were made now, for the folder of results.
-    sources : by id, what a camera was read from: its file, or the text of a new calibration.
+    known : usable cameras by id, also those that no pair uses.
+    failed : errors of the other cameras by id.
+    files : relative path -> content of the calibrations computed now, for the folder of results.
+    sources : by id, the file that a camera was read from, or the text of its new calibration.
     """
 
     known: Mapping[str, LoadedCamera]
@@ -144,7 +143,7 @@ class LoadedCameras:
     sources: Mapping[str, Path | str]
 
     def of(self, pair: Pair) -> tuple[LoadedCamera, LoadedCamera]:
-        """Return the two cameras of a pair; raises why they cannot be used."""
+        """Return the two cameras of a pair; raises the error of one that failed."""
         for entry in (pair.camera1, pair.camera2):
             if entry.camera_id in self.failed:
                 raise self.failed[entry.camera_id]
@@ -152,11 +151,10 @@ class LoadedCameras:
 
 
 def load_cameras(dataset: Dataset, *, recalibrate: bool = False, progress: Progress = silent) -> LoadedCameras:
-    """Return the cameras of a data set, calibrating those in use from their sessions where that was not done yet.
+    """Return the cameras of a data set; those in use without a calibration are calibrated from their sessions.
 
-    Nothing is written: a manifest does not say where files go. Cameras that no pair uses come along where they are
-    calibrated: an image may fit one of them better than the camera that it is said to be from. Raises the first error
-    where no pair has both its cameras.
+    Nothing is written: a manifest does not say where files go. Calibrated cameras that no pair uses are loaded too: an
+    image may fit one of them better than its declared camera. Raises the first error if no pair has both its cameras.
     """
     known: dict[str, LoadedCamera] = {}
     failed: dict[str, RigkitError] = {}
@@ -203,7 +201,7 @@ def _calibrate(dataset: Dataset, entry: CameraEntry, progress: Progress) -> Cali
 
 
 def _file_of(camera_id: str, index: int) -> str:
-    """Return where a new calibration goes among the results, whatever characters the camera's id has."""
+    """Return the path of a new calibration in the results; characters that file names cannot have are replaced."""
     safe = re.sub(r"[^\w-]", "_", camera_id)[:40]
     return f"{CALIBRATIONS}/{safe if safe == camera_id else f'{safe}-{index + 1}'}.json"
 
@@ -215,7 +213,7 @@ def _load(path: Path) -> LoadedCamera:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairFailure:
-    """A pair that came to nothing, and why."""
+    """A pair that failed, and its error."""
 
     pair_id: str
     error: RigkitError
@@ -227,7 +225,7 @@ class PairFailure:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairJob(Generic[Options]):
-    """What one process needs to know of one pair."""
+    """One pair with its cameras and options, as it is sent to a process."""
 
     pair: Pair
     cameras: LoadedCameras
@@ -242,10 +240,10 @@ def over_pairs(
     what: str,
     progress: Progress = silent,
 ) -> tuple[list[Result], tuple[PairFailure, ...], LoadedCameras]:
-    """Return what `work` makes of every pair, in their order, the pairs that came to nothing, and the cameras.
+    """Return `work` of every pair, in order, the pairs that failed, and the cameras.
 
-    Several processes work where that helps; `work` is a function of a module. A pair that cannot be done does not take
-    the others with it; only if there is no result at all is the first pair's error raised.
+    Pairs run in up to `options.jobs` processes, so `work` must be a module's function. A pair that fails does not stop
+    the others; if all fail, the first pair's error is raised.
     """
     pairs, cameras = dataset.pairs, load_cameras(dataset, recalibrate=options.recalibrate, progress=progress)
     outcomes: dict[str, Result | RigkitError] = {}
@@ -257,15 +255,11 @@ def over_pairs(
             waiting[pair.pair_id] = PairJob(pair, cameras, options)
         except RigkitError as error:
             outcomes[pair.pair_id] = error
-    count = min(len(waiting), process_count(options.jobs))
     progress(what, 0, len(waiting))
-    with contextlib.ExitStack() as stack:
-        attempt = functools.partial(_attempt, work)
-        each = map if count <= 1 else stack.enter_context(worker_pool(count)).map
-        results: Iterable[Result | RigkitError] = each(attempt, waiting.values())
-        for done, (name, outcome) in enumerate(zip(waiting, results, strict=True), start=1):
-            progress(what, done, len(waiting))
-            outcomes[name] = outcome
+    jobs, attempt = list(waiting.values()), functools.partial(_attempt, work)
+    for done, (place, outcome) in enumerate(over_items(attempt, jobs, jobs=options.jobs), start=1):
+        progress(what, done, len(jobs))
+        outcomes[jobs[place].pair.pair_id] = outcome
     ordered = [(pair.pair_id, outcomes[pair.pair_id]) for pair in pairs]
     failures = tuple(PairFailure(name, outcome) for name, outcome in ordered if isinstance(outcome, RigkitError))
     if failures and len(failures) == len(pairs):

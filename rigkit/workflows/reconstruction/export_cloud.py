@@ -1,4 +1,4 @@
-"""The oriented cloud of one pair in a format of other tools."""
+"""`rigkit export` of clouds: the oriented cloud of a pair, or of a PLY file, in other formats."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportCloudOptions(NamesFiles):
-    """Which cloud to export, in which format, and where to write it."""
+    """The cloud to export, its format, and where to write it."""
 
     output: Path
     """File to write; a folder for a COLMAP model."""
@@ -41,11 +41,11 @@ class ExportCloudOptions(NamesFiles):
     method: str = "3SDIR"
     """Affine estimator of the normals."""
     planes: Planes | None = None
-    """Points and normals, as `ReconstructOptions` has it; None: as the manifest says of the pair."""
+    """Planes that points and normals are computed on, as in `ReconstructOptions`; None: as in the manifest."""
     single_precision: bool = False
-    """Of a PLY: 32-bit numbers, for programs that know no other."""
+    """Write 32-bit numbers into a PLY, for programs that cannot read 64-bit ones."""
     force: bool = False
-    """Replace files that exist; what was read is never replaced."""
+    """Replace existing files; input files are never replaced."""
 
 
 def export_cloud(
@@ -53,10 +53,10 @@ def export_cloud(
 ) -> Reconstruction:
     """Reconstruct one pair of a data set, write its cloud, and return the reconstruction.
 
-    The cloud is that of `reconstruct_dataset` with the same options: the calibrations are in its sigmas.
+    The cloud is that of `reconstruct_dataset` with the same options; its sigmas include those of the calibrations.
 
-    Raises InputError: no such pair, or none named of several; a file that cannot be read or written; DegenerateError:
-    the corners do not determine the pose.
+    Raises InputError: no such pair, or several pairs and none selected; a file that cannot be read or written;
+    DegenerateError: the corners do not determine the pose.
     """
     known = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     if options.pair is None and len(known.pairs) != 1:
@@ -103,7 +103,7 @@ def export_ply(source: Path, options: ExportCloudOptions) -> OrientedCloud:
 
 
 def _cloud_npz(reconstruction: Reconstruction) -> bytes:
-    """Return an npz file: points, normals, sigmas, corners, affinities and the relative pose, units in the names."""
+    """Return an npz file of points, normals, sigmas, corners, affinities and relative pose."""
     cloud, matches = reconstruction.cloud, reconstruction.matches
     arrays: dict[str, NDArray[Any]] = {
         "points_mm": cloud.points_mm,

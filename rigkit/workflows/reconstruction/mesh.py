@@ -1,4 +1,4 @@
-"""A mesh through an oriented cloud."""
+"""`rigkit mesh`: a triangle mesh from an oriented cloud."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from rigkit.reconstruction.lines_of_sight import with_lines_of_sight
 from rigkit.workflows.inputs.paths import NamesFiles
 
 MAX_OCTREE_DEPTH = 12
-"""Each level more takes four times the memory: of this one, several GB."""
+"""Each further level takes four times the memory; this one takes several GB."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeshOptions(NamesFiles):
-    """How a cloud becomes a mesh."""
+    """Parameters of the surface."""
 
     output: Path
     """PLY file to write."""
     depth: int = 9
-    """Of the octree: 2^depth cells along the longest side."""
+    """Depth of the octree: 2^depth cells along the longest side."""
     cut: float = 0.02
-    """Share of the vertices, those with the fewest points near, that is cut off."""
+    """Fraction of the vertices that is removed, those with the lowest point density."""
     one_view: bool | None = None
-    """All of the cloud was seen from its origin, as that of one pair of images: where near and far points meet in the
-    picture, the surface is a line of sight. None: as the file's header says."""
+    """The whole cloud was seen from its origin, as from one pair of images: no surface then connects the near and far
+    side of an occlusion boundary. None: as the file's header states."""
     force: bool = False
     """Replace an existing file; the cloud is never replaced."""
 
@@ -38,8 +38,8 @@ class MeshOptions(NamesFiles):
 def mesh_cloud(cloud: str | Path, options: MeshOptions, *, progress: Progress = silent) -> Mesh:
     """Write the screened Poisson surface of the oriented cloud in a PLY file, and return it.
 
-    Raises InputError: the cloud cannot be read or has no normals, the file cannot be written, options without a
-    meaning; DegenerateError: nothing is left of the surface.
+    Raises InputError: the cloud cannot be read or has no normals, the file cannot be written, an option is out of
+    range; DegenerateError: nothing is left of the surface.
     """
     if not 3 <= options.depth <= MAX_OCTREE_DEPTH:
         raise InputError(f"mesh: the depth of the octree must be 3 to {MAX_OCTREE_DEPTH}, got {options.depth}")

@@ -1,4 +1,4 @@
-"""One pair of a data set: boards found, matched and reconstructed as the manifest declares it."""
+"""One pair of a data set: detection, matching and reconstruction of its boards as declared in the manifest."""
 
 from __future__ import annotations
 
@@ -33,10 +33,9 @@ Image: TypeAlias = NDArray[Any]
 
 
 def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detections, Detections, Image, Image]:
-    """Return the boards found in either image of a pair, and the images; raises InputError where there are none.
+    """Return the boards found in each image of a pair, and the images; raises InputError if an image shows none.
 
-    The cameras show where corners were missed, which parts are of one board, what is covered, and how lines bend; a
-    camera that no pose of a board fits is left aside.
+    The cameras are used to predict missed corners, join parts of boards, reject occluded corners and model distortion.
     """
     images = []
     found: list[Detections] = []
@@ -58,8 +57,8 @@ def match_images(
 ) -> tuple[MatchedPair, Image, Image]:
     """Return the matched corners of a pair, and its two images.
 
-    Of a board that fits nowhere as declared, the squares with which it would fit are said: in the notes, or in the
-    error raised where no board is left.
+    For a board that does not fit as declared, the square size that would fit is stated in the notes, or in the error
+    raised if no board is left.
     """
     found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
     try:
@@ -84,7 +83,7 @@ def match_found(
     chain: str,
     support: Support = "patch",
 ) -> MatchedPair:
-    """Match the boards found in the two images of a pair as the manifest declares it; cameras as of `match_pair`."""
+    """Match the boards found in the two images of a pair, as declared in the manifest; cameras as for `match_pair`."""
     return match_pair(
         pair.pair_id,
         camera1,
@@ -106,13 +105,13 @@ def squares_that_fit(
     detections1: Sequence[BoardDetection],
     detections2: Sequence[BoardDetection],
 ) -> tuple[str, ...]:
-    """Return in words with which squares a board would fit the others of a pair, where it fits nowhere as declared."""
+    """Return, in words, the square size with which a misfitting board would fit the other boards of a pair."""
     fitting = fitting_squares(detections1, detections2, pair.boards, far_camera(camera1), far_camera(camera2))
     return diagnose_squares(fitting)
 
 
 def geometry_of(matched: MatchedPair, pair: Pair) -> PairGeometry:
-    """Return pose and points of matched corners as the manifest declares the pair."""
+    """Return the pose and points of matched corners, with pose type and level as declared in the manifest."""
     level = None if pair.level_sigma_deg is None else float(np.deg2rad(pair.level_sigma_deg))
     frames = None if pair.down is None else LevelFrames.from_down(*pair.down)
     return pair_geometry(matched, pose_type=pair.pose_type, level_sigma_rad=level, level_frames=frames)
@@ -121,12 +120,12 @@ def geometry_of(matched: MatchedPair, pair: Pair) -> PairGeometry:
 def reconstruct_with(
     matched: MatchedPair, pair: Pair, method: str, image1: Image | None = None, *, det_scale: str = "area"
 ) -> Reconstruction:
-    """Reconstruct matched corners as the manifest declares the pair."""
+    """Reconstruct matched corners, as declared in the manifest."""
     return reconstruct_from(geometry_of(matched, pair), affine_method=method, scale=det_scale, image1=image1)
 
 
 def shifts_of(reconstruction: Reconstruction, camera1: LoadedCamera, camera2: LoadedCamera) -> CalibrationShifts | None:
-    """Return what the calibrations' uncertainty does to a reconstruction; None where a camera has no covariance."""
+    """Return the effect of the calibrations' covariances on a reconstruction; None if a camera has no covariance."""
     known1, known2 = camera1.known, camera2.known
     if known1 is None or known2 is None:
         return None
@@ -135,9 +134,9 @@ def shifts_of(reconstruction: Reconstruction, camera1: LoadedCamera, camera2: Lo
 
 
 def planes_of(geometry: PairGeometry, planes: Planes, camera1: LoadedCamera, camera2: LoadedCamera) -> BoardPlanes:
-    """Return the boards' planes, fitted to both images, with the calibrations' share in their sigmas.
+    """Return the boards' planes fitted to both images; their sigmas include those of the calibrations.
 
-    Raises DegenerateError where too few corners are seen.
+    Raises DegenerateError for too few corners.
     """
     return fit_planes(geometry, planes, camera1.known, camera2.known, one_camera=camera1 is camera2)
 
@@ -145,9 +144,9 @@ def planes_of(geometry: PairGeometry, planes: Planes, camera1: LoadedCamera, cam
 def with_whole_sigmas(
     reconstruction: Reconstruction, planes: Planes, camera1: LoadedCamera, camera2: LoadedCamera
 ) -> Reconstruction:
-    """Return a pair's free reconstruction as clouds are written: on `planes`, the calibrations' share in its sigmas.
+    """Return a reconstruction moved onto `planes`, with the calibrations' covariances in its sigmas.
 
-    Raises DegenerateError where too few corners are seen for planes.
+    Raises DegenerateError for too few corners to fit planes.
     """
     if planes == "free":
         return with_calibrations(reconstruction, shifts_of(reconstruction, camera1, camera2))
@@ -157,7 +156,7 @@ def with_whole_sigmas(
 
 
 def reconstruct_other_chain(matched: MatchedPair, pair: Pair) -> Reconstruction | None:
-    """Reconstruct the same corners in the other pixels (raw or rectified); None where they do not fit."""
+    """Reconstruct the same corners in the other chain (raw or rectified); None if that is degenerate."""
     try:
         return reconstruct_with(matched.in_chain("rectified" if matched.chain == "raw" else "raw"), pair, "3SDIR")
     except DegenerateError:

@@ -1,4 +1,4 @@
-"""Oriented clouds of every pair of a data set; needs no measured truth."""
+"""`rigkit reconstruct` of a data set: oriented clouds of its pairs; needs no measured truth."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_with
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReconstructOptions(DatasetOptions):
-    """How to reconstruct the pairs of a data set."""
+    """Options of a reconstruction of pairs."""
 
     method: str = "3SDIR"
     """Affine estimator of the normals."""
     planes: Planes | None = None
-    """Points and normals: each by itself ("free"), or on the boards' planes (then whatever the estimator); None: as the
-    manifest says of each pair."""
+    """Each point and normal by itself ("free"), or on its board's plane, where the estimator does not matter; None: as
+    in the manifest."""
     pictures: bool = True
     """Draw corners, epipolar curves and the cloud."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairReconstruction:
-    """One pair: the reconstruction, the name of its cloud's file, and all its files (relative path -> content)."""
+    """The reconstruction of one pair, the name of its PLY file, and all its files (relative path -> content)."""
 
     reconstruction: Reconstruction
     ply: str
@@ -54,9 +54,9 @@ class DatasetReconstruction:
 
     Attributes
     ----------
-    pairs : those that could be reconstructed.
+    pairs : the pairs that were reconstructed.
     failures : the others.
-    files : relative path -> content of everything, whether it was written or not.
+    files : relative path -> content of all results, written or not.
     """
 
     pairs: tuple[PairReconstruction, ...]
@@ -69,9 +69,9 @@ class DatasetReconstruction:
 def reconstruct_dataset(
     dataset: Dataset | str | Path, options: ReconstructOptions | None = None, *, progress: Progress = silent
 ) -> DatasetReconstruction:
-    """Reconstruct the pairs of a data set, given its folder or as loaded, and write what `options` ask for.
+    """Reconstruct the pairs of a data set (loaded, or its folder) and write the results if `options.output` is given.
 
-    A pair that cannot be reconstructed is among the failures; its error is raised where there is no other pair.
+    A pair that cannot be reconstructed goes into `failures`; its error is raised if all fail.
     """
     options = options or ReconstructOptions()
     known = ready_dataset(dataset, options)
@@ -86,7 +86,7 @@ def reconstruct_dataset(
 
 
 def _reconstruct(job: PairJob[ReconstructOptions]) -> PairReconstruction:
-    """Reconstruct one pair and render its files."""
+    """Reconstruct one pair and return it with its files."""
     pair, options = job.pair, job.options
     camera1, camera2 = job.cameras.of(pair)
     matched, image1, image2 = match_images(pair, camera1.near, camera2.near, options.chain, options.support)

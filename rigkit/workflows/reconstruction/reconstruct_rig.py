@@ -1,4 +1,4 @@
-"""Several views of a scene with known poses, of a rig or of one camera that was tracked, into one fused cloud."""
+"""One fused cloud from several views of a scene with known poses, of a rig or a tracked camera."""
 
 from __future__ import annotations
 
@@ -32,34 +32,35 @@ from rigkit.workflows.outputs.results import require_folder, write_results
 from rigkit.workflows.reconstruction.reconstruct_scene import CLOUD, SCENE_PAGE, CloudOptions
 
 PARTNERS = 3
-"""Views nearest to each that it is paired with."""
+"""Each view is paired with so many nearest ones."""
 MAX_AXES_DEG = 60.0
-"""Between the axes of two views that see a surface alike enough to match; of wide lenses more, if there is no other."""
+"""Maximum angle between the axes of views to be paired; beyond it surfaces look too different to match. Views of wide
+lenses are paired beyond it if there are no others."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigSceneOptions(CloudOptions):
-    """What is there of a scene, and how to reconstruct it."""
+    """The rig and the images of a scene."""
 
     rig: Path
-    """Cameras and where they stand: our rig's file, Kalibr's camchain, OpenCV's pair."""
+    """Rig with the cameras' poses: rigkit's file, a Kalibr camchain, or a stereo pair of OpenCV or MATLAB."""
     images: tuple[Path, ...]
-    """One for each camera."""
+    """One image for each camera."""
     names: tuple[str, ...] | None = None
-    """Cameras of the images; None: the rig's first ones in its order."""
+    """Cameras of the images; None: the rig's first ones, in its order."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigScene:
-    """What a scene came to.
+    """The reconstruction of a scene from a rig.
 
     Attributes
     ----------
-    cloud : fused, in the frame of the first image's camera, mm.
-    pairs : names of the two cameras -> points that the pair grew.
-    merged : points of the cloud that more than one pair saw.
-    notes : pairs that gave nothing, in words.
-    files : relative path -> content of everything, whether it was written or not.
+    cloud : fused cloud in the frame of the first image's camera, mm.
+    pairs : names of the two cameras -> number of points of the pair.
+    merged : number of points that more than one pair saw.
+    notes : pairs that gave no cloud, and why.
+    files : relative path -> content of all results, written or not.
     """
 
     cloud: OrientedCloud
@@ -71,7 +72,7 @@ class RigScene:
     __repr__ = brief
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures of the scene for programs, as JSON takes them."""
+        """Return the results of the scene as JSON values."""
         return {
             "points": len(self.cloud),
             "merged": self.merged,
@@ -85,17 +86,18 @@ class RigScene:
 class _View:
     name: str
     number: int
-    """Of the camera in the rig."""
+    """Index of the camera in the rig."""
     camera: Camera
     cam_from_world: Rigid3
     image: NDArray[np.generic]
 
 
 def reconstruct_rig_views(options: RigSceneOptions, *, progress: Progress = silent) -> RigScene:
-    """Reconstruct every pair of views that lie near each other and fuse their clouds; write what `options` ask for.
+    """Reconstruct all pairs of neighbouring views, fuse their clouds, and write the results into
+    `options.output`, if given.
 
-    Raises InputError: a file cannot be read or written, a camera is missing, an image is of another size than its
-    camera's; DegenerateError: no pair gives a cloud.
+    Raises InputError: a file cannot be read or written, a camera is missing, an image has another size than its
+    camera; DegenerateError: no pair gives a cloud.
     """
     if options.output is not None:
         require_folder(options.output, force=options.force)
@@ -139,12 +141,12 @@ def reconstruct_rig_views(options: RigSceneOptions, *, progress: Progress = sile
 
 
 def near_pairs(cam_from_world: Sequence[Rigid3]) -> list[tuple[int, int]]:
-    """Return which views to pair: each with the PARTNERS nearest ones that look the same way, at other places."""
+    """Return pairs of views (i < j): each view with its PARTNERS nearest ones of similar axis and another centre."""
     centres = np.array([pose.inverse().translation_mm for pose in cam_from_world])
     axes = np.array([pose.rotation[2] for pose in cam_from_world])
     distance = np.linalg.norm(centres[:, None] - centres, axis=-1)
     turned = np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
-    # A view that looks another way comes after all others.
+    # A view with another axis comes after all others.
     far = distance + np.where(turned > MAX_AXES_DEG, 2.0 * distance.max(), 0.0)
     far[distance <= 1e-9 * max(float(distance.max()), 1.0)] = np.inf
     chosen = np.zeros(far.shape, dtype=bool)
@@ -154,7 +156,7 @@ def near_pairs(cam_from_world: Sequence[Rigid3]) -> list[tuple[int, int]]:
 
 
 def _views(options: RigSceneOptions, cameras: Mapping[str, tuple[Camera, Rigid3]]) -> list[_View]:
-    """Return the views, the world being the frame of the first; raises InputError where rig and images do not fit."""
+    """Return the views, in the frame of the first; raises InputError if the images do not fit the rig."""
     names = options.names or tuple(cameras)[: len(options.images)]
     missing = [name for name in names if name not in cameras]
     if missing or len(names) != len(options.images) or len(set(names)) < len(names):
@@ -188,8 +190,10 @@ def _views(options: RigSceneOptions, cameras: Mapping[str, tuple[Camera, Rigid3]
 
 
 def _dense(one: _View, other: _View, known: UncertainPair | None) -> DenseScene:
-    """Return the cloud of two views, with what the rig leaves open in its sigmas where that is known; raises
-    DegenerateError where they do not see the same surfaces."""
+    """Return the cloud of two views, with the rig's covariance `known` in its sigmas.
+
+    Raises DegenerateError if they do not see the same surfaces.
+    """
     moved = () if known is None else tuple(known.moved())
     pose = KnownPose(other.cam_from_world @ one.cam_from_world.inverse(), moved=moved)
     try:

@@ -1,4 +1,4 @@
-"""A pair of views of any scene, without boards: matched here, or from a file of correspondences."""
+"""Two views of any scene without boards, by matched features or from a file of correspondences."""
 
 from __future__ import annotations
 
@@ -49,61 +49,61 @@ from rigkit.workflows.outputs.results import require_folder, write_results
 
 CLOUD = "scene.ply"
 SCENE_PAGE = "scene.html"
-"""The cloud, to be turned in a browser."""
+"""Page with an interactive view of the cloud."""
 MAPS = "maps.npz"
-"""Depth, range and normals at pixels of the first image."""
+"""Depth, range and normal maps of the first image."""
 
 Images: TypeAlias = tuple[NDArray[Any], NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CloudOptions(NamesFiles):
-    """Where a cloud goes, and how it is written."""
+    """Output of a cloud."""
 
     output: Path | None = None
     """Folder for the results; None: nothing is written."""
     force: bool = False
-    """Replace results that are there; what was read is never replaced."""
+    """Replace existing results; input files are never replaced."""
     single_precision: bool = False
-    """Write the cloud in 32 bits, for programs that know no other."""
+    """Write the cloud with 32-bit numbers, for programs that cannot read 64-bit ones."""
     confidence: bool = False
-    """Let the length of the cloud's normals say how sure they are."""
+    """Scale the cloud's normals by their confidence (see `ply_bytes`)."""
     pictures: bool = True
-    """Draw the cloud, and what it comes from."""
+    """Draw the cloud and the matched features."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneOptions(CloudOptions):
-    """The images or correspondences of a scene, its cameras, and how to reconstruct it."""
+    """Images or correspondences of a scene, its cameras, and options of the reconstruction."""
 
     camera: Path | None = None
-    """Calibration of the camera (of the first image); None: `rig` has it."""
+    """Calibration of the camera (of the first image); None: from `rig`."""
     camera2: Path | None = None
-    """Calibration of the second image's camera; None: the same."""
+    """Calibration of the second image's camera; None: the same as the first."""
     rig: Path | None = None
-    """Calibrated rig that took both images: its cameras, and their pose, which is not estimated."""
+    """Calibrated rig that took both images; its relative pose is not estimated anew."""
     rig_names: tuple[str, str] | None = None
     """Cameras of the two images; None: the rig's first two."""
     pose: Path | None = None
-    """Measured pose: cam2_from_cam1 as 3 x 4 or 4 x 4 numbers, mm; it is not estimated."""
+    """Measured cam2_from_cam1, 3 x 4 or 4 x 4 numbers, mm; it is not estimated."""
     images: tuple[Path, Path] | None = None
-    """The two images: their features are matched; with `correspondences` they colour the cloud."""
+    """The two images. Their features are matched, or with `correspondences` they colour the cloud."""
     correspondences: Path | None = None
     """Correspondences with affinities or directions (CSV, NPZ, AffineExtractor's text), or a matcher's (NPZ, COLMAP's
-    database): of these `images` give or refine the affinities."""
+    database), whose affinities are estimated or refined in `images`."""
     baseline_mm: float | None = None
-    """Measured baseline; None: it is the unit of the result."""
+    """Measured baseline; None: the baseline is the unit of length."""
     pose_type: str | None = None
-    """Of the two views: general, planar, standard, forward or auto; None: general, or exactly that of a rectified pair
-    where cameras and matches are those of one."""
+    """Pose type: general, planar, standard, forward or auto; None: general, or exactly standard if cameras and
+    matches are those of a rectified pair."""
     level_sigma_deg: float | None = None
-    """How well that pose type holds."""
+    """Standard deviation of the views from that pose type."""
     grow: bool = True
-    """Where there are images: let the correspondences grow over the surfaces, into a dense cloud."""
+    """Grow the correspondences over the surfaces of `images` into a dense cloud."""
 
     @property
     def name(self) -> str:
-        """What the scene is called: as the file that it comes from."""
+        """Name of the scene: that of the correspondences, or of the first image, without its ending."""
         source = self.correspondences or (self.images[0] if self.images else None)
         if source is None:
             raise InputError("a scene needs two images, or a file of correspondences")
@@ -116,10 +116,10 @@ class SceneResult:
 
     Attributes
     ----------
-    name : of the scene.
-    scene : the reconstruction, and which correspondences agree.
-    correspondences : all of them.
-    files : relative path -> content of everything, whether it was written or not.
+    name : name of the scene.
+    scene : the reconstruction, with the inliers.
+    correspondences : all correspondences.
+    files : relative path -> content of all results, written or not.
     """
 
     name: str
@@ -130,7 +130,7 @@ class SceneResult:
     __repr__ = brief
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures of the scene for programs, as JSON takes them."""
+        """Return the results of the scene as JSON values."""
         r = self.scene.reconstruction
         return {
             "pose_type": str(r.pose_type),
@@ -148,10 +148,10 @@ class SceneResult:
 
 
 def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> SceneResult:
-    """Reconstruct two views of a scene and write what `options` ask for.
+    """Reconstruct two views of a scene and write the results if `options.output` is given.
 
-    Raises InputError: a file cannot be read or written, an image is of another size than its camera's, both images are
-    the same; DegenerateError: the correspondences do not determine the pose.
+    Raises InputError: a file cannot be read or written, an image has another size than its camera, both images are the
+    same; DegenerateError: the correspondences do not determine the pose.
     """
     name = options.name
     for what, value in (("baseline", options.baseline_mm), ("sigma of a level", options.level_sigma_deg)):
@@ -199,10 +199,11 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
 
 
 def _cameras(options: SceneOptions) -> tuple[tuple[Camera, Camera], KnownPose | None, list[str]]:
-    """Return the cameras of both images, the pose between them where it is known, and what to say of them.
+    """Return the cameras of both images, their relative pose if known, and notes.
 
-    They are those of points in mm where there will be such, and correspondences alone: surfaces grow through central
-    lenses."""
+    For a reconstruction in mm without growing, they are the cameras for points in mm (`NearCamera`); growing needs
+    central cameras.
+    """
     metric = options.rig is not None or options.pose is not None or options.baseline_mm is not None
     near = metric and not (options.images and options.grow)
     if options.rig is not None:
@@ -223,7 +224,7 @@ def _cameras(options: SceneOptions) -> tuple[tuple[Camera, Camera], KnownPose | 
 
 
 def _calibrations(options: SceneOptions, cameras: tuple[Camera, Camera]) -> Calibrations | None:
-    """Return the cameras as their files know them, exact where one does not say; None where none does."""
+    """Return the cameras with their covariances (zero if a file has none); None if no file has one."""
     if options.rig is not None:
         rig = saved_rig(options.rig)
         names = list(rig.cameras)
@@ -271,11 +272,10 @@ def _sparse(
     images: Images | None,
     progress: Progress,
 ) -> tuple[SceneReconstruction, Correspondences]:
-    """Return the scene of the correspondences given or matched, and these.
+    """Return the scene reconstructed from the given or matched correspondences, and these.
 
-    Where those of plain features do not determine the pose, those of tilted views might.
+    If plain features do not determine the pose, features of tilted views are matched.
     """
-
     lenses = far_camera(cameras[0]), far_camera(cameras[1])
 
     def scene_of(found: Correspondences) -> SceneReconstruction:
@@ -324,7 +324,7 @@ def _grown(
     pose_is_known: bool,
     of: Calibrations | None,
 ) -> tuple[SceneReconstruction, Correspondences, Mapping[str, NDArray[Any]]]:
-    """Return the dense scene, its correspondences and maps; where nothing grows, the sparse one that says why."""
+    """Return the dense scene, its correspondences and maps; if growing fails, the sparse scene with a note."""
     progress("growing correspondences", 0, 1)
     try:
         dense = grow_scene(scene, seeds, *images, pose_is_known=pose_is_known, calibrations=of)

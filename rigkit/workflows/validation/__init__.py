@@ -1,1 +1,1 @@
-"""Data sets against what a person measured, against other programs and against the paper."""
+"""Validation of data sets against measured truth, other programs and the paper."""

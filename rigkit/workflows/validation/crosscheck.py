@@ -1,4 +1,4 @@
-"""The pairs of a data set through pycolmap, planar PnP and the other chain."""
+"""`rigkit crosscheck`: comparison of pairs with pycolmap, planar PnP and the other chain."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ FILES = ("crosscheck.md", "crosscheck.json")
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class DatasetCrossCheck:
-    """What the independent methods say of the pairs of a data set.
+    """The comparison of a data set with independent methods.
 
     Attributes
     ----------
-    reports : one a pair that could be reconstructed.
+    reports : one for each reconstructed pair.
     failures : the other pairs.
     table : all comparisons.
-    files : relative path -> content of everything, whether it was written or not.
+    files : relative path -> content of all results, written or not.
     """
 
     reports: tuple[CrossCheckReport, ...]
@@ -47,16 +47,16 @@ class DatasetCrossCheck:
 
     @property
     def passed(self) -> bool:
-        """Whether every pair could be compared, and everything agrees."""
+        """Whether every pair was compared and agrees."""
         return not self.failures and all(report.passed for report in self.reports)
 
 
 def crosscheck_dataset(
     dataset: Dataset | str | Path, options: DatasetOptions | None = None, *, progress: Progress = silent
 ) -> DatasetCrossCheck:
-    """Compare the pairs of a data set, given its folder or the data set as loaded, with independent methods.
+    """Compare the pairs of a data set (loaded, or its folder) with independent methods.
 
-    A pair that cannot be reconstructed is among the failures; its error is raised where there is no other pair.
+    A pair that cannot be reconstructed goes into `failures`; its error is raised if all fail.
     """
     options = options or DatasetOptions()
     known = ready_dataset(dataset, options, reserved=FILES)

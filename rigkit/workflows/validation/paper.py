@@ -1,4 +1,4 @@
-"""Every pair of a data set through the paper's own pipeline: its tables with the printed numbers, its claims judged."""
+"""`rigkit validate --paper`: the paper's own pipeline on a data set, compared with its printed tables and claims."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from rigkit.workflows.reconstruction.datasets import (
 from rigkit.workflows.reconstruction.pairs import match_images
 
 PAPER = "hajder2021"
-"""Folder with the paper's tables, beside the data set."""
+"""Folder of the paper's tables, beside the data set."""
 NOT_CHECKED = (
     "neither what was measured nor what is declared (pose types, levels, sizes of boards) is checked here; `rigkit "
     "validate` without --paper does that"
 )
-"""What a reader of the paper's tables must know: this pipeline errs by more than most wrong declarations."""
+"""Note under the tables: the errors of this pipeline exceed those of most wrong declarations."""
 PLANES_FILE = "planes.csv"
 BASELINES = "baselines.csv"
 
@@ -53,24 +53,24 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperOptions(DatasetOptions):
-    """How to repeat the paper on a data set."""
+    """Options of the paper's pipeline."""
 
     pictures: bool = True
-    """Make the page."""
+    """Write the page."""
     own_solvers: bool = False
-    """Standard and forward pairs by their own constrained solvers; else by the planar one, as in the paper."""
+    """Solve standard and forward pairs by their own constrained solvers, not by the planar one as in the paper."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PaperValidation:
-    """What the paper's pipeline made of a data set.
+    """The results of the paper's pipeline on a data set.
 
     Attributes
     ----------
-    reports : pairs x estimators. Their sigmas are those of the points' scatter: the pipeline predicts none.
-    tables : in the layout of the paper's, with the printed numbers, and the claims.
-    failures : pairs that came to nothing.
-    files : relative path -> content of everything, whether it was written or not.
+    reports : pairs x estimators. Their sigmas come from the scatter of the points: the pipeline predicts none.
+    tables : the paper's tables with the printed numbers beside, and the claims.
+    failures : pairs that failed.
+    files : relative path -> content of all results, written or not.
     """
 
     reports: tuple[ValidationReport, ...]
@@ -84,10 +84,10 @@ class PaperValidation:
 def validate_as_paper(
     dataset: Dataset | str | Path, options: PaperOptions | None = None, *, progress: Progress = silent
 ) -> PaperValidation:
-    """Repeat the paper's comparison on the pairs of a data set, and write what `options` ask for.
+    """Repeat the paper's comparison on the pairs of a data set, and write the results if `options.output` is given.
 
-    Raises InputError: nothing was measured, or something asked for cannot be, all said before the work; RigkitError: no
-    pair could be reconstructed (one that could not is else among the failures).
+    Raises InputError, before the work: nothing was measured, or as `ready_dataset`; RigkitError: no pair could be
+    reconstructed. Other pairs that fail go into `failures`.
     """
     options = options or PaperOptions()
     known = ready_dataset(dataset, options, measured=True)
@@ -105,7 +105,7 @@ def validate_as_paper(
 
 
 def printed_tables(dataset: Dataset) -> PaperTables | None:
-    """Return the paper's tables where they lie beside the data set."""
+    """Return the paper's tables if their folder is beside the data set, else None."""
     folder = dataset.root.parent / PAPER
     return load_paper_tables(folder) if folder.is_dir() else None
 
@@ -113,7 +113,7 @@ def printed_tables(dataset: Dataset) -> PaperTables | None:
 def load_paper_tables(folder: str | Path) -> PaperTables:
     """Read `planes.csv` and `baselines.csv` of a folder such as datasets/hajder2021.
 
-    Raises InputError where one is missing, a row has another number of cells than the head, or a cell is no number.
+    Raises InputError if one is missing, a row and the head differ in length, or a cell is not a number.
     """
     return PaperTables(_read(Path(folder) / PLANES_FILE), _read(Path(folder) / BASELINES))
 
@@ -138,7 +138,7 @@ def _without_unit(name: str) -> str:
 
 
 def _repeat(job: PairJob[PaperOptions]) -> tuple[ValidationReport, ...]:
-    """Return the reports of one pair, an estimator that fails on it left out and said."""
+    """Return the reports of one pair; warns of estimators that fail on it."""
     pair = job.pair
     camera1, camera2 = (loaded.near for loaded in job.cameras.of(pair))
     matched, _, _ = match_images(pair, camera1, camera2, job.options.chain)
@@ -170,7 +170,7 @@ def _tables(reports: Sequence[ValidationReport], printed: PaperTables, images: s
 
 
 def paper_page(name: str, images: str | None, tables: Sequence[Table], provenance: Mapping[str, str]) -> str:
-    """Return the page of a data set; `images` says whether they are "real" or "rendered", None where nobody did."""
+    """Return the page of a data set; `images` is "real", "rendered", or None if undeclared."""
     claims = next(table for table in tables if table.key == "claims")
     judged = [row[1] for row in claims.rows if row[1].value != NOTHING_TO_COMPARE]
     held = sum(not cell.failed for cell in judged)

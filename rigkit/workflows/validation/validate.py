@@ -1,4 +1,4 @@
-"""Every pair of a data set and every affine estimator against what a person measured."""
+"""`rigkit validate`: every pair of a data set and every affine estimator, compared with measured truth."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ from rigkit.workflows.validation.validation_files import RESERVED, PairValidatio
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ValidateOptions(DatasetOptions):
-    """How to validate a data set."""
+    """Options of a validation."""
 
     pictures: bool = True
-    """Draw each pair, and make the page."""
+    """Draw each pair and write the page."""
     pdf: bool = False
-    """The pictures as vectors too, for a paper."""
+    """Write the pictures as PDF, too."""
     planes: Planes | None = None
-    """By which planes angles, normals and the baseline are judged; None: as the manifest says of each pair."""
+    """Planes for the checks of angles, normals and baseline; None: as in the manifest."""
     crosscheck: bool = True
     """Compare with independent methods."""
 
@@ -74,12 +74,12 @@ class DatasetValidation:
 
     Attributes
     ----------
-    pairs : those that could be reconstructed.
+    pairs : the pairs that were reconstructed.
     failures : the others.
-    causes : what explains checks that fail, gravest where one does fail.
-    page : what its page says.
-    files : relative path -> content of everything, whether it was written or not.
-    seconds : how long it took.
+    causes : probable causes of failed checks; severity BAD if a check fails, else LOOK.
+    page : the facts on the page.
+    files : relative path -> content of all results, written or not.
+    seconds : run time.
     """
 
     pairs: tuple[PairValidation, ...]
@@ -93,7 +93,7 @@ class DatasetValidation:
 
     @property
     def reports(self) -> tuple[ValidationReport, ...]:
-        """Every estimator of every pair."""
+        """The reports of all estimators of all pairs."""
         return tuple(report for pair in self.pairs for report in pair.reports)
 
     @property
@@ -103,7 +103,7 @@ class DatasetValidation:
 
     @property
     def passed(self) -> bool:
-        """Whether every pair was validated, and every check holds."""
+        """Whether every pair was validated and passes all checks."""
         checked = all(r.passed for r in self.reports) and all(r.passed for r in self.crosschecks)
         return checked and not self.failures
 
@@ -111,10 +111,10 @@ class DatasetValidation:
 def validate_dataset(
     dataset: Dataset | str | Path, options: ValidateOptions | None = None, *, progress: Progress = silent
 ) -> DatasetValidation:
-    """Validate the pairs of a data set, given its folder or the data set as loaded, and write what `options` ask for.
+    """Validate the pairs of a data set (loaded, or its folder), and write the results if `options.output` is given.
 
-    Raises InputError: nothing was measured, or something asked for cannot be: all said before the work; RigkitError: no
-    pair could be reconstructed; a pair that could not is else among the failures.
+    Raises InputError, before the work: nothing was measured, or as `ready_dataset`; RigkitError: no pair could be
+    reconstructed. Other pairs that fail go into `failures`.
     """
     started = time.monotonic()
     options = options or ValidateOptions()
@@ -128,7 +128,6 @@ def validate_dataset(
     causes = [cause for pair in pairs for cause in pair.causes]
     causes += diagnose([pair.best for pair in pairs])
     causes += [f"pair '{report.pair_id}': {words}" for report in compared for words in report.diagnosis]
-    # Where everything passed they explain nothing, but a person should know.
     severity = Severity.LOOK if passed else Severity.BAD
     seconds = time.monotonic() - started
     page, files = validation_files(
@@ -146,7 +145,7 @@ def validate_dataset(
 
 
 def _validate(job: PairJob[ValidateOptions]) -> PairValidation:
-    """Reconstruct one pair with every estimator and judge each."""
+    """Reconstruct one pair with every estimator and validate each."""
     pair = job.pair
     names = (pair.camera1.camera_id, pair.camera2.camera_id)
     camera1, camera2 = (loaded.near for loaded in job.cameras.of(pair))
@@ -164,7 +163,7 @@ def _validate(job: PairJob[ValidateOptions]) -> PairValidation:
             causes += wrong_squares()
         return _validated(job, matched, image1, image2, causes)
     except RigkitError as error:
-        # Without a board that is left out, nothing was matched at all.
+        # Without this, no board was matched at all.
         causes = causes or wrong_squares()
         if not causes:
             raise
@@ -209,7 +208,7 @@ def _validated(
 
 
 def _fitted(geometry: PairGeometry, job: PairJob[ValidateOptions]) -> FittedPlanes:
-    """Return the boards' planes by both images; those that nothing is judged by may be missing."""
+    """Return the boards' planes fitted to both images; only the planes that are checked must exist."""
     judging = job.options.planes or job.pair.planes
     found: dict[Planes, BoardPlanes] = {}
     for planes in PLANE_CHOICES[1:]:
@@ -224,9 +223,9 @@ def _fitted(geometry: PairGeometry, job: PairJob[ValidateOptions]) -> FittedPlan
 def _shifts(
     reconstructions: Mapping[str, Reconstruction], job: PairJob[ValidateOptions]
 ) -> dict[str, CalibrationShifts | None]:
-    """Return what the calibrations' uncertainty does to each reconstruction, by estimator.
+    """Return the effect of the calibrations' covariances on each reconstruction, by estimator.
 
-    The likelihood sees the corners, not the affinities: estimators that kept the same corners share the answer.
+    It depends on the corners only, so estimators that kept the same corners share it.
     """
     out: dict[str, CalibrationShifts | None] = {}
     for method, r in reconstructions.items():

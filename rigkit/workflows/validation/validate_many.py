@@ -1,4 +1,4 @@
-"""Many data sets, each validated on its own, with one table of what they came to."""
+"""`rigkit validate` of several data sets, each on its own, with one summary table."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from rigkit.workflows.validation.validate import ValidateOptions, validate_datas
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetOutcome:
-    """What one data set of many came to.
+    """The outcome of one data set.
 
     Attributes
     ----------
-    name : of the data set, which is also its folder of results.
-    code : the exit code that it alone would have had.
-    error : why nothing came out, which pairs failed, or the probable cause of checks that did; empty where all is well.
-    pairs, checks_failed : how many.
-    worst_angle_deg, mean_normal_deg, worst_baseline_sigmas : over the pairs' best estimators; None where unknown.
+    name : name of the data set and of its folder of results.
+    code : its exit code if it were validated alone.
+    error : its error, its failed pairs, or the probable cause of failed checks; empty if all passed.
+    pairs, checks_failed : numbers of pairs and of failed checks.
+    worst_angle_deg, mean_normal_deg, worst_baseline_sigmas : over the pairs' best estimators; None if unknown.
     """
 
     name: str
@@ -48,7 +48,7 @@ class SetOutcome:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ManyValidation:
-    """What every data set came to, in the order given, as a table too, and the files of the summary."""
+    """The outcomes of all data sets in the order given, their table, and the files of the summary."""
 
     outcomes: tuple[SetOutcome, ...]
     table: Table
@@ -58,7 +58,7 @@ class ManyValidation:
 
     @property
     def code(self) -> int:
-        """The gravest exit code of them: bad input before failed checks."""
+        """The largest exit code: bad input before failed checks."""
         return max((outcome.code for outcome in self.outcomes), default=ExitCode.WELL)
 
 
@@ -70,15 +70,15 @@ def validate_datasets(
     cluster: str | None = None,
     progress: Progress = silent,
 ) -> ManyValidation:
-    """Validate data sets as `validate_dataset` does each, into folders of their names in `options.output`, and write a
-    summary there; one that fails does not end the rest.
+    """Validate each data set by `validate_dataset` into a folder of its name in `options.output`, and write a summary
+    there.
 
-    Raises InputError: two data sets of one name, no folder for results, or one that cannot be written; a cluster that
-    does not answer.
+    A data set that fails does not stop the others. Raises InputError: two data sets of the same name, no folder for
+    results, or one that cannot be written; a cluster that does not answer.
 
     Parameters
     ----------
-    jobs : data sets at a time, in processes of this machine.
+    jobs : number of processes on this machine, one data set each.
     cluster : address of a Dask scheduler to use instead; it must see the same files.
     """
     if options.output is None:
@@ -103,7 +103,7 @@ def validate_datasets(
 
 
 def _name_of(path: str | Path) -> str:
-    """Return the name in the manifest; of one that cannot be read, that of its folder: it fails in its own turn."""
+    """Return the name in the manifest, or that of its folder if the manifest cannot be read."""
     try:
         return load_dataset(path).name
     except (InputError, DegenerateError):

@@ -27,21 +27,21 @@ from rigkit.workflows.reconstruction.datasets import DatasetOptions, LoadedCamer
 
 PAGE = "report.html"
 RESERVED = (*(f"tables.{ending}" for ending in TABLE_WRITERS), PAGE)
-"""Names of files of results, which no pair can have."""
+"""Names of result files, which no pair can have."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PairValidation:
-    """What one pair came to.
+    """The validation of one pair.
 
     Attributes
     ----------
-    reports : one an estimator, in the order of the registry.
-    best : that of the estimator shown.
-    crosscheck : what independent methods say of that one, if they were asked.
-    causes : what may be wrong with the capture, seen before the reconstruction.
+    reports : one for each estimator, in the order of the registry.
+    best : the report of the best estimator, which is shown.
+    crosscheck : its comparison with independent methods, or None.
+    causes : possible faults of the capture, found before the reconstruction.
     files : relative path -> content of clouds and pictures.
-    section : of the page, where there are pictures.
+    section : section of the page; None without pictures.
     """
 
     reports: tuple[ValidationReport, ...]
@@ -70,8 +70,7 @@ def validation_files(
     options: DatasetOptions,
     seconds: float,
 ) -> tuple[PageFacts, dict[str, str | bytes]]:
-    """Return what the page says, and everything that a validation came to, relative path -> content, the page too where
-    there are pictures."""
+    """Return the facts on the page, and all results (relative path -> content), with the page if there are pictures."""
     reports = [report for pair in pairs for report in pair.reports]
     compared = [pair.crosscheck for pair in pairs if pair.crosscheck is not None]
     summary = replace(summary_table([pair.best for pair in pairs]), note=SUMMARY_WORDS)
@@ -86,7 +85,7 @@ def validation_files(
     lead = f"{len(pairs)} {'pair' if len(pairs) == 1 else 'pairs'}, each by {len(pairs[0].reports)} estimators of "
     lead += f"affine transformations, {seconds:.0f} s"
     lead += "".join(f"; not validated: {failure}" for failure in failures)
-    # What stands with the pairs is not said twice.
+    # The sections of the pairs have these tables.
     separate = ("checks", "estimators") if sections else ()
     shown = [table for table in tables if table.key not in separate]
     known = _calibrations(dataset, cameras)
@@ -99,7 +98,7 @@ def validation_files(
 
 
 def _calibrations(dataset: Dataset, cameras: LoadedCameras) -> dict[str, Calibration]:
-    """Return the calibrations in use by camera; not those whose files say no more than the camera."""
+    """Return the calibrations in use by camera, without cameras that have none."""
     return {
         name: loaded.calibration
         for name, loaded in cameras.known.items()
@@ -108,7 +107,7 @@ def _calibrations(dataset: Dataset, cameras: LoadedCameras) -> dict[str, Calibra
 
 
 def _facts(dataset: Dataset, cameras: LoadedCameras, options: DatasetOptions) -> dict[str, str]:
-    """Return what somebody needs to know to get the same page again."""
+    """Return versions, hashes and sources that the page states for reproducibility."""
     facts = software_facts("open3d", "pycolmap") | {"chain": options.chain}
     facts["directions"] = f"{options.support}; scale of DET3UDIR: {options.det_scale}"
     facts["manifest"] = f"{dataset.manifest.name}, {digest_line(dataset.manifest)}"
