@@ -1,4 +1,4 @@
-"""The public names, for type checkers and, read on first use, for `rigkit/__init__.py`: the only list of them."""
+"""The list of public names, for type checkers and for `rigkit/__init__.py`, which reads this file."""
 
 from rigkit.affine.affinities import DirectionNoise as DirectionNoise
 from rigkit.affine.affinities import EpipolarNormals as EpipolarNormals

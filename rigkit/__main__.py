@@ -1,4 +1,4 @@
-"""`python -m rigkit`: the same as the program `rigkit`."""
+"""Run the program `rigkit` by `python -m rigkit`."""
 
 import sys
 

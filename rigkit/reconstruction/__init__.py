@@ -1,1 +1,1 @@
-"""From two images' corners or correspondences to an oriented cloud in millimetres."""
+"""Reconstruct an oriented point cloud in mm from board corners or correspondences of two images."""

@@ -1,4 +1,4 @@
-"""Planes of boards that were fitted to both images at once: normals, angles, the baseline, and how certain they are."""
+"""Planes of boards fitted to both images: normals, angles and baseline, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 from rigkit.relative_pose.refinement.noise_level import variance_factor
 
 MIN_CORNERS_OF_BOARD = 8
-"""A board with fewer corners in a view has no pose there worth the name."""
+"""Fewer corners in a view do not determine the board's pose well enough."""
 GROSS = 8.0
-"""A corner this many standard deviations off is no corner of the board: something stands in front of it."""
+"""Residual, in standard deviations, from which a corner is an outlier: something hides it."""
 OUTLIER_ROUNDS = 3
 DAMPING_OF_PLANES = Damping(start=1e-6, ceiling=1e8, floor=1e-12)
 STOP_OF_PLANES = Stop(steps=60, predicted_gain=1e-14, gain=1e-14)
@@ -33,18 +33,18 @@ State = TypeVar("State")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BoardPlanes(ABC):
-    """Relative pose and planes of boards, of maximum likelihood.
+    """Maximum-likelihood relative pose and planes of boards.
 
     Attributes
     ----------
     board_ids : in the order of the parameters.
     cam2_from_cam1 : relative pose, mm.
-    covariance : (P, P) of the parameters from the corners' noise: (rotation rad, translation mm) of the relative pose,
-        then of every board, each as a left perturbation; then others of the kind of fit.
-    calibration_moves : (A, P) what one standard deviation along each principal axis of the calibrations' covariance
-        changes in the parameters; A = 0 where that is not known.
+    covariance : (P, P) of the parameters, from the corners' noise: (rotation rad, translation mm) of the relative pose,
+        then of every board, each as a left perturbation; then those that only one kind of fit has.
+    calibration_moves : (A, P) change of the parameters by one standard deviation along each principal axis of the
+        calibrations' covariance; A = 0 if that is not known.
     variance_factor : observed over stated variance of the corners, as used in `covariance`.
-    count, gross : corners that take part, and that were left out as gross outliers.
+    count, gross : number of corners used, and of outliers.
     """
 
     board_ids: tuple[str, ...]
@@ -61,7 +61,7 @@ class BoardPlanes(ABC):
 
     @abstractmethod
     def has_points(self, board: Board, grid: FloatArray) -> BoolArray:
-        """Return which of the corners `grid` (N, 2) of a board `points` knows."""
+        """Return a mask (N,) of the corners `grid` (N, 2) of a board that `points` can be asked for."""
 
     @abstractmethod
     def points(self, board: Board, grid: FloatArray) -> tuple[Points, FloatArray]:
@@ -69,20 +69,20 @@ class BoardPlanes(ABC):
 
     @cached_property
     def full_covariance(self) -> FloatArray:
-        """(P, P), with the calibrations' share."""
+        """Covariance (P, P) of the parameters, from the corners' noise and the calibrations' uncertainty."""
         return np.asarray(self.covariance + self.calibration_moves.T @ self.calibration_moves)
 
     def normal_covariance(self, board_id: str) -> Mat3:
-        """Return the covariance (3, 3) of a board's normal, rad^2, the calibrations' share included."""
+        """Return the covariance (3, 3) of a board's normal, rad^2, including the calibrations' uncertainty."""
         by_turn = np.zeros((3, len(self.covariance)))
         by_turn[:, self.rotation_of(board_id)] = -skew(self.normal(board_id))
         return np.asarray(by_turn @ self.full_covariance @ by_turn.T)
 
     def angle_deg(self, a: str, b: str) -> tuple[float, float]:
-        """Return the angle between two faces as a protractor across them shows it, and its sigma, degrees."""
+        """Return the angle between two boards' faces (180 when coplanar) and its standard deviation, degrees."""
         one, two = self.normal(a), self.normal(b)
         sine = float(np.linalg.norm(np.cross(one, two)))
-        # d angle / d turn of a: along the axis that both normals turn about; parallel faces have no such axis.
+        # d angle / d rotation of a: along the axis perpendicular to both normals; parallel faces have none.
         axis = np.cross(one, two) / sine if sine > 1e-12 else np.zeros(3)
         row = np.zeros(len(self.covariance))
         row[self.rotation_of(a)], row[self.rotation_of(b)] = axis, -axis
@@ -98,7 +98,7 @@ class BoardPlanes(ABC):
         return length, float(np.sqrt(row @ self.full_covariance @ row))
 
     def rotation_of(self, board_id: str) -> slice:
-        """Return where among the parameters a board's turn is."""
+        """Return the slice of a board's rotation among the parameters."""
         start = 6 * (1 + self.board_ids.index(board_id))
         return slice(start, start + 3)
 
@@ -120,7 +120,7 @@ def likeliest(
 
 
 def near_the_rest(lengths: FloatArray) -> BoolArray:
-    """Return which corners (N,), whose residuals have these lengths, are no gross outliers by the median of all."""
+    """Return a mask (N,) of the inliers, from the lengths (N,) of the corners' residuals and their median."""
     return np.asarray(lengths <= GROSS * max(float(np.median(lengths)) / MEDIAN_OF_RAYLEIGH, 1e-9))
 
 
@@ -129,8 +129,8 @@ def variance_and_covariance(
 ) -> tuple[float, FloatArray]:
     """Return observed over stated variance of the corners, and the covariance (F, F) of the parameters at a minimum.
 
-    The first 2 `corners` residuals are the corners', less `unknowns` that are fitted to them; the others are priors,
-    whose variance stays what a person said. Raises DegenerateError where the corners do not determine the parameters.
+    The first 2 `corners` residuals are those of the corners, to which `unknowns` parameters are fitted. The others are
+    priors, whose stated variance is kept. Raises DegenerateError if the corners do not determine the parameters.
     """
     data = problem.residual[: 2 * corners]
     factor = variance_factor(float(data @ data), 2 * corners - unknowns)

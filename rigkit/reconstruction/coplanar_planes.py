@@ -1,8 +1,8 @@
-"""The boards' planes of maximum likelihood where all that is known of a board's points is that they share a plane.
+"""Fit the boards' planes by maximum likelihood, with the points of each board only known to be coplanar.
 
-Between the lattice, of which everything is known, and free points, of which nothing is: a plane takes the first image
-to the second by a homography, so that a corner leaves two residuals where a free point leaves one. Relative pose and
-planes are estimated together. What the squares measure gives the length, as it does for free points.
+This assumes less than a known lattice and more than free points. A plane maps the first image to the second by a
+homography, so a corner has two residuals where a free point has one. Relative pose and planes are estimated jointly.
+The squares give the scale, as for free points.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoplanarPlanes(BoardPlanes):
-    """Relative pose and boards' planes of maximum likelihood, the points of a board in one plane.
+    """Maximum-likelihood relative pose and planes of boards with coplanar points.
 
-    A plane's shift is along its normal; corners seen in both views count once.
+    A plane's translation is along its normal. A corner seen in both views counts once.
 
     Attributes
     ----------
     normals : (K, 3) in the order of `board_ids`.
-    board_index, grid : (N,), (N, 2), which corners `points_mm` are.
-    points_mm, points_covariance : (N, 3), (N, 3, 3) mm, on the planes, the calibrations' share included.
+    board_index, grid : (N,), (N, 2), identify the corners in `points_mm`.
+    points_mm, points_covariance : (N, 3), (N, 3, 3) mm, on the planes, including the calibrations' uncertainty.
     """
 
     normals: FloatArray
@@ -58,13 +58,13 @@ class CoplanarPlanes(BoardPlanes):
         return np.asarray(self.normals[self.board_ids.index(board_id)])
 
     def has_points(self, board: Board, grid: FloatArray) -> BoolArray:
-        """Return which of the corners `grid` (N, 2) of a board take part."""
+        """Return a mask (N,) of the corners `grid` (N, 2) of a board that were used."""
         return np.asarray(self._rows(board, grid) >= 0)
 
     def points(self, board: Board, grid: FloatArray) -> tuple[Points, FloatArray]:
         """Return a board's corners `grid` (N, 2) in camera 1, mm, and their covariances (N, 3, 3).
 
-        Raises DegenerateError for a corner that takes no part.
+        Raises DegenerateError for a corner that was not used.
         """
         rows = self._rows(board, grid)
         if (rows < 0).any():
@@ -72,7 +72,7 @@ class CoplanarPlanes(BoardPlanes):
         return self.points_mm[rows], self.points_covariance[rows]
 
     def _rows(self, board: Board, grid: FloatArray) -> IntArray:
-        """Return which row each corner is, -1 where it is none."""
+        """Return the row of each corner in `points_mm`, -1 if it has none."""
         if board.board_id not in self.board_ids:
             return np.full(len(grid), -1)
         own = np.flatnonzero(self.board_index == self.board_ids.index(board.board_id))
@@ -88,14 +88,10 @@ def coplanar_planes(
     *,
     one_camera: bool = False,
 ) -> CoplanarPlanes:
-    """Return the boards' planes of maximum likelihood, the points of each board in one plane.
+    """Return the maximum-likelihood planes of boards with coplanar points.
 
-    Parameters, errors : as of `lattice_planes`. The pose type holds as it does in the geometry: freely, exactly, or as
-    a level's prior.
-
-    Notes
-    -----
-    The calibrations' share is linear, as that of `lattice_planes`.
+    See `lattice_planes` for parameters, errors, and how the calibrations' uncertainty is propagated. The pose type is
+    treated as in the geometry: general, exact, or a prior.
     """
     pair = geometry.pair
     moved = moved_cameras(pair.camera1, pair.camera2, known1, known2, one=one_camera)
@@ -115,7 +111,7 @@ def coplanar_planes(
 
 
 def _on_boards(matches: Matches, boards: tuple[Board, ...]) -> tuple[Matches, list[Board], int]:
-    """Return the matches on boards with enough of them, numbered anew, these boards, and how many matches they have."""
+    """Return the matches on boards with enough of them (renumbered), these boards, and the number of matches."""
     counts = np.bincount(matches.board_index[matches.board_index >= 0], minlength=len(boards))
     chosen = np.flatnonzero(counts >= MIN_CORNERS_OF_BOARD)
     kept = matches.select(np.isin(matches.board_index, chosen))
@@ -124,7 +120,7 @@ def _on_boards(matches: Matches, boards: tuple[Board, ...]) -> tuple[Matches, li
 
 
 def _without_outliers(problem: CoplanarProblem, state: CoplanarState) -> tuple[CoplanarProblem, CoplanarState]:
-    """Return the problem without gross outliers, and its minimum."""
+    """Return the problem without outliers, and its minimum."""
     for _ in range(OUTLIER_ROUNDS):
         state = problem.minimum(state)
         near = near_the_rest(np.linalg.norm(problem.corners(state)[0], axis=1))
@@ -136,12 +132,11 @@ def _without_outliers(problem: CoplanarProblem, state: CoplanarState) -> tuple[C
 
 
 class _Scale(NamedTuple):
-    """Mm to the unit of a state, its derivatives by the points (N, 3) and by the free parameters (F,), and its standard
+    """Mm per unit of a state, its derivatives by the points (N, 3) and by the free parameters (F,), and its standard
     deviation for this state.
 
-    Every board's squares give a scale, from points that weigh as well as they are known. How certain it is depends on
-    how well the board's plane is known, and the planes are known together: the scale is that of generalised least
-    squares.
+    Every board's squares give a scale. Errors of these scales are correlated through the planes, so that they are
+    averaged by generalised least squares.
     """
 
     value: float
@@ -182,7 +177,7 @@ def _result(
     known: Known,
     pair_id: str,
 ) -> CoplanarPlanes:
-    """Return the planes at a minimum in mm, with the covariance that the residuals and the moved cameras show."""
+    """Return the planes at a minimum in mm, with the covariance from the residuals and the moved cameras."""
     here, count = problem.linearise(state), len(problem.matches)
     factor, of_free = variance_and_covariance(here, count, here.jacobian.shape[1], pair_id)
     points, noise = problem.points(state)
@@ -204,7 +199,7 @@ def _result(
         there = problem.through(cameras, moved_pixels(pixels, in_cameras, known, cameras))
         change = there.corners(state)[0].ravel() - residuals
         step = -of_free @ here.jacobian[: 2 * count].T @ change / factor
-        # What moves at a fixed state: the points, and with them the scale.
+        # At a fixed state only the points move, and with them the scale.
         shift = there.points(state)[0] - points
         lengthening = float(np.sum(scale.by_points * shift))
         moves.append((by_state @ step + lengthening * by_scale)[None])

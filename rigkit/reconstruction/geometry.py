@@ -1,7 +1,7 @@
-"""What the corners of a pair say before any affinity: pose type, pose, scale and points, computed once a pair.
+"""Estimate pose type, pose, scale and points of a pair from its corners, once for all affine estimators.
 
-Points give the epipolar geometry; maximum likelihood refines the pose under the pair's pose type from every start there
-is; the squares give the scale; rays are intersected optimally. Affine estimators differ in their normals only.
+Points give the epipolar geometry. The pose is refined by maximum likelihood under the pose type, from several initial
+poses. The squares give the scale, and the points are triangulated. Affine estimators differ only in their normals.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ if TYPE_CHECKING:
     from rigkit.reconstruction.pairing import MatchedPair
 
 MAX_BASELINE_SIGMA = 0.2
-"""A baseline known to no better than a fifth of itself is no baseline: whatever is built on it is noise."""
+"""Largest relative standard deviation of the baseline: above, the reconstruction would be noise."""
 
 NOTABLE_SCATTER = 2.0
-"""Corners that scatter this many times more than predicted are worth a word: blur, JPEG, a bad calibration."""
+"""Ratio of observed to predicted corner noise that gets a note: blur, JPEG, or a bad calibration."""
 
 SAME_COST = 1e-9
-"""Costs that differ by less than this part are one minimum, reached from two sides."""
+"""Costs that differ relatively by less are of the same minimum."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseTypeDecision:
-    """The pose type to use, and what the matches say of it.
+    """The pose type to use, and the evidence for it.
 
     Attributes
     ----------
-    declared : as a person declared it.
+    declared : as the user declared it.
     pose_type : the type to use (never AUTO).
-    level_sigma_rad : how well the type is taken to hold; None: exactly, or it is general.
-    evidence : for every type; None where the general type was declared, which nothing contradicts.
-    notes : the choice under AUTO, or what contradicts the declaration, in words.
-    level_frames : in which the type is meant to hold; None: those of the cameras.
+    level_sigma_rad : standard deviation of the pose-type prior; None: the type holds exactly, or is general.
+    evidence : for every type; None if the general type was declared, which nothing contradicts.
+    notes : the choice under AUTO, or what contradicts the declaration.
+    level_frames : in which the type holds; None: those of the cameras.
     """
 
     declared: PoseType
@@ -61,18 +61,18 @@ class PoseTypeDecision:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PairGeometry:
-    """What does not depend on the affine estimator.
+    """The geometry of a pair, which does not depend on the affine estimator.
 
     Attributes
     ----------
-    pair : the matched corners, with sigmas that fit what is seen.
+    pair : the matched corners, with sigmas scaled to the residuals.
     decision : the pose type, and the evidence for it.
     refined : pose of maximum likelihood, unit baseline.
     metric : the pose in mm, with its covariance.
     E21 : (3, 3) essential matrix of that pose, unit Frobenius norm.
-    points : every corner, triangulated, mm in the frame of camera 1.
-    scatter : factor of the corners' stated sigmas that their residuals show; `pair` has it in its sigmas.
-    notes : what was dropped, assumed or contradicted, in words.
+    points : the triangulated corners, mm, in the frame of camera 1.
+    scatter : ratio of observed to stated corner noise; the sigmas of `pair` were multiplied by it.
+    notes : warnings: what was left out, assumed or contradicted.
     """
 
     pair: MatchedPair
@@ -101,17 +101,17 @@ def pair_geometry(
 ) -> PairGeometry:
     """Return pose, scale and points of one pair.
 
-    Raises InputError: level frames of another motion than planar; DegenerateError: no baseline, or geometry that does
-    not determine the pose.
+    Raises InputError for level frames with another motion than planar; DegenerateError if there is no baseline, or the
+    corners do not determine the pose.
 
     Parameters
     ----------
     pair : matched corners, from `match_pair`.
-    pose_type : as a person declared it; AUTO takes the type that the data support best. A declared type that the data
-        contradict is used as told, and `notes` gives the figure.
-    level_sigma_rad : how well the spirit level held: the pose type is a soft prior in the refinement. None: as well as
-        a carefully set level does (DEFAULT_LEVEL_RAD); 0: the pose type is exact.
-    level_frames : of cameras that are not level themselves but whose mounting is known; planar motion only.
+    pose_type : as declared; AUTO chooses the type that the data support best. A declared type is used even if the data
+        contradict it; then `notes` says so.
+    level_sigma_rad : standard deviation of the pose-type prior in the refinement. None: that of a carefully set spirit
+        level (DEFAULT_LEVEL_RAD); 0: the pose type is exact.
+    level_frames : for cameras that are not level themselves but whose mounting is known; planar motion only.
     """
     declared = PoseType(pose_type)
     if level_frames is not None and declared is not PoseType.PLANAR:
@@ -123,7 +123,7 @@ def pair_geometry(
         contradiction = () if declared is PoseType.AUTO else decision.notes
         return _in_mm(pair, decision, _likeliest_pose(pair, decision))
     except DegenerateError as error:
-        # A declaration that does not hold is the likeliest reason of a pose that makes no sense.
+        # A wrong declaration is the likeliest reason of a degenerate pose.
         raise DegenerateError("; ".join((f"pair '{pair.pair_id}': {error}", *contradiction))) from error
 
 
@@ -136,7 +136,7 @@ def decide_pose_type(captured: Matches, declared: PoseType, level_sigma_rad: flo
     if declared is PoseType.AUTO:
         chosen = evidence.types[0]
         words = f"pose type '{chosen.pose_type}' chosen (probability {chosen.probability:.3f})"
-        # The evidence is for the type up to a level's accuracy, not for an exact one that nobody declared.
+        # The evidence is for the type with a level's accuracy, not for an exact type.
         soft = None if chosen.pose_type is PoseType.GENERAL else evidence.level_sigma_rad
         return PoseTypeDecision(declared, chosen.pose_type, soft, evidence, (words,))
     contradiction = evidence.contradiction(declared)
@@ -145,11 +145,11 @@ def decide_pose_type(captured: Matches, declared: PoseType, level_sigma_rad: flo
 
 
 def _likeliest_pose(pair: MatchedPair, decision: PoseTypeDecision) -> RefinedPose:
-    """Return the pose of maximum likelihood among the ends of the refinement from every start there is.
+    """Return the pose of maximum likelihood among the minima that the refinement reaches from several initial poses.
 
-    The linear solution of a pose type holds it exactly: where a level is off by half a degree and the corners are good,
-    it can land in another valley. The general solution and the pose by which the boards were identified cannot. Points
-    of one plane are explained by two poses: that of the board, whose shape is known, stands unless they rule it out.
+    The linear solution holds the pose type exactly. If a level is off by half a degree and the corners are good, it
+    can lead to a wrong local minimum. The general solution and the pose that identified the boards do not. Coplanar
+    points have two poses: the one from the known board shape is kept unless the points rule it out.
     """
     kind, level, frames = decision.pose_type, decision.level_sigma_rad, decision.level_frames
     m = pair.matches if frames is None else frames.matches(pair.matches)
@@ -176,11 +176,10 @@ def _likeliest_pose(pair: MatchedPair, decision: PoseTypeDecision) -> RefinedPos
 
 
 def _in_mm(pair: MatchedPair, decision: PoseTypeDecision, refined: RefinedPose) -> PairGeometry:
-    """Return the geometry of a pair with the scale of its squares, and sigmas that fit what is seen."""
+    """Return the geometry of a pair in mm, with sigmas scaled to the residuals."""
     notes = [*pair.notes, *decision.notes]
     freedom = len(pair.captured) - POSE_FREEDOM
     scatter = float(np.sqrt(variance_factor(refined.variance_factor * freedom, freedom)))
-    # The corners miss the epipolar geometry by more than their sigmas promise, or by less: believe what is seen.
     pair = pair.noisier(scatter)
     level, frames = decision.level_sigma_rad, decision.level_frames
     refined = refine_pose(pair.captured, refined.cam2_from_cam1, decision.pose_type, level, level_frames=frames)

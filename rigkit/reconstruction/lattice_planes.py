@@ -1,9 +1,8 @@
-"""The boards' planes from their known lattice: joint maximum likelihood over relative pose and boards' poses.
+"""Fit the boards' planes with known lattices: joint maximum likelihood over relative pose and board poses.
 
-All corners of both views take part, also those that only one view shows. A free plane is known along the lines of sight
-no better than its triangulated points. The lattice fixes its tilt by perspective in each view as well, and the relative
-pose ties both views together. So the planes are several times more certain, most of all where the baseline is short or
-points at the boards.
+All corners of both views are used, also those that only one view shows. A plane through triangulated points is no more
+certain along the line of sight than these. A known lattice also fixes the tilt by perspective in each view. The planes
+are several times more certain, above all if the baseline is short or points towards the boards.
 """
 
 from __future__ import annotations
@@ -39,19 +38,18 @@ if TYPE_CHECKING:
 
 
 PlacedLattices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-"""cam2_from_cam1 (4, 4), the boards' poses in camera 1 (K, 4, 4), and the logarithms (K,) of their sizes over the
-declared ones."""
+"""cam2_from_cam1 (4, 4), cam1_from_board (K, 4, 4), and log (K,) of the boards' true over declared sizes."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LatticePlanes(BoardPlanes):
-    """Relative pose and boards' poses of maximum likelihood, with the boards' lattices known.
+    """Maximum-likelihood relative pose and board poses with known lattices.
 
-    The last parameters are the logarithms of the boards' sizes; corners of both views count each.
+    The last parameters are the logarithms of the boards' relative sizes. A corner seen in both views counts twice.
 
     Attributes
     ----------
-    cam1_from_board : by id, mm.
+    cam1_from_board : by board id, mm.
     """
 
     cam1_from_board: Mapping[str, Rigid3]
@@ -61,7 +59,7 @@ class LatticePlanes(BoardPlanes):
         return facing_normal(self.cam1_from_board[board_id])
 
     def has_points(self, board: Board, grid: FloatArray) -> BoolArray:
-        """Return which of the corners `grid` (N, 2) of a board are known: all, or none of a board that is not."""
+        """Return a mask (N,) of the corners `grid` (N, 2): all of a fitted board, none of another."""
         return np.full(len(grid), board.board_id in self.board_ids)
 
     def points(self, board: Board, grid: FloatArray) -> tuple[Points, FloatArray]:
@@ -82,21 +80,21 @@ def lattice_planes(
     *,
     one_camera: bool = False,
 ) -> LatticePlanes:
-    """Return the boards' planes of maximum likelihood with their lattices known.
+    """Return the maximum-likelihood planes of the boards with known lattices.
 
-    Raises DegenerateError: no board has enough corners in both views, or they leave the poses open.
+    Raises DegenerateError if no board has enough corners in both views, or they do not determine the poses.
 
     Parameters
     ----------
-    geometry : of the pair; boards need eight corners in each view.
-    known1, known2 : the cameras as they are known, or None: the intrinsics are exact.
-    one_camera : both images are of one camera, whose errors they share; `known2` is not used then.
+    geometry : of the pair; a board needs eight corners in each view.
+    known1, known2 : the cameras with their covariance, or None for exact intrinsics.
+    one_camera : both images are of one camera and share its errors; `known2` is not used.
 
     Notes
     -----
-    Residuals are pixels over the corners' sigmas; a board whose `square_sigma_mm` is stated has its size as a further
-    unknown with that prior, else it is exact. The calibrations' share is linear: moving the cameras along a principal
-    axis changes the residuals by dr and the parameters by -(J^T J)^-1 J^T dr.
+    Residuals are whitened pixels. If a board's `square_sigma_mm` is stated, its size is a parameter with that prior,
+    else it is exact. The calibrations' uncertainty is propagated linearly: moving the cameras along a principal axis
+    changes the residuals by dr and the parameters by -(J^T J)^-1 J^T dr.
     """
     pair = geometry.pair
     moved = moved_cameras(pair.camera1, pair.camera2, known1, known2, one=one_camera)
@@ -128,10 +126,9 @@ def lattice_planes(
 
 
 def _problem(geometry: PairGeometry, moved: list[tuple[Camera, Camera]]) -> tuple[LatticeProblem, list[Board]]:
-    """Return the corners of every board that has enough of them in both views, and these boards; raises DegenerateError
-    without any.
+    """Return the corners of every board with enough of them in both views, and these boards.
 
-    Corners at the rim of the field that one of the moved cameras does not see take no part.
+    Corners outside the field of view of any moved camera are left out. Raises DegenerateError if no board is left.
     """
     pair = geometry.pair
     found = [{d.board_id: d for d in one} for one in (pair.identity.detections1, pair.identity.detections2)]
@@ -143,7 +140,7 @@ def _problem(geometry: PairGeometry, moved: list[tuple[Camera, Camera]]) -> tupl
         for second in (0, 1):
             corners = found[second][board.board_id]
             seen = np.logical_and.reduce([two[second].unproject(corners.pixels)[1] for two in cameras])
-            # What the matched corners show of their noise holds as well for those that one view alone has.
+            # The noise factor of the matched corners also applies to those seen in one view only.
             sigma_px, number = geometry.scatter * corners.sigma_px[seen], np.full(int(seen.sum()), len(boards))
             both.append((corners.pixels[seen], sigma_px, board.points(corners.grid[seen]), number))
         if min(len(number) for *_, number in both) >= MIN_CORNERS_OF_BOARD:
@@ -167,7 +164,7 @@ class LatticeProblem:
 
     Attributes
     ----------
-    pixels, images : of either image, the corners.
+    pixels, images : the corners in each image.
     size_sigma : (K,) standard deviation of the logarithm of a board's size; 0: the size is exact.
     """
 
@@ -182,11 +179,11 @@ class LatticeProblem:
 
     @property
     def free(self) -> BoolArray:
-        """Which parameters are unknown: a board's size only where a sigma of it is stated."""
+        """Mask of the free parameters; a board's size is free only if its sigma is stated."""
         return np.concatenate([np.ones(6 * (len(self.size_sigma) + 1), dtype=bool), self.size_sigma > 0.0])
 
     def moved_pixels(self, state: PlacedLattices, known: Known, moved: tuple[Camera, Camera]) -> tuple[Pixels, Pixels]:
-        """Return the corners as of `moved_pixels` where the boards are placed so."""
+        """Return the corners as `moved_pixels` corrects them for moved cameras, with the boards at `state`."""
         motion, boards, log_sizes = state
         points = []
         for c, second in zip(self.images, (False, True), strict=True):
@@ -196,7 +193,7 @@ class LatticeProblem:
         return moved_pixels(self.pixels, (points[0], points[1]), known, moved)
 
     def through(self, cameras: tuple[Camera, Camera], pixels: tuple[Pixels, Pixels]) -> LatticeProblem:
-        """Return the same corners as other cameras see them, at these pixels."""
+        """Return the same corners, at new pixels, for other cameras."""
         first, second = (
             seen_corners(camera, at, c.sigma_px, c.points, c.board)
             for camera, at, c in zip(cameras, pixels, self.images, strict=True)
@@ -204,11 +201,11 @@ class LatticeProblem:
         return replace(self, images=(first, second))
 
     def residuals(self, state: PlacedLattices) -> FloatArray:
-        """Return the residuals (2 N,) of the corners in sigmas."""
+        """Return the whitened residuals (2 N,) of the corners."""
         return joint_residuals(self.images, *state)[0]
 
     def linearise(self, state: PlacedLattices) -> DenseProblem:
-        """Return all residuals in sigmas, those of the sizes' prior last, and their derivatives by what is unknown."""
+        """Return all whitened residuals, those of the size priors last, and their Jacobian by the free parameters."""
         residual, jacobian = joint_residuals(self.images, *state)
         stated = self.size_sigma > 0.0
         sigma = self.size_sigma[stated]
@@ -222,7 +219,7 @@ class LatticeProblem:
         return likeliest(state, self.linearise, _moved, self.free)
 
     def without_outliers(self, state: PlacedLattices) -> tuple[LatticeProblem, PlacedLattices]:
-        """Return the problem without gross outliers, and its minimum."""
+        """Return the problem without outliers, and its minimum."""
         problem = self
         for _ in range(OUTLIER_ROUNDS):
             state = problem.minimum(state)
@@ -244,7 +241,7 @@ class LatticeProblem:
 
 
 def seen_corners(camera: Camera, pixels: Pixels, sigma_px: FloatArray, points: Points, board: IntArray) -> BoardCorners:
-    """Return corners as a camera sees them."""
+    """Return the corners with their rays in a camera, and the bases that whiten their residuals."""
     bases = np.linalg.pinv(camera.ray_jacobian(pixels)) / sigma_px[:, None, None]
     return BoardCorners(camera.unproject(pixels)[0], np.asarray(bases), points, board, sigma_px)
 

@@ -1,7 +1,7 @@
-"""Where near and far points meet in a picture, the surface between them is a line of sight: the camera saw along it.
+"""Add points along the lines of sight at depth edges, so that a mesh does not bridge them.
 
-A surface through points alone bridges such an edge of depth by a slope, and hides what is behind. Points along the
-line of sight, whose normals are across it, towards the far side, tell Poisson's method that it is empty there.
+A surface through measured points only would join a near and a far surface by a slope. Points along the line of sight,
+with normals perpendicular to it and towards the far side, tell Poisson reconstruction that this space is empty.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from rigkit.core.cloud import OrientedCloud
 from rigkit.geometry.rotation import angle_between, unit
 
 STEEP = 3.0
-"""Rise of the logarithm of the distance over the angle: seen at 18 degrees or less."""
+"""Least d log(distance) / d angle of a depth edge: a surface there would be seen at 18 degrees or less."""
 OPEN_RISE = 0.5
-"""Share of the rise that either point's plane leaves open: else it is one slanted surface."""
+"""Least share of the rise that neither point's plane explains: else both are on one slanted surface."""
 MAX_STEPS = 5.0
-"""Between neighbours, in the usual angle between neighbours: beyond, nobody knows where between them the edge is."""
+"""Largest angle between neighbours, over their median angle: beyond, the place of the edge is unknown."""
 SPACING = 2.0
-"""Of the points along a line of sight, in the distance between neighbours on the near surface."""
+"""Spacing of added points, over the distance between neighbours on the near surface."""
 MIN_FORWARD = -0.99
-"""Cosine from the axis: the stereographic plane ends opposite to it."""
+"""Least cosine from the axis: the stereographic projection ends opposite to it."""
 
 
 def with_lines_of_sight(cloud: OrientedCloud) -> OrientedCloud:
-    """Return a cloud that was seen from its origin with further points along the lines of sight at edges of depth.
+    """Return a cloud that was seen from its origin, with points added along the lines of sight at depth edges.
 
-    Their sigmas are NaN: nothing was measured there. Neighbours are those of the Delaunay triangulation of the
-    directions (stereographic, so for fisheye lenses as well).
+    The added points were not measured: their sigmas are NaN. Neighbours are those of the Delaunay triangulation of the
+    directions, in stereographic projection so that fisheye lenses work as well.
     """
     rays = unit(cloud.points_mm)
     usable = np.flatnonzero((rays[:, 2] > MIN_FORWARD) & cloud.normals.any(axis=1))
@@ -62,7 +62,7 @@ def with_lines_of_sight(cloud: OrientedCloud) -> OrientedCloud:
 
 
 def _edges_of_depth(points: Points, normals: Normals) -> tuple[IntArray, IntArray]:
-    """Return the near and the far point (K,) of every pair of neighbours between which no surface was seen."""
+    """Return the indices (K,) of the near and the far point of every depth edge between neighbours."""
     from scipy.spatial import Delaunay, QhullError
 
     none = np.zeros(0, dtype=np.int64)
@@ -86,7 +86,7 @@ def _edges_of_depth(points: Points, normals: Normals) -> tuple[IntArray, IntArra
 
 
 def _missed(points: Points, normals: Normals, rays: FloatArray, distance: FloatArray) -> FloatArray:
-    """Return by how much (N,) planes miss points on other rays, in the logarithm of the distance; inf: never met."""
+    """Return the distance (N,) along `rays` between planes and points, in log(distance); inf if they do not meet."""
     with np.errstate(divide="ignore", invalid="ignore"):
         there = np.sum(normals * points, axis=1) / np.sum(normals * rays, axis=1)
         met: BoolArray = np.isfinite(there) & (there > 0.0)

@@ -1,4 +1,4 @@
-"""From a pose of unit baseline to millimetres: the scale from the boards, and the uncertainty of everything metric."""
+"""Scale a pose of unit baseline to mm by the boards' squares, and propagate the uncertainty."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ class MetricPose:
     Attributes
     ----------
     cam2_from_cam1 : metric pose.
-    covariance : (6, 6) of (left rotation perturbation rad, translation mm), the scale's uncertainty included.
-    baseline_mm, baseline_sigma_mm : length of the translation; sigma from corners, pose, and the squares' own sigma.
+    covariance : (6, 6) of (left rotation perturbation rad, translation mm), with the scale's uncertainty.
+    baseline_mm, baseline_sigma_mm : length of the translation and its standard deviation, from corners, pose and
+        squares.
     """
 
     cam2_from_cam1: Rigid3
@@ -38,7 +39,7 @@ class MetricPose:
 
 
 class TriangulatedPoints(NamedTuple):
-    """Points (N, 3) in the frame of camera 1, their covariances (N, 3, 3), and which of them (N,) are valid."""
+    """Points (N, 3) in the frame of camera 1, their covariances (N, 3, 3), and a mask (N,) of the valid ones."""
 
     points: Points
     covariance: FloatArray
@@ -48,9 +49,9 @@ class TriangulatedPoints(NamedTuple):
 def triangulate_matches(
     matches: Matches, cam2_from_cam1: Rigid3, pose_covariance: FloatArray | None = None
 ) -> TriangulatedPoints:
-    """Intersect the rays of all matches.
+    """Triangulate all matches, in the unit of the pose's translation.
 
-    The unit is that of the pose's translation. `pose_covariance` (6, 6) adds the pose's share: see `point_uncertainty`.
+    With `pose_covariance` (6, 6) the covariances include the pose's uncertainty, see `point_uncertainty`.
     """
     points, valid, covariance, by_pose = _uncertain_points(matches, cam2_from_cam1)
     if pose_covariance is not None:
@@ -59,7 +60,7 @@ def triangulate_matches(
 
 
 def _uncertain_points(m: Matches, cam2_from_cam1: Rigid3) -> tuple[Points, BoolArray, FloatArray, FloatArray]:
-    """Return points (N, 3), NaN where they are not valid (N,), and their `point_uncertainty`."""
+    """Return points (N, 3), NaN if not valid, the mask (N,) of valid ones, and their `point_uncertainty`."""
     seen, sigmas = (m.rays1, m.rays2), {"sigma1_px": m.sigma1_px, "sigma2_px": m.sigma2_px}
     points, valid = triangulate_rays(*seen, cam2_from_cam1, jacobians1=m.jacobians1, jacobians2=m.jacobians2, **sigmas)
     points = np.where(valid[:, None], points, np.nan)
@@ -69,25 +70,25 @@ def _uncertain_points(m: Matches, cam2_from_cam1: Rigid3) -> tuple[Points, BoolA
 def metric_pose(
     matches: Matches, cam2_from_cam1: Rigid3, pose_covariance: FloatArray, boards: Sequence[Board]
 ) -> MetricPose:
-    """Return the pose in mm: rotation and direction stay, the length comes from the boards' squares.
+    """Return the pose with its translation scaled to mm by the boards' squares.
 
-    Raises DegenerateError: no board has enough triangulated corners.
+    Raises DegenerateError if no board has enough triangulated corners.
 
     Parameters
     ----------
-    matches : `board_index` and `grid` say which corner each is.
-    cam2_from_cam1, pose_covariance : of unit baseline, as from the refinement.
+    matches : `board_index` and `grid` identify the corners.
+    cam2_from_cam1, pose_covariance : refined pose of unit baseline.
     boards : in the order of `board_index`.
 
     Notes
     -----
-    Var(s) = Var(s | pose) + g C g^T with g the derivative of the scale by the pose: the corners' noise splits into a
-    part that moves the pose and, independent of it, a part that moves the points at fixed pose.
+    Var(s) = Var(s | pose) + g C g^T, with g the derivative of the scale by the pose. The corners' noise has two
+    independent parts: one changes the pose, the other the points at a fixed pose.
     """
     R, t = cam2_from_cam1.rotation, unit(cam2_from_cam1.translation_mm)
     points, _, covariance, by_pose = _uncertain_points(matches, Rigid3(R, t))
     scale, sigma, d_scale_d_points = scale_and_gradient(points, matches.board_index, matches.grid, boards, covariance)
-    # A point without a triangulation takes no part.
+    # Points that could not be triangulated have a zero gradient.
     gradient = np.einsum("ni,nip->p", d_scale_d_points, np.nan_to_num(by_pose))
     full = covariance_in_mm(t, pose_covariance, scale, sigma, gradient)
     baseline_sigma = float(np.sqrt(sigma**2 + gradient @ pose_covariance @ gradient))
@@ -97,9 +98,9 @@ def metric_pose(
 def covariance_in_mm(
     t: FloatArray, pose_covariance: FloatArray, scale: float, scale_sigma: float, d_scale_d_pose: FloatArray
 ) -> FloatArray:
-    """Return the covariance (6, 6) of a pose in mm from that of the pose of unit baseline `t` (3,), and of its scale.
+    """Return the covariance (6, 6) of a pose in mm from that of the pose with unit translation `t` (3,), and its scale.
 
-    `scale_sigma` is that of the scale at a fixed pose, `d_scale_d_pose` (6,) how the scale moves with the pose.
+    `scale_sigma` is the scale's standard deviation at a fixed pose, `d_scale_d_pose` (6,) its derivative by the pose.
     """
     to_metric = np.diag([1.0] * 3 + [scale] * 3)
     to_metric[3:] += np.outer(t, d_scale_d_pose)

@@ -1,8 +1,8 @@
-"""The metric scale of a reconstruction from chessboards whose squares were measured.
+"""Estimate the metric scale of a reconstruction from boards whose squares were measured.
 
 Each board is a rigid, scaled copy of its grid: p_i = k (R g_i + c) with p in the unit of the reconstruction and g in
-mm. The scale is that of maximum likelihood under the points' covariances, robust to single bad corners. It uses all
-distances on the board at once, and is several times more precise than the median of neighbouring corners' distances.
+mm. The scale is the robust maximum-likelihood estimate under the points' covariances. It uses all distances on the
+board, and is several times more precise than the median distance of neighbouring corners.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rigkit.optim.robust_scale import MEDIAN_OF_CHI_SQUARE_3
 
 MIN_CORNERS_FOR_SCALE = 4
 OUTLIER_SQUARE = 14.2
-"""Squared distance in sigmas (three components) from which a corner loses weight: one in 400 Gaussian ones does."""
+"""Squared Mahalanobis distance (three components) from which a corner is downweighted: one in 400 Gaussian ones."""
 ITERATIONS = 15
 
 
@@ -32,20 +32,19 @@ def metric_scale(
 ) -> tuple[float, float]:
     """Return the factor from the reconstruction's unit to mm and its standard deviation.
 
-    Raises DegenerateError: no board has enough corners.
+    Raises DegenerateError if no board has enough corners.
 
     Parameters
     ----------
     points_unit : (N, 3) triangulated corners; NaN rows are ignored.
-    board_index : (N,) index into `boards`; -1 where the point is on none.
+    board_index : (N,) index into `boards`; -1 if the point is on none.
     grid : (N, 2) int, (column, row).
-    boards : with their measured squares; a stated `square_sigma_mm` enters the standard deviation, and the weight.
+    boards : with their measured squares; `square_sigma_mm` enters the standard deviation and the weight.
     covariances : (N, 3, 3) of the points in the unit of the reconstruction; None: equal and estimated from the fit.
 
     Notes
     -----
-    The standard deviation holds for the given pose of the cameras; what the uncertainty of the pose adds is the
-    business of whoever knows it.
+    The standard deviation is for a fixed pose of the cameras. The caller adds the pose's uncertainty.
     """
     scale, sigma, _ = scale_and_gradient(points_unit, board_index, grid, boards, covariances)
     return scale, sigma
@@ -58,10 +57,9 @@ def scale_and_gradient(
     boards: Sequence[Board],
     covariances: FloatArray | None = None,
 ) -> tuple[float, float, FloatArray]:
-    """Return what `metric_scale` returns, and how the scale moves with every point, (N, 3).
+    """Return what `metric_scale` returns, and the derivative (N, 3) of the scale by every point.
 
-    The derivative is that of the least-squares problem with the weights as they ended: zero for points that took no
-    part, and for those that lost all their weight.
+    It is that of the least-squares problem with its final weights held: zero for points that were left out.
     """
     scales, variance, slopes = board_scales_and_gradients(points_unit, board_index, grid, boards, covariances)
     known = np.isfinite(scales)
@@ -78,10 +76,10 @@ def board_scales_and_gradients(
     boards: Sequence[Board],
     covariances: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return every board's scale, its variance (B,) with the squares' own, and how it moves with the points.
+    """Return every board's scale (B,), its variance (B,) with that of the squares, and its derivative by the points.
 
-    Boards that disagree by many standard deviations have a wrong square size or a wrong pose under them.
-    The gradients are (B, N, 3); scales that nothing tells are NaN. Parameters, errors as of `metric_scale`.
+    If boards disagree by many standard deviations, a square size or the pose is wrong. The derivatives are (B, N, 3);
+    scales that are not determined are NaN. See `metric_scale` for parameters and errors.
     """
     points = np.asarray(points_unit, dtype=np.float64)
     index, cells = np.asarray(board_index), np.asarray(grid)
@@ -97,8 +95,7 @@ def board_scales_and_gradients(
         if on.sum() < MIN_CORNERS_FOR_SCALE:
             continue
         model = board.points(cells[on])
-        # Corners in a row leave the rotation about it open, but the scale is determined: two spreads are asked all the
-        # same, because a single row is what a wrong detection looks like.
+        # A single row of corners would determine the scale, but is typical of a wrong detection.
         if np.linalg.matrix_rank(model - model.mean(axis=0)) < 2:
             continue
         found = _similarity_scale(points[on], model, None if covariances is None else covariances[on])
@@ -113,14 +110,14 @@ def board_scales_and_gradients(
 
 
 def square_sigmas(boards: Sequence[Board]) -> FloatArray:
-    """Return the standard deviations (B,) of the squares as parts of them; 0 where none is stated."""
+    """Return the relative standard deviations (B,) of the squares; 0 if none is stated."""
     return np.array([(b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards])
 
 
 def _similarity_scale(
     points: Points, model: Points, covariances: FloatArray | None
 ) -> tuple[float, float, FloatArray] | None:
-    """Return mm per unit, its standard deviation and its gradient (N, 3) for one board; None without a scale."""
+    """Return mm per unit, its standard deviation and its gradient (N, 3) for one board; None if not determined."""
     centred = model - model.mean(axis=0)
     k, R, c = _robust_start(points, centred)
     if not k > 0.0:
@@ -131,7 +128,7 @@ def _similarity_scale(
         floor = 1e-12 * np.trace(covariances, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         whiten = np.linalg.inv(np.linalg.cholesky(covariances + floor))
     noise, gram = 1.0, np.eye(7)
-    # Reweighted at every step, which changes the cost that `rigkit.optim` would hold fixed; the robust start is near.
+    # The weights, and so the cost, change at every step; `rigkit.optim` needs a fixed cost.
     for iteration in range(ITERATIONS):
         turned = centred @ R.T
         residual = np.einsum("nij,nj->ni", whiten, points - k * turned - c)
@@ -156,7 +153,7 @@ def _similarity_scale(
 
 
 def _robust_start(points: Points, centred: Points) -> tuple[float, FloatArray, FloatArray]:
-    """Return unit per mm (median of all distance ratios), rotation and centre to begin with."""
+    """Return initial values: unit per mm (median of all distance ratios), rotation and centre."""
     first, second = np.triu_indices(len(points), 1)
     between = np.linalg.norm(points[first] - points[second], axis=1)
     grid = np.linalg.norm(centred[first] - centred[second], axis=1)

@@ -1,9 +1,8 @@
-"""From correspondences of any scene to an oriented cloud: the pipeline for pairs without chessboards.
+"""Reconstruct an oriented cloud from correspondences of any scene, without boards.
 
-Correspondences of natural images are contaminated and their stated sigmas optimistic. A robust search finds the pose
-that most points agree with; what the agreeing ones then show is the noise of points and affinities, with which the
-likelihood of points and affinities together refines the pose. No square gives the scale: lengths are in baselines
-unless the baseline is known.
+Correspondences of natural images contain outliers, and their stated sigmas are too small. A robust search finds the
+pose with most inliers. The inliers' residuals give the noise of points and affinities, and the pose is refined by the
+joint likelihood of both. Without boards, lengths are in baselines unless the baseline is known.
 """
 
 from __future__ import annotations
@@ -34,16 +33,16 @@ from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.weights import usable_affinities
 
 MAX_RANGE_SIGMA = 0.3
-"""A point whose distance is known no better than this share of it is left out: it could be anywhere along its ray."""
+"""Largest relative standard deviation of a point's distance; points beyond are left out."""
 MIN_SHARE_AGREEING = 0.3
-"""Fewer of the correspondences on one pose are a warning. Ten REAL pairs of five scenes have 0.64 to 0.92; a RENDERED
-wall of one picture repeated had 0.10, and another pose than the cameras'."""
+"""Inlier ratio below which a note warns. Ten REAL pairs of five scenes have 0.64 to 0.92; a RENDERED wall of one
+repeated picture had 0.10, and a wrong pose."""
 NO_DISTANCE = "no point's distance is known; the baseline is too short for this scene"
 SAME_ROW = 1e-9
 """Tangents of rows of two rectified images agree to rounding: they are computed, not measured."""
 PIXELS_A_SIDE = 9
 PUPIL_ROUNDS = 3
-"""Pupils move by a few hundredths of the points' distance: three rounds leave less than a thousandth of a pixel."""
+"""Pupils move by a few hundredths of the points' distance: after three rounds the error is below 0.001 px."""
 RECTIFIED_NOTE = (
     "the cameras and the matches are those of a rectified pair, whose pose is exact; for one camera moved sideways by "
     "hand declare the pose type 'general'"
@@ -52,17 +51,16 @@ RECTIFIED_NOTE = (
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SceneReconstruction:
-    """What the pipeline found for one pair of views of any scene.
+    """The reconstruction of one pair of views of any scene.
 
     Attributes
     ----------
-    reconstruction : pose, matches and cloud as for a pair with boards, without boards. Lengths are in mm, or in
-        baselines where `metric` is False.
-    metric : the baseline was given.
-    inliers : (N,) bool, which of the correspondences fit the pose; row n of the cloud belongs to the n-th of `kept`.
-    kept : (K,) indices of the correspondences in the cloud.
-    sigma_px : standard deviation of the points per axis that the inliers show (median of all).
-    sigma_A : the same of an entry of their affinities; NaN where these were computed from directions and the pose.
+    reconstruction : pose, matches and cloud, with no boards. Lengths are in mm, or in baselines if not `metric`.
+    metric : whether the baseline was given.
+    inliers : (N,) mask of the correspondences that fit the pose.
+    kept : (K,) indices of the correspondences of the cloud's points.
+    sigma_px : standard deviation of the inliers' points per axis, from their residuals (median).
+    sigma_A : the same for an entry of their affinities; NaN if these were computed from directions and the pose.
     """
 
     reconstruction: Reconstruction
@@ -76,7 +74,7 @@ class SceneReconstruction:
 
     @property
     def unit(self) -> str:
-        """The unit of lengths: "mm", or "baselines" where none was measured."""
+        """The unit of lengths: "mm", or "baselines" if the baseline was not given."""
         return "mm" if self.metric else "baselines"
 
 
@@ -95,17 +93,19 @@ def reconstruct_scene(
 ) -> SceneReconstruction:
     """Reconstruct two views of any scene from point correspondences with affinities or directions.
 
-    Raises InputError: too few correspondences, neither affinities nor directions, or a baseline that is not positive;
-    DegenerateError: too few of them agree with any pose; no baseline.
+    Raises InputError for too few correspondences, without affinities and directions, or for a baseline that is not
+    positive; DegenerateError if too few correspondences agree with any pose, or there is no baseline.
 
     Parameters
     ----------
-    correspondences, camera1, camera2 : some may be wrong, their sigmas only count relative to each other; calibrated.
-    pair_id, seed : for messages; of the robust search.
-    pose_type, level_sigma_rad : as for `reconstruct_pair`. None: general, or exactly that of a rectified pair.
-    baseline_mm : length of the baseline where it was measured: then the cloud is in mm.
-    known_pose : the pose where it was measured: it is used as it is, and gives the baseline.
+    correspondences : may contain outliers; only the ratios of their sigmas are used.
+    camera1, camera2 : calibrated cameras.
+    pair_id : for messages.
+    pose_type, level_sigma_rad : as for `reconstruct_pair`. None: general, or standard and exact for a rectified pair.
+    baseline_mm : measured length of the baseline, if known; then the cloud is in mm.
+    known_pose : measured pose, if known; it is not refined, and gives the baseline.
     image1 : image of camera 1, for colours.
+    seed : of the robust search.
     """
     baseline_mm = baseline_mm if known_pose is None else known_pose.baseline_mm
     matches, seen = _matches(correspondences, camera1, camera2, baseline_mm, pair_id)
@@ -143,11 +143,10 @@ def with_pupils(
     correspondences: Correspondences,
     cameras: tuple[Camera, Camera],
 ) -> SceneReconstruction:
-    """Return `scene_of` the correspondences as if the pupils of the cameras, `NearCamera`, did not move.
+    """Return `scene_of` the correspondences, corrected for moving entrance pupils (`NearCamera`) if it is in mm.
 
-    `scene_of` takes the lenses for central. Where its scene is in mm, its points say what a pupil's motion does to the
-    pixels; without that the points are others again: a fixed point, which each round comes nearer by as much as the
-    pupil moves over the points' distance.
+    `scene_of` treats the lenses as central. The correction depends on the points' distances, and these on it: it is a
+    fixed-point iteration, whose error shrinks by the pupil's motion over the points' distance in each round.
     """
     scene, moving = scene_of(correspondences), [isinstance(camera, NearCamera) for camera in cameras]
     if not (any(moving) and scene.metric):
@@ -200,8 +199,8 @@ def _with_scatter(
     *,
     metric: bool,
 ) -> SceneReconstruction:
-    """Return the reconstruction with what refers to the `count` correspondences: `seen` of them have matches, `chosen`
-    of these are in the cloud."""
+    """Return the scene of `count` correspondences: `seen` are the indices of those with matches, `chosen` the indices
+    of the matches in the cloud."""
     inliers = np.zeros(count, dtype=bool)
     inliers[seen[fit.inliers]] = True
     sigma_A = fit.matches.sigma_A
@@ -218,7 +217,7 @@ def _with_scatter(
 def _matches(
     correspondences: Correspondences, camera1: Camera, camera2: Camera, baseline_mm: float | None, pair_id: str
 ) -> tuple[Matches, BoolArray]:
-    """Return the matches and which of the correspondences have one. Raises InputError where these cannot be used."""
+    """Return the matches, and a mask of the correspondences with one. Raises InputError for unusable ones."""
     _check(correspondences, baseline_mm, pair_id)
     matches, seen = correspondences.matches(camera1, camera2)
     if len(seen) < MIN_MATCHES:
@@ -260,9 +259,9 @@ def _check(correspondences: Correspondences, baseline_mm: float | None, pair_id:
 
 
 def _affinities(found: Correspondences, fit: ScenePose) -> Affinities:
-    """Return the affinities of all matches that fit: given ones, and from directions and the pose where none is.
+    """Return the affinities of all inliers: the given ones, else those from directions and the pose.
 
-    Those from the pose fulfil the epipolar geometry whatever their error: only given ones have a sigma.
+    Those from the pose always fulfil the epipolar geometry, so only given ones have a sigma.
     """
     m, E21 = fit.matches, essential_from_pose(fit.refined.cam2_from_cam1)
     n = len(m)
@@ -282,7 +281,7 @@ def _affinities(found: Correspondences, fit: ScenePose) -> Affinities:
 def _cloud(
     fit: ScenePose, found: Correspondences, pose: Rigid3, covariance: FloatArray, image1: NDArray[np.generic] | None
 ) -> tuple[OrientedCloud, NDArray[np.int64], Affinities]:
-    """Return the cloud, which matches are in it, and the affinities of all."""
+    """Return the cloud, the indices of the matches in it, and the affinities of all matches."""
     affinities = _affinities(found, fit)
     points = triangulate_matches(fit.matches, pose, covariance)
     colours = colours_at(image1, fit.matches.pixels1)
@@ -294,13 +293,13 @@ def _cloud(
 
 
 def in_unit(pose: Rigid3, covariance: FloatArray, scale: float) -> tuple[Rigid3, FloatArray]:
-    """Return a pose of unit baseline, and its covariance (6, 6), with a baseline of `scale`."""
+    """Return a pose of unit baseline, and its covariance (6, 6), scaled to the baseline `scale`."""
     by = np.repeat([1.0, scale], 3)
     return Rigid3(pose.rotation, scale * pose.translation_mm), np.asarray(by[:, None] * covariance * by)
 
 
 def are_rectified(camera1: Camera, camera2: Camera) -> bool:
-    """Say whether the cameras are perspective ones of one focal length, whose rows look the same way up and down.
+    """Return whether both are perspective cameras of one focal length whose rows correspond.
 
     Their principal points may differ along the row.
     """
@@ -324,7 +323,7 @@ def are_rectified(camera1: Camera, camera2: Camera) -> bool:
 
 
 def seen_as_rectified(matches: Matches) -> bool:
-    """Say whether matches that agree with one pose speak for a baseline along the rows and no rotation."""
+    """Return whether the matches support a baseline along the rows and no rotation."""
     try:
         return pose_type_evidence(matches).choice is PoseType.STANDARD
     except (InputError, DegenerateError):

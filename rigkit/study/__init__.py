@@ -1,1 +1,1 @@
-"""Synthetic studies: the estimators over noise, pose types and boards."""
+"""Synthetic studies of the estimators over noise, pose types and boards."""

@@ -1,8 +1,8 @@
-"""The synthetic study: how far normals are off when directions or corners are noisy.
+"""Run synthetic studies: errors of normals for noisy directions or corners.
 
-A study is a grid of pose types, noise levels and affine estimators. Trials are cut into chunks of fixed size, each with
-a random generator of its own, so that the numbers do not depend on how many processes share the work. Source: L.
-Hajder, "Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations", synthetic tests.
+A study is a grid of pose types, noise levels and affine estimators. Trials are divided into chunks of fixed size with
+their own random generators, so that results do not depend on the number of processes. Source: L. Hajder, "Affine
+Correspondences in Stereo Vision: Theory, Practice, and Limitations", synthetic tests.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ NOISE_KINDS = {"directions": "deg", "corners": "px"}
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A statement about medians: each cell of `smaller` is below each cell of `larger`, or at most a limit.
+    """A claim about medians: each cell of `smaller` is below each cell of `larger`, or at most a limit.
 
     Attributes
     ----------
-    text : the statement in words.
-    smaller, larger : selections of cells: any of method, pose_type, plane, sigma, each a value or several; cells that
-        agree in all that not both sides name are compared with each other.
-    at_most_deg : instead of `larger`: what no cell of `smaller` exceeds.
+    text : the claim in words.
+    smaller, larger : selections of cells by any of method, pose_type, plane, sigma, each a value or several. Cells are
+        compared if they agree in all keys that not both sides name.
+    at_most_deg : instead of `larger`: upper limit of all cells of `smaller`.
     """
 
     text: str
@@ -62,7 +62,7 @@ class Claim:
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """An affine estimator under a name of its own, with the directions and the scale that it works from."""
+    """A named variant of an affine estimator with its own directions and scale."""
 
     name: str
     method: str
@@ -72,7 +72,7 @@ class Variant:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Study:
-    """What is simulated.
+    """Definition of a synthetic study.
 
     Attributes
     ----------
@@ -84,14 +84,14 @@ class Study:
     noise : "directions" (sigmas in degrees, lengths kept) or "corners" (sigmas in px, everything computed from them).
     sigmas : noise levels.
     images : which image is noisy.
-    support : what directions are estimated from, see `direction_field`; "chord" as in the paper.
-    det_scale : scale of DET3UDIR, see `affines_from_directions`; "sqmean" as in the paper.
+    support : corners that directions are estimated from, see `direction_field`; "chord" in the paper.
+    det_scale : scale of DET3UDIR, see `affines_from_directions`; "sqmean" in the paper.
     variants : estimators with another support or scale than the study's, for comparison.
     epipolar : "truth", or "estimated" from the noisy corners by the eight-point method (corner noise only).
     board, focal_px, centre_px : target and camera.
     parallax_deg : of general pairs. baseline_mm, in_plane_deg : of the others.
     min_conditioning : affinities below are left out and counted; 0 keeps all.
-    claims : statements that the report checks.
+    claims : checked in the report.
     """
 
     name: str
@@ -139,7 +139,7 @@ class Study:
 
     @property
     def estimators(self) -> tuple[Variant, ...]:
-        """What `methods` name."""
+        """The estimators that `methods` name."""
         named = {variant.name: variant for variant in self.variants}
         return tuple(named.get(m, Variant(m, m, self.support, self.det_scale)) for m in self.methods)
 
@@ -149,7 +149,7 @@ class Study:
         return NOISE_KINDS[self.noise]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything that determines the numbers, for provenance and for recognising earlier results."""
+        """Return everything that determines the results, for provenance and to recognise earlier results."""
         out = {name: getattr(self, name) for name in self.__slots__ if name != "claims"}
         out["board"] = {"columns": self.board.columns, "rows": self.board.rows, "square_mm": self.board.square_x_mm}
         out["variants"] = [asdict(variant) for variant in self.variants]
@@ -161,11 +161,10 @@ def chunk_count(study: Study) -> int:
 
 
 def run_chunk(study: Study, index: int) -> NDArray[np.float32]:
-    """Return angles between estimated and true normals, degrees, NaN where there is no estimate.
+    """Return angles between estimated and true normals, degrees, NaN without an estimate.
 
-    Angles are between lines, at most 90 degrees: which way a normal points is decided by where the camera is, not by
-    the estimator. Shape (pose types, sigmas, methods, trials of this chunk, corners). Depends on the study and `index`
-    alone.
+    Shape (pose types, sigmas, methods, trials of this chunk, corners). Angles are between lines, at most 90 degrees:
+    the sign of a normal is given by the camera, not by the estimator. Depends only on the study and `index`.
     """
     trials = min(CHUNK_TRIALS, study.trials - index * CHUNK_TRIALS)
     corners = STUDY_PLANES * study.board.corner_count
@@ -215,7 +214,7 @@ class _Scene:
         )
 
     def _along(self, lattices: Pixels, support: str) -> FloatArray:
-        """Return the directions of all lattices (trials, planes, rows, columns, 2) at once where a formula does it."""
+        """Return the directions of lattices (trials, planes, rows, columns, 2), in a batch if there is a formula."""
         if support == "chord":
             return chord_directions(lattices)
         if support == "neighbours":
@@ -270,14 +269,14 @@ def _jacobian(points: FloatArray, focal_px: float) -> FloatArray:
 
 
 def _epipolar_normals(F21: Mat3, pixels1: Pixels, pixels2: Pixels) -> EpipolarNormals:
-    """Return the normals of the epipolar lines of (T, N, 2) pixels and T fundamental matrices, flattened."""
+    """Return the flattened normals of the epipolar lines of pixels (T, N, 2) for T fundamental matrices."""
     n2 = pixels1 @ np.swapaxes(F21[:, :2, :2], 1, 2) + F21[:, None, :2, 2]
     n1 = pixels2 @ F21[:, :2, :2] + F21[:, None, 2, :2]
     return EpipolarNormals(n1.reshape(-1, 2), n2.reshape(-1, 2))
 
 
 def _eight_point(pixels1: Pixels, pixels2: Pixels) -> Mat3:
-    """Return normalised eight-point fundamental matrices (T, 3, 3) of T pairs at once."""
+    """Return fundamental matrices (T, 3, 3) of T pairs by the normalised eight-point method."""
     normalised, transforms = [], []
     for pixels in (pixels1, pixels2):
         mean = pixels.mean(axis=1, keepdims=True)

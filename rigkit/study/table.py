@@ -1,4 +1,4 @@
-"""Numbers of a synthetic study: box-plot statistics a cell, and the statements that they bear out or not."""
+"""Tabulate a synthetic study: box-plot statistics of each cell, and verdicts on the claims."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from rigkit.core.errors import InputError
 from rigkit.study.study import STUDY_PLANES, Claim, Study
 
 ALL_PLANES = 0
-"""`StudyCell.plane` of the cell over all planes together."""
+"""`StudyCell.plane` of the cell over all planes."""
 WHISKER_IQR = 1.5
 """Whiskers end at the last value within this many interquartile ranges of the box, as in the paper's figures."""
 EXACT_DEG = 1e-5
-"""Below this an estimate is exact (errors are kept in single precision): two exact ones are not compared."""
+"""Errors below are rounding (they are stored in single precision); two such cells are not compared."""
 CELL_STATISTICS = ("median_deg", "q25_deg", "q75_deg", "whisker_low_deg", "whisker_high_deg", "mean_deg")
 CELL_KEYS = ("pose_type", "sigma", "method", "plane")
 
@@ -30,7 +30,7 @@ class StudyCell:
 
     Attributes
     ----------
-    pose_type, sigma, method, plane : which cell; plane 1, 2, 3 or 0 for all.
+    pose_type, sigma, method, plane : keys of the cell; plane 1, 2, 3 or 0 for all.
     count, missing : corners with and without an estimate.
     """
 
@@ -57,7 +57,7 @@ class StudyTable:
     verdicts: tuple[Verdict, ...]
 
     def cell(self, **which: Any) -> StudyCell:
-        """Return the one cell with these keys (plane: all unless said); raises InputError if there is not just one."""
+        """Return the cell with these keys (default plane: all); raises InputError if there is not exactly one."""
         found = _select(self.cells, {"plane": ALL_PLANES, **which})
         if len(found) != 1:
             raise InputError(
@@ -73,7 +73,7 @@ class StudyTable:
 
 
 def tabulate(study: Study, chunks: Sequence[NDArray[np.float32]]) -> StudyTable:
-    """Return the statistics of all chunks, in the order that `run_chunk` numbers them."""
+    """Return the table of a study from all its chunks, in the order of their index in `run_chunk`."""
     errors = np.concatenate(chunks, axis=3)
     if errors.shape[3] != study.trials:
         raise InputError(f"study '{study.name}': {errors.shape[3]} of {study.trials} trials; run the missing chunks")
@@ -96,7 +96,7 @@ def _cells(study: Study, errors: NDArray[np.float32]) -> Iterator[StudyCell]:
 
 
 def _statistics(values: NDArray[np.float32]) -> dict[str, Any]:
-    """Return what `StudyCell` tells of angles, not finite where there is none."""
+    """Return the statistics of `StudyCell`, NaN without any finite angle."""
     good = np.sort(values[np.isfinite(values)].astype(np.float64))
     counts = {"count": good.size, "missing": values.size - good.size}
     if not good.size:
@@ -109,7 +109,7 @@ def _statistics(values: NDArray[np.float32]) -> dict[str, Any]:
 
 
 def _select(cells: Sequence[StudyCell], which: Mapping[str, Any]) -> list[StudyCell]:
-    """Return the cells with these keys; a list of values stands for any of them."""
+    """Return the cells with these keys; a list or tuple matches any of its values."""
 
     def fits(cell: StudyCell) -> bool:
         return all(
@@ -128,7 +128,7 @@ def _evaluated(claim: Claim, cells: Sequence[StudyCell]) -> Verdict:
 
 
 def _comparisons(claim: Claim, cells: Sequence[StudyCell]) -> Iterator[Comparison]:
-    """Yield each cell of one side with each of the other that agrees in what not both name, or with the limit."""
+    """Yield the comparisons of a claim: cells that agree in all keys that not both sides name, or with the limit."""
     larger = claim.larger or {}
     free = [key for key in CELL_KEYS if key not in claim.smaller or key not in larger]
     default = {"plane": ALL_PLANES} if "plane" not in {**claim.smaller, **larger} else {}

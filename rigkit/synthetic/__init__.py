@@ -1,1 +1,1 @@
-"""Scenes with known truth: geometry, noise, rendered images, studies."""
+"""Synthetic scenes with exact truth: geometry, noise and rendered images."""

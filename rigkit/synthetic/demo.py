@@ -1,7 +1,7 @@
-"""A complete capture without a camera: calibration images and a stereo pair of three boards through a fisheye lens.
+"""Render a complete capture: calibration images and stereo pairs of three boards through a fisheye lens.
 
-`build_demo` writes a data set as a person would have made it: manifest, boards, images, measured facts. The exact truth
-goes to `truth.json`, which nothing in the pipeline reads.
+`build_demo` writes a data set like a real one: manifest, boards, images, measurements. The exact truth is written to
+`truth.json`, which the pipeline does not read.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PAIRS = (("general", PoseType.GENERAL, 0.0), ("standard", PoseType.STANDARD, 300
 RULER_SIGMA_MM = 1.0
 SQUARE_SIGMA_DEG = 0.3
 VIEW_RADIUS = (0.0, 0.45, 0.62)
-"""Where calibration boards are seen: distance from the image's centre, as a share of half its height."""
+"""Distances of calibration boards from the image's centre, over half the image height."""
 VIEWS = 10
 TARGET_TRIES = 300
 OPTICS = Optics(0.6, field_deg=FIELD_DEG)
@@ -50,9 +50,9 @@ def demo_camera() -> Camera:
 
 
 def build_demo(directory: str | Path, rng: np.random.Generator, progress: Progress = silent) -> Path:
-    """Write the demo capture into a new or empty folder, whole or not at all, and return its manifest.
+    """Write the demo capture atomically into a new or empty folder, and return the path of its manifest.
 
-    Raises InputError: the folder has something in it, or cannot be written (permission, full disk).
+    Raises InputError if the folder is not empty, or cannot be written (permission, full disk).
     """
     root = Path(directory)
     if root.is_dir() and any(root.iterdir()):
@@ -107,7 +107,7 @@ def _build(root: Path, rng: np.random.Generator, progress: Progress) -> None:
 
 
 def _calibration_view(camera: Camera, index: int, rng: np.random.Generator) -> PlacedBoard:
-    """Return the target for one calibration image: in turn near the centre and towards the rim, all round."""
+    """Return the target for one calibration image, at a distance from the centre that cycles with `index`."""
     width, height = camera.size_px
     centre = np.array([width, height]) / 2.0
     for attempt in range(TARGET_TRIES):
@@ -145,7 +145,7 @@ def _session_toml() -> str:
 
 
 def _manifest_toml(scenes: dict[str, StereoScene]) -> str:
-    """Return the manifest, with what a person with a ruler and a set square would have written."""
+    """Return the manifest, with measurements as by a ruler and a set square."""
     out = ['schema = "rigkit.dataset/1"', 'name = "demo"', ""]
     for board in DEMO_PLANES:
         out += ["[[boards]]", f'id = "{board.board_id}"', f'file = "boards/{board.board_id}.toml"', ""]
@@ -166,7 +166,7 @@ def _manifest_toml(scenes: dict[str, StereoScene]) -> str:
 
 
 def _truth(camera: Camera, targets: list[PlacedBoard], scenes: dict[str, StereoScene]) -> dict[str, Any]:
-    """Return everything exactly, for comparison only."""
+    """Return the exact truth."""
     return {
         "camera": {"model": camera.model, "size_px": camera.size_px, "parameters": camera.named(camera.parameters)},
         "calibration": {

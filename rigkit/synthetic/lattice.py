@@ -1,4 +1,4 @@
-"""Directions on whole board lattices, batched over trials: the paper's chords, or exact derivatives."""
+"""Compute directions on whole board lattices, batched over trials: the paper's chords, or exact derivatives."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from rigkit.core.arrays import FloatArray, Pixels
 def chord_directions(lattice: Pixels) -> FloatArray:
     """Return the chords to the neighbour along the columns, the rows and the diagonal, (..., rows, columns, 3, 2).
 
-    At the last column or row the chord from the neighbour before is taken, so that all point the same way. Chords have
-    the right direction but a biased length: one square ahead is farther, or nearer, than the corner itself. The two
-    corners without a diagonal neighbour get the sum of their other two (exact) derivatives.
+    The last column and row use the chord from the previous neighbour, so that all point the same way. Chords have the
+    right direction but a biased length, because of perspective. The two corners without a diagonal neighbour get the
+    sum of their other two (exact) derivatives.
 
     Parameters
     ----------
@@ -36,9 +36,9 @@ def harmonic_directions(lattice: Pixels) -> FloatArray:
 
     Notes
     -----
-    On a line seen in perspective x(s) = a s / (1 + c s), so the derivative's length is the harmonic mean of the chords
-    to both neighbours, or l1 l2 / (2 (l2 - l1)) from the distances to the next two at a border. The diagonal's
-    derivative is the sum of the other two.
+    In perspective a line is x(s) = a s / (1 + c s), so the derivative's length is the harmonic mean of the chords to
+    both neighbours, or l1 l2 / (2 (l2 - l1)) from the distances to the next two at a border. The diagonal's derivative
+    is the sum of the other two.
     """
     horizontal, vertical = _harmonic(lattice, -2), _harmonic(lattice, -3)
     return np.stack([horizontal, vertical, horizontal + vertical], axis=-2)

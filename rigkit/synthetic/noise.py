@@ -1,4 +1,4 @@
-"""The noise of the synthetic study: turned directions, moved corners."""
+"""Add the noise of the synthetic study: rotated directions, displaced corners."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rigkit.core.matches import DirectionPairs
 
 
 class NoisyImages(StrEnum):
-    """Which image of a pair is noisy. The paper does not say; `BOTH` is what a camera does."""
+    """Which image of a pair is noisy. The paper does not say; in reality it is `BOTH`."""
 
     FIRST = "1"
     SECOND = "2"
@@ -23,7 +23,7 @@ class NoisyImages(StrEnum):
 
 
 def turn(vectors: FloatArray, angle_rad: FloatArray) -> FloatArray:
-    """Return 2-vectors (..., 2) turned by `angle_rad` (...), their lengths kept."""
+    """Return 2-vectors (..., 2) rotated by `angle_rad` (...)."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     x, y = vectors[..., 0], vectors[..., 1]
     return np.stack([c * x - s * y, s * x + c * y], axis=-1)
@@ -32,10 +32,10 @@ def turn(vectors: FloatArray, angle_rad: FloatArray) -> FloatArray:
 def rotate_directions(
     directions: DirectionPairs, sigma_rad: float, rng: np.random.Generator, *, images: NoisyImages = NoisyImages.BOTH
 ) -> DirectionPairs:
-    """Return the directions, each turned by its own normally distributed angle; lengths are kept.
+    """Return the directions, each rotated by an independent normally distributed angle.
 
     The noise model of L. Hajder, "Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations". It
-    leaves lengths noise-free, which favours the estimators that use them.
+    keeps lengths noise-free, which favours the estimators that use them.
     """
     shape = directions.valid.shape
     out = [directions.image1, directions.image2]

@@ -1,4 +1,4 @@
-"""From reflectance to grey levels: light, lens fall-off, gamma, sharpening, saturation, noise, quantisation, JPEG."""
+"""Convert radiance to grey levels: illumination, vignetting, gamma, sharpening, noise, quantisation, JPEG."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Shadow:
     Attributes
     ----------
     angle_deg : direction in the image towards the dark side.
-    offset : where the border crosses, as a fraction of half the image diagonal from the centre.
+    offset : distance of the border from the centre, over half the image diagonal.
     softness : width of the penumbra (sigma), same unit.
-    factor : light left in the dark.
+    factor : fraction of the light in the shadow.
     """
 
     angle_deg: float = 30.0
@@ -35,17 +35,17 @@ class Shadow:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Photometry:
-    """Light and sensor.
+    """Illumination and sensor.
 
     Attributes
     ----------
-    exposure : grey level (of 0..1) of a white sheet of reflectance 1 in the middle; above 1 whites saturate.
-    vignetting : share of light lost in the image's corners (quadratic in the radius).
+    exposure : grey level (0 to 1) of reflectance 1 in the middle; above 1 whites saturate.
+    vignetting : fraction of light lost in the image's corners (quadratic in the radius).
     gradient : (right, down) relative change of the light from the centre to the border.
     shadow : a shadow across the image, or None.
-    gamma : exponent of the tone curve (1 linear, 1 / 2.2 as for display).
+    gamma : exponent of the tone curve (1 linear, 1 / 2.2 for display).
     sharpen : amount of an unsharp mask.
-    noise_levels : sigma of Gaussian noise, in grey levels of an 8-bit image whatever `bits` is.
+    noise_levels : sigma of Gaussian noise, in grey levels of 8 bits whatever `bits` is.
     bits : 8 or 16.
     jpeg_quality : quality of a JPEG round trip, or None (8 bit only).
     """
@@ -72,9 +72,9 @@ class Photometry:
 def develop(
     radiance: FloatArray, photometry: Photometry, rng: np.random.Generator | None = None
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Return the image that a sensor makes of `radiance` (height, width; 0 to 1).
+    """Return the sensor image of `radiance` (height, width; 0 to 1).
 
-    Raises InputError where noise is asked for without `rng`.
+    Raises InputError for noise without `rng`.
     """
     light = radiance * (photometry.exposure * _illumination(radiance.shape, photometry))
     if photometry.gamma != 1.0:
@@ -96,7 +96,7 @@ def develop(
 
 
 def _illumination(shape: tuple[int, ...], photometry: Photometry) -> FloatArray:
-    """Return the relative light at every pixel (height, width), or 1 where it is even."""
+    """Return the relative illumination of every pixel (height, width)."""
     height, width = shape
     half = 0.5 * float(np.hypot(width, height))
     x = ((np.arange(width) - (width - 1) / 2.0) / half)[None, :]

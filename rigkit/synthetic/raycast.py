@@ -1,4 +1,4 @@
-"""Where the rays of an image tile meet rectangles in space, and what they see there."""
+"""Intersect the rays of an image tile with rectangles in space."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rigkit.kernels.painting import PaintedSurface, PaintedTile
 from rigkit.synthetic.scene import Panel, PlacedBoard
 
 RIM_MARGIN = 0.1
-"""Cosine by which the nodes must clear the lens's rim for a whole tile to be lit: they stop short of its edge."""
+"""Margin in cosine of the nodes to the lens's rim for a whole tile to be inside: nodes do not reach the tile's edge."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -26,7 +26,7 @@ class Surface:
     low: FloatArray
     high: FloatArray
     cells: tuple[int, int] | None
-    """(columns, rows) of inner corners where there is a pattern to see."""
+    """(columns, rows) of inner corners if a chessboard is visible."""
     white: float
     black: float
     first_black: bool = True
@@ -37,15 +37,15 @@ class Surface:
     """(K, 3) discs: x, y, radius in mm."""
     squares_mm: tuple[float, float] = (1.0, 1.0)
     ground: tuple[FloatArray, FloatArray] | None = None
-    """Lower and upper end, in squares, of the black ground of a print whose discs are white; None: black discs."""
+    """Lower and upper end, in squares, of the black background of white discs; None: black discs."""
 
     @property
     def printed(self) -> bool:
-        """Whether there is a pattern to see."""
+        """Whether a pattern is visible."""
         return self.cells is not None or self.marks is not None or self.discs is not None
 
     def for_kernel(self) -> PaintedSurface:
-        """Return it as the kernel takes it."""
+        """Return the surface in the form of the kernel."""
         columns, rows = self.cells or (0, 0)
         marks, discs = (np.zeros((0, n)) if a is None else a for a, n in ((self.marks, 4), (self.discs, 3)))
         ground = np.zeros((0, 2, 2)) if self.ground is None else np.array([self.ground])
@@ -70,10 +70,10 @@ def board_surface(placed: PlacedBoard, cam_from_world: Rigid3) -> Surface:
     board = placed.board
     low, high = placed.edge_squares()
     scale, ink = np.array(board.squares_mm), board.ink()
-    # White circles lie on black ground on white paper; of all else black and white are exchanged, with the paper.
+    # Inverted circles have a black background on white paper; other inverted patterns invert the paper as well.
     discs = bool(len(ink.circles))
     white, black = (placed.black, placed.white) if ink.inverted and not discs else (placed.white, placed.black)
-    # Behind the paper there is no pattern.
+    # The back of the paper has no pattern.
     front = float(cam_from_board.rotation[:, 2] @ cam_from_board.translation_mm) > 0.0
     centre = cam_from_board.apply(board.points()).mean(axis=0)
     return Surface(
@@ -106,13 +106,13 @@ def _plane_from_ray(cam_from_plane: Rigid3, scale: FloatArray) -> FloatArray:
     rotation, translation = cam_from_plane.rotation, cam_from_plane.translation_mm
     forward = np.stack([rotation[:, 0] * scale[0], rotation[:, 1] * scale[1], translation], axis=1)
     if abs(np.linalg.det(forward)) < 1e-9 * scale.prod():
-        # The camera lies in the plane: the rectangle is a line, nothing of it is seen.
+        # The camera is in the plane, and the rectangle invisible.
         return np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     return np.asarray(np.linalg.inv(forward))
 
 
 class Chart:
-    """Where the sub-samples of a tile meet a plane; polynomial where the lens is smooth, ray by ray at its rim."""
+    """The rays of a tile's sub-samples: interpolated by polynomials, or computed one by one at the lens's rim."""
 
     def __init__(
         self,
@@ -123,8 +123,8 @@ class Chart:
         field_deg: float | None,
         per_pixel: int,
     ) -> None:
-        """Take the sub-samples' columns and rows, the rays at their nodes, and at the lens's rim the ray and the light
-        of every sub-sample."""
+        """Take the sub-samples' columns and rows, the rays at their nodes, and at the lens's rim every sub-sample's ray
+        and whether it is inside."""
         self.shape = (len(v.samples), len(u.samples))
         self.u, self.v, self.nodes = u, v, nodes
         self.rays: FloatArray | None = None
@@ -137,7 +137,7 @@ class Chart:
         self.tile = PaintedTile.of_rays(v.weights, u.across, nodes, self.rays, per_pixel)
 
     def _limit(self, cosine: float) -> None:
-        """Darken what lies farther from the axis than the lens reaches."""
+        """Darken sub-samples outside of the lens's field of view."""
         if self.rays is None and self.nodes[..., 2].min() > cosine + RIM_MARGIN:
             return
         forward = self._interpolate(self.nodes[..., 2]) if self.rays is None else self.rays[..., 2]
@@ -148,7 +148,7 @@ class Chart:
 
     def _interpolate(self, nodes: FloatArray) -> FloatArray:
         """Return (rows, columns) from values at the nodes, (NODES, NODES)."""
-        # einsum, not @: BLAS starts threads for matrices of this size, which cost far more than they gain.
+        # einsum, not @: BLAS starts threads for matrices of this size, which is slower.
         return np.asarray(np.einsum("vj,ju->vu", np.einsum("vi,ij->vj", self.v.weights, nodes), self.u.across))
 
 
@@ -159,9 +159,9 @@ def charts_of(
     field_deg: float | None,
     per_pixel: int,
 ) -> Iterator[Chart]:
-    """Return the charts of an image's tiles, row by row, from the columns u and the rows v of their sub-samples, px."""
+    """Yield the charts of an image's tiles, row by row, from the columns u and the rows v of their sub-samples, px."""
     across, down = [_Axis.of(u) for u in columns], [_Axis.of(v) for v in rows]
-    # The nodes of all tiles at once: a lens is asked many pixels as fast as few.
+    # One call for the nodes of all tiles is faster.
     rays, valid = _unproject(camera, *(np.concatenate([axis.nodes for axis in axes]) for axes in (across, down)))
     for i, v in enumerate(down):
         for k, u in enumerate(across):
@@ -176,8 +176,8 @@ def _unproject(camera: Camera, u: FloatArray, v: FloatArray) -> tuple[FloatArray
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Axis:
-    """Sub-samples of a tile along an axis, nodes that span them, and the weights (samples, NODES) that interpolate;
-    `across` is their transpose."""
+    """Sub-samples of a tile along an axis, Chebyshev nodes, and the interpolation weights (samples, NODES); `across` is
+    their transpose."""
 
     samples: FloatArray
     nodes: FloatArray
@@ -186,7 +186,7 @@ class _Axis:
 
     @classmethod
     def of(cls, samples: FloatArray) -> _Axis:
-        """Lay Chebyshev nodes over the samples."""
+        """Return the axis with Chebyshev nodes over the samples."""
         low, high = samples[0], samples[-1]
         angle = (2 * np.arange(NODES) + 1) * np.pi / (2 * NODES)
         nodes = 0.5 * (low + high) + 0.5 * (high - low) * np.cos(angle)

@@ -1,14 +1,14 @@
-"""Images of boards through any central camera, exact to a thousandth of a pixel.
+"""Render images of boards through any central camera, accurate to a thousandth of a pixel.
 
-Every pixel is the integral of the scene over the pixel's square and the optical blur. The scene is cut into tiles. In a
-tile that a board or panel touches, rays are polynomial in the pixel, fitted to the camera's own rays at Chebyshev
-nodes. Reflectance is evaluated on a grid of sub-samples, each of which integrates over its own square cell, exactly
-where one straight edge crosses it. One separable kernel (pixel box convolved with a Gaussian) reduces sub-samples to
-pixels. Cells fill the plane and the kernel is symmetric and the same for every pixel, so edges carry no bias, whatever
-their direction. With 4 sub-samples and a blur of 0.3 px corners are right to 0.0004 px (rms; to 0.0007 px on tilted
-boards with rows along the image's), sharper ones to about 0.001 px.
+Every pixel is the integral of the scene over the pixel's square and the optical blur. The image is rendered in tiles.
+In a tile with a board or panel, rays are interpolated by polynomials from the camera's rays at Chebyshev nodes.
+Reflectance is evaluated on a grid of sub-samples, each of which integrates over its square cell, exactly for a single
+straight edge. A separable kernel (pixel box convolved with a Gaussian) reduces sub-samples to pixels. Cells tile the
+plane and the kernel is symmetric and the same for every pixel, so edges have no bias in any direction. With 4
+sub-samples and a blur of 0.3 px the RMS error of corners is 0.0004 px (0.0007 px on tilted boards with rows parallel to
+the image's), with less blur about 0.001 px.
 
-Photometry (light, gamma, noise, JPEG) follows in `rigkit.synthetic.photometry`.
+`rigkit.synthetic.photometry` adds illumination, gamma, noise and JPEG.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ from rigkit.synthetic.scene import Panel, PlacedBoard
 TILE = 64
 """Side of a tile, px."""
 KERNEL_SIGMAS = 4.0
-"""The Gaussian is cut here: 6e-5 of its mass."""
+"""The Gaussian is truncated here: 6e-5 of its mass."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Optics:
-    """How the lens blurs.
+    """Blur and field of view of the lens.
 
     Attributes
     ----------
-    blur_px : sigma of the Gaussian blur, on top of the pixel's own square.
+    blur_px : sigma of the Gaussian blur, in addition to the pixel's square.
     defocus_px : radius of a uniform disc, 0 for none.
     motion_px : (dx, dy) of a straight motion during the exposure, whole length.
-    field_deg : full angle of the lens's field of view; beyond it the image is black. None: as far as the model goes.
-    supersample : sub-samples a pixel along each axis.
+    field_deg : full angle of the field of view; the image is black beyond. None: that of the camera model.
+    supersample : sub-samples of a pixel along each axis.
     """
 
     blur_px: float = 0.5
@@ -69,7 +69,7 @@ class Optics:
 
     @property
     def reach_px(self) -> int:
-        """How far a point of the scene spreads."""
+        """Largest distance that blur spreads a point."""
         spread = KERNEL_SIGMAS * self.blur_px + self.defocus_px + 0.5 * float(np.hypot(*self.motion_px))
         return int(np.ceil(spread)) + 1
 
@@ -86,15 +86,15 @@ def render(
     background: float = 0.35,
     rng: np.random.Generator | None = None,
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Return the grey image (height, width) of boards and panels, uint8 or uint16 as `photometry.bits` says.
+    """Return the grey image (height, width) of boards and panels, uint8 or uint16 by `photometry.bits`.
 
-    Panels are drawn in the given order behind all boards; boards from the farthest to the nearest; occluders in the
+    Panels are drawn in the given order behind all boards, boards from the farthest to the nearest, and occluders in the
     given order in front of all.
 
     Parameters
     ----------
-    background : reflectance where nothing is.
-    rng : source of the sensor noise; needed where `photometry.noise_levels` is not zero.
+    background : reflectance of empty space.
+    rng : source of the sensor noise; needed if `photometry.noise_levels` is not zero.
     """
     image = radiance(
         boards, camera, cam_from_world, panels=panels, occluders=occluders, optics=optics, background=background
@@ -112,7 +112,7 @@ def radiance(
     optics: Optics | None = None,
     background: float = 0.35,
 ) -> FloatArray:
-    """Return the blurred, pixel-integrated reflectance (height, width) before light and sensor; 0 outside the lens."""
+    """Return the blurred, pixel-integrated reflectance (height, width); 0 outside the field of view."""
     optics = optics or Optics()
     width, height = camera.size_px
     surfaces = [panel_surface(p, cam_from_world) for p in panels]
@@ -137,7 +137,7 @@ def radiance(
 
 
 class _Reduction:
-    """From sub-samples to pixels: one kernel along each axis, shared by all tiles of an image."""
+    """Reduces sub-samples to pixels, with the same kernel for all tiles of an image."""
 
     def __init__(self, optics: Optics) -> None:
         self.step = 1.0 / optics.supersample
@@ -149,7 +149,7 @@ class _Reduction:
         self.spread = _spread_kernel(optics)
 
     def axis(self, first: int, size: int) -> FloatArray:
-        """Return where, px, the sub-samples lie that a tile needs which begins at `first` of an image of `size` px."""
+        """Return the positions, px, of the sub-samples of a tile that begins at `first` in an image of `size` px."""
         return np.asarray(self.offsets[: (min(TILE, size - first) + 2 * self.reach) * self.count] + first)
 
     def __call__(self, fine: Float32, shape: tuple[int, int]) -> Float32:
@@ -161,8 +161,8 @@ class _Reduction:
 def _reduction_kernel(distance: FloatArray, step: float, sigma: float) -> Float32:
     """Return the pixel's box convolved with a Gaussian, on sub-samples at a `distance` (n,) from its centre, px.
 
-    It sums to 1. Each sub-sample stands for its cell, so the Gaussian is sampled, not integrated: the variance of the
-    whole is then 1/12 + sigma^2 exactly.
+    It sums to 1. Each sub-sample represents its cell, so the Gaussian is sampled, not integrated: the total variance is
+    then exactly 1/12 + sigma^2.
     """
     within = (np.arange(round(1.0 / step)) + 0.5) * step - 0.5
     if sigma == 0.0:
@@ -201,7 +201,7 @@ def _render_tile(
     reduce: _Reduction,
     background: float,
 ) -> Float32 | float:
-    """Return one tile (height, width = `shape`), or the one brightness of all its pixels."""
+    """Return one tile (height, width = `shape`), or a single brightness if it is uniform."""
     if chart.dark:
         return 0.0
     seen: list[PaintedSurface] = []
@@ -209,7 +209,7 @@ def _render_tile(
     for surface, painted in layers:
         cover = tile_cover(chart.tile, painted)
         if cover == COVERED_WHOLLY:
-            # Hides all that was drawn before.
+            # Hides everything behind it.
             seen, base = [], surface.white
         if cover == COVERED_PARTLY or (cover == COVERED_WHOLLY and surface.printed):
             seen.append(painted)

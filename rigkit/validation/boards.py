@@ -1,4 +1,4 @@
-"""A reconstructed board: its plane, and the lattice that its corners were printed on."""
+"""Fit the plane and the lattice of a reconstructed board."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from rigkit.validation.planes import NormalErrors, Plane, fit_moved, fit_plane, 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoardGrid:
-    """x = origin + across * step_x + down * step_y at places in squares, fitted to the corners by least squares.
+    """The lattice x = origin + across * step_x + down * step_y, fitted to the corners; (across, down) in squares.
 
     Attributes
     ----------
     steps_mm : (3, 3), rows: origin, a square along the columns, a square along the rows.
     scatter_mm2 : (3, 3) covariance of one corner about the lattice.
-    cofactor : (3, 3) inverse normal matrix of (1, across, down): leverage of a place on the board.
+    cofactor : (3, 3) inverse normal matrix of (1, across, down).
     """
 
     steps_mm: Mat3
@@ -29,14 +29,14 @@ class BoardGrid:
     cofactor: Mat3
 
     def at(self, place: FloatArray) -> tuple[FloatArray, Mat3]:
-        """Return the point (3,) at a place, mm, and its covariance (3, 3)."""
+        """Return the point (3,) at a place (2,) in squares, mm, and its covariance (3, 3)."""
         row = np.array([1.0, *np.asarray(place, dtype=np.float64)])
         return row @ self.steps_mm, self.scatter_mm2 * float(row @ self.cofactor @ row)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoardPlace:
-    """Where a board is: once, or for each of several (...) ways in which its points moved.
+    """Plane and lattice of a board, for one or several (...) positions of its points.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class BoardPlace:
     steps_mm: Mat3
 
     def at(self, place: FloatArray) -> Points:
-        """Return the points (..., 3) at a place, mm."""
+        """Return the points (..., 3) at a place (2,) in squares, mm."""
         return np.asarray(np.array([1.0, *place]) @ self.steps_mm)
 
     def distances(self, points: Points) -> FloatArray:
@@ -59,16 +59,15 @@ class BoardPlace:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class BoardResult:
-    """What was reconstructed of one board.
+    """The reconstruction of one board.
 
     Attributes
     ----------
     board : the board.
-    plane : through its points.
-    lattice : of its points.
+    plane, lattice : fitted to its points.
     normal_errors : of the estimated normals against the plane's.
-    square_x_ratio, square_y_ratio : reconstructed over measured square size: 1 for the board that was declared.
-    skew_deg : how far the reconstructed columns and rows are from perpendicular.
+    square_x_ratio, square_y_ratio : reconstructed over declared square size.
+    skew_deg : deviation of the reconstructed columns and rows from perpendicular.
     right_handed : whether columns x rows points into the board, as in the board frame.
     """
 
@@ -83,20 +82,20 @@ class BoardResult:
 
     @property
     def size_ratio(self) -> float:
-        """Reconstructed over measured size of a square, its sides taken together."""
+        """Reconstructed over declared size of a square: geometric mean of both sides."""
         return float(np.sqrt(self.square_x_ratio * self.square_y_ratio))
 
     @property
     def placed(self) -> BoardPlace:
-        """Where the board is."""
+        """Plane and lattice without their uncertainty."""
         return BoardPlace(self.plane.normal, np.asarray(self.plane.offset_mm), self.lattice.steps_mm)
 
     def feature(self, feature: Feature) -> tuple[FloatArray, Mat3]:
-        """Return where a corner or the centre lies (3,), mm, and its covariance (3, 3) from the corners' scatter."""
+        """Return the position (3,) of a corner or the centre, mm, and its covariance (3, 3) from the scatter."""
         return self.lattice.at(self.place(feature))
 
     def place(self, feature: Feature) -> FloatArray:
-        """Return where on the board a corner or the centre is, (2,) in squares from the first corner."""
+        """Return the place (2,) of a corner or the centre on the board, in squares from the first corner."""
         if feature.grid is not None:
             return np.asarray(places_on(self.board, np.array([feature.grid]))[0])
         places = places_on(self.board, self.board.grid())
@@ -104,14 +103,14 @@ class BoardResult:
 
 
 def places_on(board: Board, grid: IntArray) -> FloatArray:
-    """Return where the corners `grid` (N, 2) lie on a board, (N, 2) in squares from the first corner."""
+    """Return the places (N, 2) of the corners `grid` (N, 2) on a board, in squares from the first corner."""
     return board.pattern.positions(np.asarray(grid, dtype=np.float64))
 
 
 def fit_lattice(points_mm: Points, places: FloatArray) -> BoardGrid:
     """Fit the lattice to points (N, 3) at `places` (N, 2) on the board, in squares.
 
-    Raises DegenerateError where the corners lie in one row or column, or are fewer than four.
+    Raises DegenerateError if the corners are in one row or column, or fewer than four.
     """
     design = _design(places)
     if len(places) < 4 or np.linalg.matrix_rank(design) < 3:
@@ -127,8 +126,10 @@ def _design(places: FloatArray) -> FloatArray:
 
 
 def place_moved(points_mm: Points, places: FloatArray, like: Plane) -> BoardPlace:
-    """Return where a board is for points (M, N, 3) at `places` (N, 2) on it, in squares: M times those that `like` was
-    fitted to, moved a little."""
+    """Return plane and lattice for M perturbed copies (M, N, 3) of the points that `like` was fitted to.
+
+    `places` (N, 2) are the points' places on the board, in squares.
+    """
     used = points_mm[:, like.used]
     many = np.swapaxes(used, 0, 1).reshape(used.shape[1], -1)
     steps, *_ = np.linalg.lstsq(_design(places[like.used]), many, rcond=None)
@@ -145,10 +146,10 @@ def measure_board(
 ) -> BoardResult:
     """Return plane, lattice and normal errors of one board's points (N, 3), normals (N, 3) and grid (N, 2).
 
-    `covariance_mm2` and `common_mm` as in `fit_plane`. Points that the plane leaves out take no part in the lattice
-    either; all normals are judged.
+    See `fit_plane` for `covariance_mm2` and `common_mm`. The lattice is fitted to the same points as the plane; normal
+    errors are of all normals.
 
-    Raises DegenerateError where too few corners are left; the message names the board.
+    Raises DegenerateError if too few corners are left; the message names the board.
     """
     try:
         plane = fit_plane(points_mm, covariance_mm2, common_mm)

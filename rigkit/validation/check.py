@@ -1,6 +1,6 @@
-"""One quantity beside ours: both uncertainties and a verdict.
+"""Compare one reconstructed quantity with its measured value.
 
-A check passes where |ours - measured| <= k sqrt(sigma_ours^2 + sigma_measured^2).
+A check passes if |ours - measured| <= k sqrt(sigma_ours^2 + sigma_measured^2).
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from rigkit.core.truth import MeasuredAngle, MeasuredDistance, MeasuredLength
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:
-    """One measured quantity beside ours.
+    """The comparison of a reconstructed with a measured or declared quantity.
 
     Attributes
     ----------
     name : "baseline", "angle plane1-plane2", "distance plane1.centre to plane2", "pose type planar", "level".
-    kind : "baseline", "angle", "distance", or of a declaration "pose type", "level", "board size", "layout".
+    kind : "baseline", "angle", "distance", or for a declaration "pose type", "level", "board size", "layout".
     unit : "mm" or "deg", of all values.
-    measured, measured_sigma, how : what a person wrote down.
-    ours, our_sigma : what was reconstructed, with the predicted standard deviation.
+    measured, measured_sigma, how : the measured value, its standard deviation, and the method of measurement.
+    ours, our_sigma : the reconstructed value and its predicted standard deviation.
     difference : ours - measured.
     combined_sigma : root of the sum of both variances.
     k : |difference| / combined_sigma.
     limit_k : the largest k that passes.
     passed : the verdict.
-    count : how many points stand behind ours.
+    count : number of points that the reconstructed value is based on.
     """
 
     name: str
@@ -60,8 +60,8 @@ def compare(
 ) -> Check:
     """Return the check of `ours` (value, sigma) against `known` (value, sigma, how).
 
-    A sigma that is NaN (not predicted) counts as zero on our side: that makes the check stricter, never laxer.
-    `combined_sigma` is that of the difference where the two are not independent; by default they are.
+    A sigma of `ours` that is NaN (not predicted) counts as zero, which makes the check stricter. Pass `combined_sigma`,
+    the standard deviation of the difference, if the two values are not independent.
     """
     value, sigma, how = known
     our_sigma = ours[1] if np.isfinite(ours[1]) else 0.0
@@ -87,15 +87,15 @@ def compare(
 
 
 def compare_baseline(name: str, known: MeasuredLength, ours: tuple[float, float], coverage: float, count: int) -> Check:
-    """Return the check of a baseline (value and sigma, mm) against what a person measured."""
+    """Return the check of a baseline (value and sigma, mm) against its measured value."""
     return compare(name, "baseline", "mm", (known.value_mm, known.sigma_mm, known.how), ours, coverage, count)
 
 
 def compare_angle(known: MeasuredAngle, ours: tuple[float, float], coverage: float, count: int) -> Check:
-    """Return the check of an angle of boards (value and sigma, deg) against what a person measured."""
+    """Return the check of an angle between boards (value and sigma, deg) against its measured value."""
     return compare(known.name, "angle", "deg", (known.value_deg, known.sigma_deg, known.how), ours, coverage, count)
 
 
 def compare_distance(known: MeasuredDistance, ours: tuple[float, float], coverage: float, count: int) -> Check:
-    """Return the check of a distance on boards (value and sigma, mm) against what a person measured."""
+    """Return the check of a distance on boards (value and sigma, mm) against its measured value."""
     return compare(known.name, "distance", "mm", (known.value_mm, known.sigma_mm, known.how), ours, coverage, count)

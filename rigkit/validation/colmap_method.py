@@ -1,4 +1,4 @@
-"""What pycolmap found of a pair, as a reconstruction in millimetres that can be measured like ours."""
+"""Convert pycolmap's result for a pair to a reconstruction in mm."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.reconstruction.scale import scale_and_gradient
 
 BEST_CORNER_PX = 1e-3
-"""No corner is known better than this, however well a few of them happen to fit."""
+"""Floor of the corners' standard deviation: a few corners can fit better by chance."""
 PER_POINT = ("normals", "colours", "board_index", "grid", "sigma_mm", "normal_sigma_rad")
 
 
@@ -43,7 +43,7 @@ def colmap_reconstruction(reconstruction: Reconstruction, pair: ColmapPair, resu
     )
     if not np.isfinite(result.adjusted_covariance).all():
         return metric
-    # A point without a triangulation takes no part.
+    # Points that could not be triangulated have a zero gradient.
     slope = np.einsum("ni,nip->p", d_scale_d_points, np.nan_to_num(by_pose))
     of_pose = variance * result.adjusted_covariance
     covariance = covariance_in_mm(result.adjusted.translation_mm, of_pose, scale, scale_sigma, slope)

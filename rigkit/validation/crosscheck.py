@@ -1,8 +1,8 @@
-"""The same pair by methods that share nothing with the main path but corners and calibration.
+"""Cross-check a reconstruction with independent methods that share only corners and calibration with it.
 
-pycolmap: two-view geometry, triangulation and bundle adjustment; scale from the squares. Planar PnP: every board's own
-pose, no epipolar geometry at all. Another chain: the same pair reconstructed in other pixels (raw or rectified).
-A difference beyond its own sigma is a failed check; which methods agree among each other says what to suspect.
+pycolmap: two-view geometry, triangulation and bundle adjustment, with the scale from the squares. Planar PnP: the pose
+of every board in each view, without epipolar geometry. Other chain: the same pair in other pixels (raw or rectified).
+A check fails if the difference is too large for its standard deviation. Which methods agree hints at the cause.
 """
 
 from __future__ import annotations
@@ -35,30 +35,30 @@ ADJUSTED = "pycolmap bundle adjustment"
 PNP = "planar PnP"
 OTHER_CHAIN = "other chain"
 CROSS_COVERAGE = 4.0
-"""A data set of eight pairs makes a hundred and fifty comparisons: at four sigmas one such data set in a hundred has a
-false alarm, at three every third, at two each."""
+"""A data set of eight pairs has 150 comparisons: at four sigmas one such data set in a hundred has a false alarm, at
+three sigmas every third, at two every one."""
 REPORTED_FIELDS = (
     *("name", "rotation_difference_deg", "direction_difference_deg", "baseline_mm"),
     *("rms_px", "variance_factor", "used", "excluded"),
 )
-"""What `crosscheck.json` has of a method, beside its angles."""
+"""Fields of a method in `crosscheck.json`, besides its angles."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class IndependentMethod:
-    """What another method found, beside ours.
+    """The result of another method, and its difference to the reconstruction.
 
     Attributes
     ----------
     name : "pycolmap two-view", "pycolmap bundle adjustment", "planar PnP", "rectified chain".
     cam2_from_cam1 : its relative pose, mm.
-    covariance : (6, 6) of (left rotation perturbation rad, translation mm), NaN where that method has none.
-    rotation_difference_deg, direction_difference_deg : angle between its rotation, translation direction, and ours.
+    covariance : (6, 6) of (left rotation perturbation rad, translation mm), NaN if the method has none.
+    rotation_difference_deg, direction_difference_deg : angle to the reconstruction's rotation, translation direction.
     baseline_mm : its baseline, scaled by the squares.
     angles_deg : (a, b) -> (angle between the faces, sigma).
-    rms_px : its root mean square reprojection error, 2-D per observation; NaN where that method has none.
-    used, excluded : matches that took part; matches beyond what that method can represent.
-    variance_factor : observed over predicted variance of the corners, where that method can tell; else NaN.
+    rms_px : its RMS reprojection error, 2-D per observation; NaN if the method has none.
+    used, excluded : number of matches used, and of those that the method cannot represent.
+    variance_factor : observed over predicted variance of the corners; NaN if the method does not estimate it.
     """
 
     name: str
@@ -76,15 +76,15 @@ class IndependentMethod:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CrossCheckReport:
-    """All methods of one pair; cannot be built without a check.
+    """The cross-checks of one pair. Raises InputError without any check.
 
     Attributes
     ----------
     pair_id, affine_method : of the reconstruction.
-    methods : what each found.
-    checks : differences against combined sigmas; `how` names the method.
+    methods : result of each method.
+    checks : differences against their standard deviations; `how` names the method.
     skipped : methods that could not be used, and why.
-    diagnosis : what to look at where a check failed, in words.
+    diagnosis : probable causes of failed checks.
     """
 
     pair_id: str
@@ -105,7 +105,7 @@ class CrossCheckReport:
         return all(check.passed for check in self.checks)
 
     def method(self, name: str) -> IndependentMethod:
-        """Return the method of that name; raises InputError that lists those used."""
+        """Return the method of that name; raises InputError if it was not used."""
         for method in self.methods:
             if method.name == name:
                 return method
@@ -148,16 +148,16 @@ def crosscheck(
     coverage: float = CROSS_COVERAGE,
     seed: int = 0,
 ) -> CrossCheckReport:
-    """Compare a reconstruction with pycolmap, planar PnP, and the same pair through another chain if given.
+    """Compare a reconstruction with pycolmap, planar PnP, and the same pair in another chain if given.
 
-    Raises InputError: none of the methods could be used.
+    Raises InputError if none of the methods could be used.
 
     Parameters
     ----------
     reconstruction : of one pair.
-    other_chain : the same pair reconstructed in other pixels (rectified where this one is raw, or the reverse).
-    shifts : from `calibration_shifts`: a wrong calibration moves the methods apart; None: exact intrinsics.
-    coverage : largest |difference| / its sigma that passes.
+    other_chain : the same pair reconstructed in other pixels (rectified if this one is raw, or the reverse).
+    shifts : from `calibration_shifts`: adds the effect of calibration errors on the difference; None: exact intrinsics.
+    coverage : largest |difference| / sigma that passes.
     seed : of COLMAP's RANSAC.
     """
     methods: list[IndependentMethod] = []
@@ -190,7 +190,7 @@ def crosscheck(
 
 
 def compare_chains(reconstruction: Reconstruction, other: Reconstruction, name: str) -> IndependentMethod:
-    """Return another reconstruction of the same pair as one of the methods."""
+    """Return another reconstruction of the same pair as an independent method."""
     angles, rms = _angles(measure(other)), other.sampson_rms_px
     return _method(name, reconstruction, other.cam2_from_cam1, _covariance(other), angles, rms, len(other.cloud), 0)
 
@@ -209,13 +209,13 @@ def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[Independe
     baseline = adjusted.baseline_mm
     two_view = Rigid3(result.two_view.rotation, result.two_view.translation_mm * baseline)
     covariance = _covariance(adjusted)
-    # What the adjustment leaves in place is as certain as its end, but for a length that it never had.
+    # If bundle adjustment does not change the two-view pose significantly, its covariance holds for that pose too.
     own_sigma = np.array(_pose_sigmas(adjusted.cam2_from_cam1, covariance)[:2])
     own = adjusted.cam2_from_cam1
     turned, rotated = own.rotation @ two_view.rotation.T, angle_between(own.translation_mm, two_view.translation_mm)
     moved = np.rad2deg([rotation_angle(turned), rotated])
     settled = bool((moved <= CROSS_COVERAGE * own_sigma).all())
-    # What the adjustment moves, the two-view estimate has not taken from the corners: an error of its own.
+    # The change by bundle adjustment is an error of the two-view estimate itself.
     step = two_view.step_from(own)
     of_two_view = covariance + np.outer(step, step) if settled else np.full((6, 6), np.nan)
     counts = result.inliers, excluded
@@ -238,9 +238,9 @@ def sigma_of_difference(ours: float, theirs: float, freedom: int) -> float:
 
     Notes
     -----
-    The more certain estimate uses what the corners say in full, so that the error of the other one is its error and an
-    independent part: Var(a - b) = |Var a - Var b| (Hausman, Econometrica 46, 1978). Each variance is estimated from
-    residuals, to the share sqrt(2 / freedom) of itself; as much of the larger one is added.
+    If the more certain estimate is efficient, the error of the other is the sum of its error and an independent part:
+    Var(a - b) = |Var a - Var b| (Hausman, Econometrica 46, 1978). Variances are estimated from residuals, with relative
+    standard deviation sqrt(2 / freedom); that part of the larger variance is added.
     """
     a, b = ours**2, theirs**2
     return float(np.sqrt(abs(a - b) + np.sqrt(2.0 / max(freedom, 2)) * max(a, b)))
@@ -272,7 +272,7 @@ def _method(
 
 
 def _covariance(reconstruction: Reconstruction) -> FloatArray:
-    """Return the covariance (6, 6) of its pose; NaN where nobody knows it."""
+    """Return the covariance (6, 6) of its pose; NaN if unknown."""
     known = reconstruction.pose_covariance
     return np.full((6, 6), np.nan) if known is None else known
 
@@ -288,10 +288,10 @@ def _checks(
     coverage: float,
     shifts: CalibrationShifts | None,
 ) -> list[Check]:
-    """Return the checks of one method, by the sigma of the difference: both saw the same corners.
+    """Return the checks of one method, with the standard deviation of a difference of estimates from the same corners.
 
-    There are none for what a method gives without uncertainty. Epipolar methods take the same calibration in the same
-    manner; only the boards' own poses move apart from ours.
+    Quantities without uncertainty are not checked. Calibration errors change the results of all epipolar methods alike;
+    only for planar PnP do they enter the difference.
     """
     rows_of: list[tuple[str, str, str, tuple[float, float], tuple[float, float]]] = []
     ours = _angles(measured)
@@ -320,8 +320,7 @@ def _checks(
 
 
 def _difference_sigmas(measured: Measured, shifts: CalibrationShifts) -> dict[str, float]:
-    """Return how far the calibrations' uncertainty moves our quantities and those of planar PnP apart, one sigma."""
-
+    """Return the standard deviations, from the calibrations, of the differences between ours and planar PnP."""
     every = (shifts.base, *shifts.moved)
     cloud, boards = shifts.base.cloud, shifts.base.boards
     points = np.array([moved.cloud.points_mm for moved in every])
@@ -346,7 +345,7 @@ def _difference_sigmas(measured: Measured, shifts: CalibrationShifts) -> dict[st
 
 
 def _pose_sigmas(pose: Rigid3, covariance: FloatArray) -> tuple[float, float, float]:
-    """Return the rms angle of the rotation and of the translation's direction, deg, and the sigma of its length, mm."""
+    """Return the RMS error of the rotation and of the translation's direction, deg, and of its length, mm."""
     length = float(np.linalg.norm(pose.translation_mm))
     along = pose.translation_mm / length
     translation = covariance[3:, 3:]
@@ -357,7 +356,7 @@ def _pose_sigmas(pose: Rigid3, covariance: FloatArray) -> tuple[float, float, fl
 
 
 def _diagnosis(reconstruction: Reconstruction, checks: Sequence[Check]) -> tuple[str, ...]:
-    """Return which stage to look at, from which methods disagree with ours."""
+    """Return the probable causes, from which methods disagree with ours."""
     failed = {name: {c.kind for c in checks if c.how == name and not c.passed} for name in {c.how for c in checks}}
     colmap, pnp, chain = (failed.get(name, set()) for name in (ADJUSTED, PNP, OTHER_CHAIN))
     out = []

@@ -1,8 +1,8 @@
-"""What was declared of a pair against what its corners show: pose type, level, sizes and sides of the boards.
+"""Check the declarations of a pair against its corners: pose type, level, sizes and sides of the boards.
 
-A declaration enters the reconstruction as a prior, or names its parts. One that does not hold bends or confuses the
-result without any trace in the measured lengths and angles, so it has to be judged by itself: pose type and level
-always, sizes and sides where they are contradicted.
+Declarations enter the reconstruction as priors or identities. A wrong one can change the result without any trace in
+the measured lengths and angles. So pose type and level are always checked; sizes and sides are reported if
+contradicted.
 """
 
 from __future__ import annotations
@@ -22,34 +22,33 @@ from rigkit.validation.boards import BoardResult
 from rigkit.validation.check import Check, compare
 
 DECLARED = ("pose type", "level", "board size", "layout")
-"""Kinds of checks that are about a declaration, not about a measured quantity."""
+"""Kinds of checks of declarations, not of measured quantities."""
 MAX_DECLARED_SIGMAS = 38.0
-"""A chance below the smallest number there is is told as this many standard deviations."""
+"""Deviation, in standard deviations, for a probability that underflows a float."""
 
 
 BOARDS_AGREE = 0.003
-"""Squares of boards that were measured well come out alike within this part: paper, flatness, the pose."""
+"""Relative standard deviation of the size of well-measured squares: paper, flatness, pose."""
 RULER_MM = 0.25
-"""Standard deviation of a square's side that was stated without one: half of a ruler's millimetre, read at both ends
-of some squares."""
+"""Standard deviation of a square's side if none is stated: half a millimetre of a ruler, read at both ends."""
 SIDE_DEG = 15.0
-"""Standard deviation of the direction that a person calls a side of a scene."""
+"""Standard deviation of the direction of a declared side of a scene."""
 LIMIT_K = 2.0
 MAX_TURNED_DEG = 45.0
-"""Between its two walls a person names the sides of a room's corner alike, however the camera is turned."""
+"""Largest rotation of the camera in the corner of a room for which people name its walls alike."""
 
 
 def contradicted_boards(boards: Mapping[str, BoardResult], layout: Mapping[str, str]) -> tuple[Check, ...]:
-    """Return a failed check for every board whose squares are of another size than declared, against those of the other
-    boards, and for every one that faces another side than the layout says.
+    """Return a failed check for every board whose squares have another size than declared, relative to those of the
+    other boards, and for every board that faces another side than the layout says.
 
-    Of two boards that disagree nobody knows which one is wrong: both fail.
+    If only two boards disagree, both fail.
     """
     ratio = {name: b.size_ratio for name, b in boards.items()}
     checks = []
     sides = _sides(boards, layout)
     for name, found in boards.items():
-        # Of three and more the middle one is right, whichever is wrong.
+        # With three boards or more the median includes the board itself, and is right if one of them is wrong.
         others = [value for other, value in ratio.items() if other != name or len(ratio) > 2]
         side = float(np.sqrt(found.board.square_x_mm * found.board.square_y_mm))
         if others:
@@ -59,7 +58,7 @@ def contradicted_boards(boards: Mapping[str, BoardResult], layout: Mapping[str, 
         if name in layout:
             off = {s: np.degrees(np.arccos(np.clip(found.plane.normal @ to, -1.0, 1.0))) for s, to in sides.items()}
             nearest = min(off, key=lambda s: float(off[s]))
-            # How much nearer the board faces another side: nothing where the declared one is the nearest.
+            # 0 if the declared side is the nearest.
             beyond = (float(off[layout[name]] - off[nearest]), float("nan"))
             words = f"declared {layout[name]}, looks {nearest}"
             known = (0.0, SIDE_DEG, words)
@@ -68,8 +67,11 @@ def contradicted_boards(boards: Mapping[str, BoardResult], layout: Mapping[str, 
 
 
 def _sides(boards: Mapping[str, BoardResult], layout: Mapping[str, str]) -> dict[str, FloatArray]:
-    """Return where each side of the scene faces, turned about the camera's y axis as the listed walls stand, if there
-    are two: in the corner of a room none of them stands where its side does."""
+    """Return the direction that a board on each side of the scene faces.
+
+    If two walls or more are listed, all are rotated about the camera's y axis to fit them: in the corner of a room no
+    wall faces the camera's own axes.
+    """
     sides = {side: np.array(to) for side, to in BOARD_SIDES.items()}
     walls = [(boards[name].plane.normal, sides[side]) for name, side in layout.items() if name in boards]
     walls = [(normal, to) for normal, to in walls if to[1] == 0.0]
@@ -84,9 +86,9 @@ def _sides(boards: Mapping[str, BoardResult], layout: Mapping[str, str]) -> dict
 
 
 def declaration_checks(reconstruction: Reconstruction) -> tuple[tuple[Check, ...], tuple[str, ...]]:
-    """Return the checks of the declared pose type and level, and what could not be checked, in words.
+    """Return the checks of the declared pose type and level, and messages about what could not be checked.
 
-    Nothing is returned where nothing was declared: the general type, or "auto".
+    Both are empty for the general type and "auto", which declare nothing.
     """
     if reconstruction.geometry is None:
         return (), ()
@@ -94,7 +96,7 @@ def declaration_checks(reconstruction: Reconstruction) -> tuple[tuple[Check, ...
     if decision.evidence is None or decision.declared in (PoseType.AUTO, PoseType.GENERAL):
         return (), ()
     checks, unchecked = [], []
-    # Two cameras on one level keep the vertical and the height: what the planar type says, and the others imply.
+    # Two level cameras at one height are the planar type, which the others imply.
     for kind, name, pose_type in (
         ("pose type", f"pose type {decision.declared}", decision.declared),
         ("level", "level", PoseType.PLANAR),
@@ -108,9 +110,9 @@ def declaration_checks(reconstruction: Reconstruction) -> tuple[tuple[Check, ...
 
 
 def _check(kind: str, name: str, found: TypeEvidence, decision: PoseTypeDecision, count: int) -> Check:
-    """Return a declaration as a check: no deviation was declared, its chance gives the standard deviations it is off.
+    """Return the check of a declaration: the declared deviation is 0, and k is that of a normal with the same p-value.
 
-    Several angles are judged at once: their combined sigma is that of the largest one which has the same chance.
+    Several angles are tested at once: their combined sigma is that of a single angle with the same p-value.
     """
     from scipy.special import ndtri
 

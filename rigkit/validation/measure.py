@@ -1,10 +1,10 @@
-"""Angles and distances of a reconstruction, with their standard deviations.
+"""Measure angles and distances of a reconstruction, with their standard deviations.
 
-The corners' own scatter about plane and lattice is observed. The relative pose moves all points together, and so do the
-calibrations where they come with their covariances; else intrinsics are taken as exact. Each independent error that the
-points share moves them by one standard deviation: the squares of what that changes in a quantity add up to its
-variance. Scatter and pose are independent, because the residuals that fix the pose are orthogonal to those that fix the
-points. What pose and calibrations bend of a plane is counted with them, not with the scatter.
+The noise of the corners is their observed scatter about plane and lattice. Errors of the relative pose move all points
+together; so do those of the calibrations if their covariances are known (else intrinsics are exact). The points are
+moved by one standard deviation of each of these independent errors, and the squared changes of a quantity add up to its
+variance. Scatter and pose are independent, because the residuals that determine the pose are orthogonal to those that
+determine the points. Bending of a plane by pose and calibrations counts as their error, not as scatter.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ Boards = dict[str, BoardResult]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Measured:
-    """The boards of a reconstruction, and how they move with the errors that their points share.
+    """The boards of a reconstruction, and their displacement by the errors common to all points.
 
     Attributes
     ----------
     boards : by id, in the order of the reconstruction.
-    moved : the same boards as they are, and then for one standard deviation of each independent error of the relative
-        pose and of the calibrations, where these are known.
+    moved : the boards unperturbed, and then moved by one standard deviation of each independent error of the relative
+        pose and of the calibrations, if known.
     """
 
     boards: Boards
     moved: Mapping[str, BoardPlace]
 
     def with_normals(self, reconstruction: Reconstruction) -> Measured:
-        """Return the same for a reconstruction that differs in its normals only."""
+        """Return the same boards with the normal errors of a reconstruction that differs only in its normals."""
         cloud = reconstruction.cloud
         boards = {
             name: replace(found, normal_errors=normal_errors(cloud.normals[cloud.on_board(name)], found.plane.normal))
@@ -50,12 +50,12 @@ class Measured:
         return replace(self, boards=boards)
 
     def absent(self, *board_ids: str) -> str:
-        """Return in words which of the boards were not reconstructed; empty if all were."""
+        """Return a message about the boards that were not reconstructed; empty if all were."""
         lost = [f"'{b}'" for b in dict.fromkeys(board_ids) if b not in self.boards]
         return f"board {' and '.join(lost)} was not reconstructed" if lost else ""
 
     def count(self, *board_ids: str) -> int:
-        """Return how many points lie on these boards."""
+        """Return the number of points on these boards."""
         return sum(self.boards[b].plane.count for b in dict.fromkeys(board_ids))
 
     def angle_deg(self, a: str, b: str) -> tuple[float, float]:
@@ -75,7 +75,7 @@ class Measured:
 
 
 def _common_variance(moved: FloatArray) -> float:
-    """Return the variance of a quantity from what moves all points together, from its values (1 + K,) as `moved`."""
+    """Return the variance of a quantity by the common errors, from its values (1 + K,) for the boards `moved`."""
     return float(np.sum((moved[1:] - moved[0]) ** 2))
 
 
@@ -84,12 +84,12 @@ def measure(
 ) -> Measured:
     """Fit plane and lattice of every board, and again for each error of the pose, and of the calibrations if given.
 
-    Without `weighted` the planes are the principal ones of the points, all alike and none left out.
+    Without `weighted` planes are fitted by PCA to all points with equal weights.
 
-    Raises DegenerateError where a board has too few points.
+    Raises DegenerateError if a board has too few points.
     """
     cloud = reconstruction.cloud
-    # Only the ratios of these covariances count, as weights across the plane: one pixel is as good a sigma as any.
+    # Only the ratios of these covariances are used, as weights: any sigma will do, here one pixel.
     covariance, by_pose = point_uncertainty(
         cloud.points_mm, reconstruction.cam2_from_cam1, *reconstruction.measured_rays()
     )
@@ -114,7 +114,7 @@ def measure(
 
 
 def _distance(boards: Boards, placed: Mapping[str, BoardPlace], distance: MeasuredDistance) -> FloatArray:
-    """Return a distance (...), mm, between features of `boards` that are where `placed` says."""
+    """Return a distance (...), mm, between features of `boards` with planes and lattices `placed`."""
     a, b = distance.a, distance.b
     if a.is_plane:
         a, b = b, a

@@ -1,8 +1,8 @@
-"""What the paper says of its estimators and pose types, judged on our figures and on the ones that it printed.
+"""Test the paper's claims about estimators and pose types on our figures and on the printed ones.
 
 L. Hajder, "Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations". Figures are mean angles between
-the normals at the corners and the normal of the plane through the points; the paper prints them by plane and capture
-without saying by which estimator, and estimators only by the baselines that they lead to.
+the normals at the corners and the normal of the plane through the points. The paper prints them for each plane and
+capture without naming the estimator; for estimators it prints only baselines.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ CLAIMS = (
     "Standard stereo is the most accurate of the motions of a lens",
 )
 NOTHING_TO_COMPARE = "nothing to compare"
-"""What is said of a claim that no figures are about."""
+"""Verdict on a claim without figures."""
 
 
 class Capture(NamedTuple):
-    """A pair by name, by its lens ("regular" of "regular forward") and by how it was taken."""
+    """A pair: its name, its lens ("regular" of "regular forward") and its motion."""
 
     name: str
     lens: str
@@ -42,23 +42,23 @@ class Capture(NamedTuple):
 
     @classmethod
     def of(cls, pair_id: str, motion: str | None = None) -> Capture:
-        """Take the lens, and the motion where it is not given, from the name."""
+        """Return the capture with the lens, and the motion if not given, from the pair's name."""
         name = pair_id.replace("-", " ")
         head, _, tail = name.rpartition(" ")
         return cls(name, head, tail if motion is None else motion)
 
 
 Errors = Mapping[Capture, Mapping[int, float]]
-"""Number of the plane, from 1 -> degrees."""
+"""Capture -> number of the plane, from 1 -> degrees."""
 
 
 def claim_table(reports: Sequence[ValidationReport], method: str, printed: PaperTables) -> Table:
-    """Return the paper's claims with the verdict of our figures on each, and that of the paper's own.
+    """Return the paper's claims, each with the verdict of our figures and that of the printed ones.
 
     Parameters
     ----------
     reports : pairs x estimators. The lens of a pair is its name up to the last word ("regular" of "regular-forward").
-    method : estimator whose figures stand for planes and pose types.
+    method : estimator whose figures are used for planes and pose types.
     printed : the paper's tables.
     """
     by_baseline = dict(_baseline_errors(printed))
@@ -85,7 +85,7 @@ def claim_table(reports: Sequence[ValidationReport], method: str, printed: Paper
 
 
 def estimator_order_table(reports: Sequence[ValidationReport], printed: PaperTables) -> Table:
-    """Return one row an estimator: mean normal error, mean baseline error, and that of the printed baselines."""
+    """Return a row for each estimator: mean normal error, mean baseline error, and that of the printed baselines."""
     methods = list(dict.fromkeys(r.affine_method for r in reports))
     theirs = dict(_baseline_errors(printed))
     rows = []
@@ -114,7 +114,7 @@ def _of_planes(errors: Errors) -> tuple[Verdict | None, ...]:
 
 
 def _between(errors: Errors, claimed: Callable[[str, str], bool]) -> Iterator[Comparison]:
-    """Yield the captures of one lens whose motions (of the smaller, of the larger) a claim is about."""
+    """Yield the pairs of captures of one lens for whose motions (smaller error, larger error) `claimed` is true."""
     mean = {capture: float(np.mean(list(planes.values()))) for capture, planes in errors.items() if planes}
     for one, other in product(mean, mean):
         if one != other and one.lens == other.lens and claimed(one.motion, other.motion):
@@ -124,7 +124,7 @@ def _between(errors: Errors, claimed: Callable[[str, str], bool]) -> Iterator[Co
 def _better(
     errors: Mapping[str, Mapping[str, float]], good: Sequence[str], bad: Sequence[str], unit: str
 ) -> Iterator[Comparison]:
-    """Yield every good estimator against every bad one, capture by capture."""
+    """Yield the comparisons of every good with every bad estimator for each capture."""
     for name, of in errors.items():
         for one, other in product(good, bad):
             if one in of and other in of:

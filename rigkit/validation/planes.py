@@ -1,12 +1,11 @@
-"""Planes through the points of a board, the angles between them, and how far normals are from them.
+"""Fit planes to the points of a board; compute angles between planes, and errors of normals.
 
-A plane is n . x = offset with a unit normal that faces the camera at the origin. PCA is Open3D's. Where the points'
-uncertainty across the plane is known, the fit is repeated with those weights. Points that lie far off in spite of it
-(the edge of something in front of a board, taken for a corner) are left out: Open3D's RANSAC finds the plane of the
-others.
+A plane is n . x = offset with a unit normal that faces the camera at the origin. PCA is Open3D's. If the points'
+covariances are known, the fit is weighted by their variances along the normal. Outliers (e.g. the edge of an object in
+front of the board, detected as a corner) are found with Open3D's RANSAC and left out.
 
-A point is uncertain by its own noise, and by errors that it shares with all others: those of the pose and of the
-calibrations. What these do to the whole plane is no reason to trust a point less, but what they bend it by is.
+A point has its own noise, and errors common to all points: those of the pose and of the calibrations. Of a common error
+only the part that bends the plane reduces a point's weight, not the part that moves the whole plane.
 """
 
 from __future__ import annotations
@@ -23,25 +22,24 @@ from rigkit.interop.open3d import mean_and_covariance, plane_inliers
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 MIN_POINTS = 4
-"""Three points always lie in a plane and say nothing about how flat it is."""
+"""Three points are always in a plane and do not determine its flatness."""
 MIN_WIDTH = 1e-3
-"""Points whose second principal extent is below this part of the first lie on a line: the plane could turn about it."""
+"""Least ratio of the second to the first principal extent; below, the points are on a line."""
 GROSS = 8.0
-"""A point this many standard deviations off, noise and bending together, is no corner of the board: chance never does
-that."""
+"""Residual, in standard deviations of noise and bending, from which a point is an outlier."""
 MAX_SIGMA_RATIO = 8.0
-"""A point this many times as uncertain as the middle one of its board has a sixty-fourth of its say. Nothing is lost
-without it, and beside an epipole errors are so large that they are no longer linear: nobody knows its true variance."""
+"""Points with more than this times the median sigma are left out. Their weight would be 1/64 at most, and close to an
+epipole errors are so large that their linearised variance is wrong."""
 ROUNDING = 1e-9
-"""Of the distance: exact points have no scatter to judge by."""
+"""Floor of residuals, as a part of the distance: exact points have no scatter."""
 RANSAC_ROUNDS = 2
-"""The first takes its distance from the scatter about the tilted plane, the second from that about the common one."""
+"""The inlier distance of the first comes from the scatter about the tilted plane, that of the second is right."""
 RANSAC_ITERATIONS = 60
-"""With a third of the points bad, no good sample of three is found once in a billion."""
+"""With a third of the points bad, the probability of no good sample of three is 1e-9."""
 WEIGHT_ROUNDS = 3
-"""Weights follow from the plane and the plane from the weights: a third round changes nothing that shows."""
+"""Weights depend on the plane and the plane on the weights: the third round changes nothing visible."""
 NOISE_STEPS, NOISE_TOLERANCE = 100, 1e-10
-"""Until it is near, a step doubles the noise's variance at least; then convergence is quadratic."""
+"""Far from the solution each step at least doubles the variance; close to it convergence is quadratic."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -53,15 +51,15 @@ class Plane:
     normal : (3,) unit, facing the origin (camera 1).
     offset_mm : n . x of its points; negative, because the normal faces the origin.
     centroid_mm : (3,) weighted mean of the points.
-    rms_mm, peak_mm : root mean square and largest distance of the points from the plane: flatness.
-    count : how many points it goes through.
+    rms_mm, peak_mm : RMS and largest distance of the points from the plane: flatness.
+    count : number of points used.
     tangents : (3, 2) unit vectors along the plane.
     scatter : (3, 3) covariance of the plane's height at the centroid (mm) and of its slopes along the tangents (rad),
-        from the points' independent noise alone.
+        from the points' independent noise only.
     weights : (count,) of the points, summing to one.
-    noise_mm2 : (count,) variance of each point across the plane, from its own noise as observed.
-    used : (N,) which of the points given; the others are part of no figure here.
-    gross : how many of those are gross outliers; of the rest it is not known where they are.
+    noise_mm2 : (count,) variance of each point along the normal, from its own noise, scaled to the residuals.
+    used : (N,) mask of the points used.
+    gross : number of outliers; other points that were not used were too uncertain.
     """
 
     normal: FloatArray
@@ -84,18 +82,18 @@ class Plane:
         return np.asarray(np.asarray(points) @ self.normal - self.offset_mm)
 
     def variance_at(self, point: FloatArray) -> float:
-        """Return the variance (mm^2) of where the plane passes a point (3,), from the noise alone."""
+        """Return the variance (mm^2) of the plane's height at a point (3,), from the noise only."""
         row = np.array([1.0, *((point - self.centroid_mm) @ self.tangents)])
         return float(row @ self.scatter @ row)
 
     @property
     def normal_covariance(self) -> Mat3:
-        """(3, 3) rad^2, of the normal's tilt from the points' independent noise; rank 2."""
+        """Covariance (3, 3) rad^2 of the normal from the points' independent noise; rank 2."""
         return np.asarray(self.tangents @ self.scatter[1:, 1:] @ self.tangents.T)
 
     @property
     def sigma_rad(self) -> float:
-        """Root mean square tilt of the normal."""
+        """RMS error of the normal from the points' independent noise."""
         return float(np.sqrt(np.trace(self.normal_covariance)))
 
 
@@ -116,22 +114,22 @@ def fit_plane(
 ) -> Plane:
     """Return the plane through points (N, 3) in the frame of camera 1.
 
-    Raises DegenerateError: fewer than four points, or points on a line.
+    Raises DegenerateError for fewer than four points, or points on a line.
 
     Parameters
     ----------
     points_mm : (N, 3)
-    covariance_mm2 : (N, 3, 3) of each point's own noise, or None. Only what lies across the plane matters, and only the
-        ratios: how large the noise is, the observed scatter tells. Without it all points count, as far off as they are.
-    common_mm : (K, N, 3) how the points move for one standard deviation of each of K independent errors that they share
-        (pose, calibrations), or None: there are none. A point with NaN is left out: how far off it is, nobody knows.
+    covariance_mm2 : (N, 3, 3) of each point's own noise, or None. Only the ratios of the variances along the normal
+        matter: the scale is estimated from the residuals. Without it all points are used with equal weights.
+    common_mm : (K, N, 3) displacement of the points by one standard deviation of each of K independent errors common to
+        all (pose, calibrations), or None. A point with NaN is left out: its error is unknown.
 
     Notes
     -----
-    Weights are 1 / (s^2 n^T C_k n + sum b^2): s^2 scales the noise to what is observed, and b is what the weighted fit
-    does not follow of each common move. A plane's heights and slopes are T e, with e the residuals across it,
-    T = (A^T W A)^-1 A^T W and rows (1, t1 . (x_k - c), t2 . (x_k - c)) of A. Their covariance from the noise is
-    T diag(s^2 n^T C_k n) T^T; their error from what is common is T times the moves: see `fit_moved`.
+    Weights are 1 / (s^2 n^T C_k n + sum b^2): s^2 scales the noise to the residuals, and b is the residual of the
+    weighted fit to each common displacement. A plane's height and slopes are T e, with e the residuals along the
+    normal, T = (A^T W A)^-1 A^T W and rows (1, t1 . (x_k - c), t2 . (x_k - c)) of A. Their covariance from the noise is
+    T diag(s^2 n^T C_k n) T^T; their error from the common errors is T times the displacements: see `fit_moved`.
     """
     points = as_array(points_mm, (None, 3), "points_mm")
     common = np.zeros((0, *points.shape)) if common_mm is None else np.asarray(common_mm, dtype=np.float64)
@@ -149,9 +147,9 @@ def fit_plane(
 
 
 def fit_moved(points_mm: Points, like: Plane) -> tuple[Normals, FloatArray]:
-    """Return the normal (..., 3) and the offset (...), mm, of the plane of points (..., N, 3).
+    """Return the normal (..., 3) and the offset (...), mm, of the planes of points (..., N, 3).
 
-    They are those that `like` was fitted to, moved a little, and keep their weights.
+    These are perturbed copies of the points that `like` was fitted to, and keep their weights.
     """
     centroid, axes = _principal(np.asarray(points_mm)[..., like.used, :], like.weights)
     normal = _facing(axes[..., 0], centroid)
@@ -161,7 +159,7 @@ def fit_moved(points_mm: Points, like: Plane) -> tuple[Normals, FloatArray]:
 def _principal(points: Points, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
     """Return centroid and principal axes (columns, the normal first) of points (..., N, 3).
 
-    Their `weights` (N,) sum to one; without, all points are alike, and there is one set (N, 3) of them.
+    `weights` (N,) sum to one; without them weights are equal, and the points must be one set (N, 3).
     """
     n = points.shape[-2]
     if n < MIN_POINTS:
@@ -179,10 +177,10 @@ def _principal(points: Points, weights: FloatArray | None = None) -> tuple[Float
 
 
 def _weights(points: Points, covariance: FloatArray, common: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the points' weights, summing to one, and the variance of each across the plane from its noise, mm^2."""
+    """Return the points' weights, summing to one, and the variance of each along the normal from its noise, mm^2."""
     centroid, axes = _principal(points)
-    # A point that the common errors move far would pull the first plane to itself, and look unmoved from there: so the
-    # whole move counts in the first round.
+    # With zero weights the whole common displacement counts in the first round: a point with a large one would attract
+    # the first plane, and so seem to have a small one.
     weights = np.zeros(len(points))
     for _ in range(WEIGHT_ROUNDS):
         seen = _Across.of(points, covariance, common, centroid, axes)
@@ -195,14 +193,14 @@ def _weights(points: Points, covariance: FloatArray, common: FloatArray) -> tupl
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Across:
-    """What is seen of points across a plane near theirs.
+    """Residuals of points along the normal of a plane, and their variances.
 
     Attributes
     ----------
     residuals : (N,) mm.
-    variance : (N,) mm^2, of their noise as it was given.
+    variance : (N,) mm^2, of their noise as given.
     design : (N, 3) rows (1, t1 . (x - c), t2 . (x - c)).
-    common : (N, K) mm, the common moves.
+    common : (N, K) mm, the common displacements.
     floor_mm : rounding.
     """
 
@@ -226,16 +224,16 @@ class _Across:
         )
 
     def bending(self, weights: FloatArray) -> FloatArray:
-        """Return what a fit with these weights (N,) leaves of the common moves, (N, K) mm; all if they are zero."""
+        """Return the residuals (N, K) mm of a fit with weights (N,) to the common displacements."""
         root = np.sqrt(weights)[:, None]
         follows, *_ = np.linalg.lstsq(root * self.design, root * self.common, rcond=None)
         return np.asarray(self.common - self.design @ follows)
 
     def noise_variance(self) -> float:
-        """Return s^2: of the noise alone, in units of `variance`; what is common bends the points, but is no noise.
+        """Return the variance s^2 of the noise without the common errors, in units of `variance`.
 
-        Divided by the root of `variance`, the residuals have the covariance V = s^2 1 + H H^T. s^2 is that at which
-        e^T V^-1 e, in the space that no plane follows, has its expectation.
+        Divided by the root of `variance`, the residuals have the covariance V = s^2 1 + H H^T. s^2 is the value for
+        which e^T V^-1 e, in the space orthogonal to all planes, equals its expectation.
         """
         sigma = np.sqrt(self.variance)
         basis, _ = np.linalg.qr(self.design / sigma[:, None])
@@ -244,8 +242,8 @@ class _Across:
         modes, sizes, _ = np.linalg.svd(both[:, 1:], full_matrices=False)
         along, free = (modes.T @ both[:, 0]) ** 2, len(both) - 3
         rest = max(float(both[:, 0] @ both[:, 0] - along.sum()), 0.0)
-        # rest / s^2 + sum along / (s^2 + sizes^2) = free. The left side falls and is convex: Newton's steps from below
-        # the root stay below. Where the common errors can explain everything, there is no rest.
+        # rest / s^2 + sum along / (s^2 + sizes^2) = free. The left side is decreasing and convex: Newton's steps from
+        # below the root stay below. `rest` is 0 if the common errors can explain all residuals.
         variance = max(rest / free, float(np.mean(self.floor_mm / sigma)) ** 2)
         for _ in range(NOISE_STEPS):
             spread = variance + sizes**2
@@ -264,10 +262,10 @@ def _variance_across(normal: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _judged(points: Points, covariance: FloatArray, common: FloatArray) -> tuple[BoolArray, BoolArray]:
-    """Return which points are no gross outliers (N,), and which are certain enough to tell something (N,).
+    """Return a mask (N,) of the inliers, and one (N,) of the points that are certain enough to use.
 
-    Outliers tilt the plane that they would be judged by: they are judged by one that most points share. How far what is
-    common bends the points away from that plane is no evidence against them.
+    Outliers would tilt the plane of all points, so residuals are from a plane that most points share. Bending by the
+    common errors is part of the expected residual.
     """
     centroid, axes = _principal(points)
     floor = ROUNDING * float(np.linalg.norm(centroid))
@@ -286,7 +284,7 @@ def _judged(points: Points, covariance: FloatArray, common: FloatArray) -> tuple
 
 
 def _plane(points: Points, weights: FloatArray, noise_mm2: FloatArray | None, used: BoolArray) -> Plane:
-    """Return the plane of points with weights; their noise is estimated, equal for all, where it is not given."""
+    """Return the plane of weighted points; if their noise is not given, equal noise is estimated."""
     equal = noise_mm2 is None
     centroid, axes = _principal(points, None if equal else weights)
     normal = _facing(axes[:, 0], centroid)
@@ -316,15 +314,12 @@ def _facing(normal: Normals, point: Points) -> Normals:
 
 
 def face_angle(normal_a: Normals, normal_b: Normals) -> FloatArray:
-    """Return the angle (...) between two faces with normals (..., 3), radians, as a protractor across them shows it.
-
-    It is pi minus the angle between the normals that face the camera.
-    """
+    """Return the angle (...) between two faces, radians: pi minus the angle between their normals (..., 3)."""
     return np.asarray(np.pi - angle_between(normal_a, normal_b))
 
 
 def angle_jacobian(normal_a: FloatArray, normal_b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return d face angle / d normal of `a` and of `b`, (3,) each; zero where the planes are parallel."""
+    """Return d face angle / d normal of `a` and of `b`, (3,) each; zero for parallel planes."""
     sine = float(np.linalg.norm(np.cross(normal_a, normal_b)))
     if sine < 1e-12:
         return np.zeros(3), np.zeros(3)
@@ -335,7 +330,7 @@ def angle_jacobian(normal_a: FloatArray, normal_b: FloatArray) -> tuple[FloatArr
 def normal_errors(normals: Normals, plane_normal: FloatArray) -> NormalErrors:
     """Return statistics of the angles between normals (N, 3) and that of their plane (3,).
 
-    Raises DegenerateError where there are no normals.
+    Raises DegenerateError without normals.
     """
     array = as_array(normals, (None, 3), "normals")
     if len(array) == 0:

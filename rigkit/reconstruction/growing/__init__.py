@@ -1,1 +1,1 @@
-"""A dense cloud of a scene without boards: matches that grow over surfaces, posed again, fused over views."""
+"""Dense clouds of scenes without boards: grow matches over surfaces, refine the pose, fuse views."""

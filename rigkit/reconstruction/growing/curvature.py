@@ -1,4 +1,4 @@
-"""Grown pairs without the curvature of what they were aligned by (`affine.curvature`)."""
+"""Correct grown pairs for the curvature of the surface in their alignment windows (`affine.curvature`)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rigkit.reconstruction.growing.surface import PairRays
 
 
 def without_curvature(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3) -> GrownPatches:
-    """Return the pairs, at their nodes or `centred`, with places in image 2 where their nodes' points are."""
+    """Return the pairs, at their nodes or `centred`, with corrected pixels in image 2."""
     planes = PairRays.of(grown, camera1, camera2).planes(cam2_from_cam1)
     at = grown.valid & np.isfinite(planes[..., 0])
     place = grown.pixels1[at]

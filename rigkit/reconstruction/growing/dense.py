@@ -1,4 +1,8 @@
-"""From two images and seeds to a dense oriented cloud: grow, pose again, grow with what the pose says, fit planes."""
+"""Reconstruct a dense oriented cloud from two images and seed matches.
+
+Pairs are grown, the pose is estimated from them, pairs are grown again along its epipolar lines, and local planes are
+fitted.
+"""
 
 from __future__ import annotations
 
@@ -36,39 +40,38 @@ from rigkit.relative_pose.solvers.pose import essential_from_pose, translation_b
 from rigkit.relative_pose.solvers.weights import affinity_residuals
 
 POSE_STEP = 8
-"""Nodes of the pairs that the pose is estimated from, px: spread evenly, unlike features."""
+"""Node spacing, px, of the pairs for the pose: evenly spread, unlike features."""
 CLOUD_STEP = 3
 CLOUD_NODES = 80_000
-"""Nodes of a cloud beyond which they lie further apart: of images of more than 1 MP."""
+"""Largest number of nodes of a cloud: their spacing grows for images of more than 1 MP."""
 MAX_DISTANCE_PX = 0.7
-"""From the epipolar line, of a pair that is taken; more where the correspondences show more noise."""
+"""Largest epipolar distance of a pair; more if the correspondences are noisier."""
 MIN_GROWN = 100
-"""Pairs grown, from which on the pose is estimated from them."""
+"""Least number of grown pairs for the pose."""
 MOVED_RAD = np.deg2rad(0.5)
-"""Change of the pose by which what was grown with the old one is grown again."""
+"""Change of the pose from which pairs are grown again."""
 MAX_GROWTHS = 3
 POSE_STEP_RAD = 1e-5
-"""For differences of planes: far above rounding, far below where they bend."""
+"""Step of forward differences of planes: far above rounding, far below any curvature."""
 EXACT = 1e-12
-"""Share of the pose's largest variance up to which another is rounding: one more axis would cost as much as any."""
+"""Variances of the pose below this part of the largest are rounding and get no axis."""
 SHARED_ERROR = 0.5
-"""Of the errors of pairs, in their median: no pair is much better than the others (measured: by likelihood)."""
+"""Error added to that of every pair, over their median: no pair is much better than others (by maximum likelihood)."""
 WINDOW_OVERLAP = WINDOW_AREA_PX / POSE_STEP**2
-"""Pairs on the nodes of a pose whose windows share their pixels."""
+"""Number of pairs for the pose whose windows share the same pixels."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class DenseScene:
-    """A dense cloud, and the grid that it grew on.
+    """A dense cloud, and the grid that it was grown on.
 
     Attributes
     ----------
-    scene : as without growing; its correspondences are those of `grown`, row by row.
+    scene : the scene with the dense cloud; its correspondences are those of `grown`, row by row.
     grown : the pairs.
-    surface : the planes at their nodes, in the unit of the scene; row k of the cloud is node `nodes[k]` (row-major).
-    nodes : (K,) indices.
-    of_calibrations : of the K points' sigmas (mm, rad) what the calibrations have in them: an error of all points
-        together.
+    surface : the planes at their nodes, in the unit of the scene.
+    nodes : (K,) row-major index of the node of each point of the cloud.
+    of_calibrations : part of the K points' sigmas (mm, rad) by the calibrations, which is common to all points.
     """
 
     scene: SceneReconstruction
@@ -83,9 +86,9 @@ class DenseScene:
         return self.grown.correspondences()
 
     def maps(self) -> dict[str, NDArray[np.float64]]:
-        """Return depth (along the axis of camera 1), range and normals at the pixels of image 1 that are nodes.
+        """Return depth (along the axis of camera 1), range and normals at the nodes in image 1.
 
-        Arrays (R, C) and (R, C, 3) with `pixels` (R, C, 2); NaN where the surface is not known.
+        Arrays (R, C) and (R, C, 3) with `pixels` (R, C, 2); NaN without a surface.
         """
         r = self.scene.reconstruction
         step, shape = self.grown.step, self.surface.valid.shape
@@ -113,11 +116,10 @@ def grow_scene(
 ) -> DenseScene:
     """Return the dense cloud of two images whose `seeds` gave the reconstruction `sparse`.
 
-    With `pose_is_known` its pose is not estimated again. With `calibrations`, the cameras as they are known (two of a
-    rig: with their pose, which is known then), what these leave open is in the covariance of the pose and in the
-    cloud's sigmas.
+    With `pose_is_known` the pose is not estimated again. With `calibrations`, the cameras with their covariance (for a
+    rig including the pose, which is then known), their uncertainty is propagated to the pose and the cloud's sigmas.
 
-    Raises DegenerateError: nothing grows from the seeds.
+    Raises DegenerateError if nothing grows from the seeds.
     """
     r = sparse.reconstruction
     view1 = GrowingView.of(grey_of(image1, "image 1"), r.camera1)
@@ -201,7 +203,7 @@ def _pose_from_grown(
     sparse: SceneReconstruction,
     fixed: KnownPose | None,
 ) -> _EvenPose:
-    """Return the pose of evenly spread pairs, grown until it does not move any more; where it is `fixed`, that."""
+    """Return the pose of evenly spread pairs, which are grown again until it converges, or the `fixed` pose."""
     r = sparse.reconstruction
     pose = Rigid3(r.cam2_from_cam1.rotation, unit(r.cam2_from_cam1.translation_mm))
     cameras = view1.camera, view2.camera
@@ -218,11 +220,11 @@ def _pose_from_grown(
         if fixed is not None:
             kept = known_scene_pose(matches, fixed)
             even = kept.matches.select(kept.inliers)
-            # What pairs err by together across their epipolar lines they err by along them too.
+            # The pose is kept; this measures the lens errors across epipolar lines, which also act along them.
             there = kept.refined.cam2_from_cam1
             found = pose_with_lens_errors(even, cameras, there, PoseType.STANDARD, None, WINDOW_OVERLAP)
             return _EvenPose(replace(found, cam2_from_cam1=there, covariance=kept.refined.covariance), even)
-        # Without a level a type holds exactly.
+        # Without a level the type is exact.
         level = r.level_sigma_rad or 0.0
         fit = fit_scene_pose(_floored(matches), r.pose_type, level, np.random.default_rng(0), start=pose)
         even = fit.matches.select(fit.inliers)
@@ -239,7 +241,7 @@ def _pose_from_grown(
 
 
 def _floored(matches: Matches) -> Matches:
-    """Return the matches with what images do not tell of a patch's error: half of the usual error in addition."""
+    """Return the matches with SHARED_ERROR added to their sigmas, which the images do not show."""
     sigma = np.hypot(matches.sigma1_px, SHARED_ERROR * np.median(matches.sigma1_px))
     return replace(matches, sigma1_px=sigma, sigma2_px=sigma)
 
@@ -249,16 +251,16 @@ def _distances(matches: Matches, pose: Rigid3) -> FloatArray:
 
 
 def _knowledge(matches: Matches, pose: Rigid3) -> LineKnowledge:
-    """Return what the pose says of pairs, as well as the pairs that gave it agree with it."""
-    # Sampson's distance is shared by both images; growing moves the place in image 2 alone.
+    """Return the epipolar constraint of the pose, with sigmas from the residuals of its pairs."""
+    # Sampson's distance moves both pixels; growing moves only that in image 2.
     sigma = np.sqrt(2.0) * SIGMA_OF_MEDIAN * float(np.median(np.abs(_distances(matches, pose))))
     sigma_A = SIGMA_OF_MEDIAN * float(np.nanmedian(np.abs(affinity_residuals(matches, essential_from_pose(pose)))))
     return LineKnowledge(essential_from_pose(pose), max(MAX_DISTANCE_PX, GATE * sigma), sigma, sigma_A)
 
 
 def _moved_planes(rays: PairRays, pose: Rigid3, covariance: FloatArray) -> FloatArray:
-    """Return how the nodes' own planes change (R, C, 3, K) with the pose, by a standard deviation along each of the K
-    axes of its covariance along which it is not exact."""
+    """Return the change (R, C, 3, K) of the nodes' own planes by one standard deviation of the pose along each of the K
+    principal axes of its covariance that are not exact."""
     length = float(np.linalg.norm(pose.translation_mm))
     t = pose.translation_mm / length
     directions = np.zeros((5, 6))
@@ -273,7 +275,7 @@ def _moved_planes(rays: PairRays, pose: Rigid3, covariance: FloatArray) -> Float
 
     changes = np.zeros((*rays.grown.valid.shape, 3, len(moves)))
     here = rays.planes(pose) if len(moves) else changes
-    # Sigmas need no better derivatives than forward differences.
+    # Forward differences suffice for sigmas.
     for k, axis in enumerate(moves):
         change = planes(POSE_STEP_RAD * axes[:, axis] @ directions) - here
         changes[..., k] = np.sqrt(variances[axis]) / POSE_STEP_RAD * change
@@ -281,15 +283,15 @@ def _moved_planes(rays: PairRays, pose: Rigid3, covariance: FloatArray) -> Float
 
 
 class _Moved(NamedTuple):
-    """Cameras moved by one standard deviation along an axis of their covariance, and the pose (6,) that moves with
-    them: left rotation perturbation, rad, and translation."""
+    """Cameras moved by one standard deviation along an axis of their covariance, and the resulting change (6,) of the
+    pose: left rotation perturbation, rad, and translation."""
 
     cameras: tuple[Camera, Camera]
     change: FloatArray
 
 
 def _moves(even: _EvenPose, r: Reconstruction, moved: list[PosedPair], *, pose_is_known: bool) -> list[_Moved]:
-    """Return the moved cameras, and how the pose moves with them: as it is told, or as the same pairs move it."""
+    """Return the moved cameras with the change of the pose: that of `moved` if it is known, else by the same pairs."""
     here, out = r.cam2_from_cam1, []
     for camera1, camera2, there in moved:
         if pose_is_known:
@@ -302,7 +304,7 @@ def _moves(even: _EvenPose, r: Reconstruction, moved: list[PosedPair], *, pose_i
 
 
 def _change_of_pose(even: _EvenPose, r: Reconstruction, cameras: tuple[Camera, Camera]) -> FloatArray:
-    """Return by how much (6,) the pose of the same pairs differs with other cameras."""
+    """Return the change (6,) of the pose of the same pairs with other cameras."""
     pose, m = even.pose.cam2_from_cam1, even.matches
     t = pose.translation_mm
     seen = np.flatnonzero(seen_by_all([cameras], m.pixels1, m.pixels2))
@@ -313,7 +315,7 @@ def _change_of_pose(even: _EvenPose, r: Reconstruction, cameras: tuple[Camera, C
 
 
 def _planes_of_moves(rays: PairRays, pose: Rigid3, moves: list[_Moved]) -> FloatArray:
-    """Return how the nodes' own planes change with each move (R, C, 3, M)."""
+    """Return the change (R, C, 3, M) of the nodes' own planes by each move."""
     planes = np.zeros((*rays.grown.valid.shape, 3, len(moves)))
     here = rays.planes(pose) if moves else planes
     for k, (cameras, change) in enumerate(moves):
@@ -323,8 +325,8 @@ def _planes_of_moves(rays: PairRays, pose: Rigid3, moves: list[_Moved]) -> Float
 
 
 class _UncertainPlanes(NamedTuple):
-    """Planes at nodes, and how they change with each axis of the pose's covariance (R, C, 3, K) and with each move of
-    the calibrations (R, C, 3, M)."""
+    """Planes at nodes, and their changes by each axis of the pose's covariance (R, C, 3, K) and by each move of the
+    calibrations (R, C, 3, M)."""
 
     surface: GrownSurface
     by_pose: FloatArray
@@ -334,7 +336,7 @@ class _UncertainPlanes(NamedTuple):
 def _cloud(
     grown: GrownPatches, planes: _UncertainPlanes, image1: NDArray[np.generic]
 ) -> tuple[OrientedCloud, NDArray[np.int64], tuple[FloatArray, FloatArray]]:
-    """Return the cloud of the planes whose range is known, their nodes, and what of its sigmas (mm, rad) is of the
+    """Return the cloud of the planes with a certain range, their nodes, and the part of its sigmas (mm, rad) by the
     calibrations."""
     surface = planes.surface
     at = np.flatnonzero(surface.valid.ravel())

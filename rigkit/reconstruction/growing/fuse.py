@@ -1,10 +1,9 @@
-"""Clouds of several pairs of views with known poses, fused into one.
+"""Fuse the clouds of several pairs of views with known poses.
 
-What one pair says of a place, another pair may have said before: then the two are one point. A point of a later cloud
-is looked for where the camera of an earlier one saw it. Where its distance from the surface there is no more than the
-errors of both along the surface's normal, the two are merged by these errors, and their colours with them. Distances
-across the surface do not matter: both clouds are samples of it. What calibrations err by parts clouds as noise does,
-but merging does not average it away: all points of a pair have it together, and pairs with a camera in common, too.
+A point of a later cloud is projected into the camera of an earlier one. If its distance to the surface there, along the
+normal, is within the errors of both, the two are merged, weighted by these errors. Distances along the surface do not
+matter, because both clouds are samples of it. Calibration errors separate clouds as noise does, but are not averaged by
+merging: they are common to all points of a pair, and to pairs with a common camera.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ from rigkit.reconstruction.growing.dense import DenseScene
 from rigkit.reconstruction.scene_pose import GATE
 
 MAX_TURN_DEG = 45.0
-"""Between the normals of two points of one surface: both sides of a thin board are two surfaces."""
+"""Largest angle between normals of merged points: both sides of a thin board are two surfaces."""
 REACH_STEPS = 1.0
-"""In steps of the earlier cloud's nodes: further from its nearest one it saw nothing."""
+"""Largest distance to the nearest node of the earlier cloud, in its node spacing."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -36,10 +35,11 @@ class PosedCloud:
 
     Attributes
     ----------
-    cloud : N points. pixels : (N, 2) of its first image, where each was seen; nodes were `step_px` apart.
-    of_calibrations : what of its sigmas (N,) (mm, rad) is of the calibrations.
-    camera, world_from_cam : the first camera, and where it stands.
-    pose_covariance : (6, 6) of that place: left rotation perturbation, rad, and translation, mm.
+    cloud : N points.
+    of_calibrations : part of its sigmas (N,) (mm, rad) by the calibrations.
+    pixels, step_px : (N, 2) of the points in the first image, and the node spacing.
+    camera, world_from_cam : the first camera and its pose.
+    pose_covariance : (6, 6) of that pose: left rotation perturbation, rad, and translation, mm.
     """
 
     cloud: OrientedCloud
@@ -52,7 +52,7 @@ class PosedCloud:
 
     @classmethod
     def of(cls, dense: DenseScene, world_from_cam1: Rigid3, pose_covariance: FloatArray | None = None) -> PosedCloud:
-        """Return the cloud of a dense scene whose first camera stands there, exactly so without a covariance."""
+        """Return the cloud of a dense scene with the pose of its first camera, exact without a covariance."""
         r = dense.scene.reconstruction
         return cls(
             cloud=r.cloud,
@@ -72,8 +72,8 @@ class FusedCloud:
     Attributes
     ----------
     cloud : in the world's frame; every normal faces the camera that saw its point.
-    pairs_of : (N,) int, how many pairs' points are in each.
-    source : (N,) int, the cloud that a point was in first.
+    pairs_of : (N,) int, number of pairs whose points were merged into each.
+    source : (N,) int, index of the cloud that each point is from.
     """
 
     cloud: OrientedCloud
@@ -83,13 +83,14 @@ class FusedCloud:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _MergedSurface:
-    """A cloud in the world, and what later clouds add to it.
+    """A cloud in the world frame, and the weighted sums of the points merged into it.
 
     Attributes
     ----------
-    sigma, errors, variance : (N,), (N, 3), (N,) of noise: of points, along rays, and squared along normals.
-    common : (N, 3, 3) mm^2 of the calibrations. common_sums : (N,) of its largest axes, weighted as points are.
-    common_rad : (N,), of normals.
+    sigma, errors, variance : (N,) sigma of the points' noise, (N, 3) the same along rays, (N,) variance along normals.
+    common : (N, 3, 3) mm^2 covariance by pose and calibrations.
+    common_sums : (N,) weighted sum of the largest standard deviations of `common`.
+    common_rad : (N,) sigma of the normals by pose and calibrations.
     """
 
     posed: PosedCloud
@@ -111,14 +112,13 @@ class _MergedSurface:
 
 
 def fuse_clouds(clouds: Sequence[PosedCloud]) -> FusedCloud:
-    """Return the clouds of several pairs as one, what they say twice merged by covariance.
+    """Return the clouds of several pairs as one, with points of the same surface merged by their covariances.
 
-    Sigmas of merged points are those of independent errors: poses and calibrations that err are not averaged away.
-    Raises InputError for no clouds.
+    Merging reduces only independent noise, not the errors of poses and calibrations. Raises InputError without clouds.
     """
     if not clouds:
         raise InputError("clouds: there is none to fuse")
-    # The clouds that know their points best come first: they see what is merged into them.
+    # The most certain clouds come first: others are merged into them.
     order = sorted(range(len(clouds)), key=lambda k: float(np.median(clouds[k].cloud.sigma_mm)))
     surfaces: list[_MergedSurface] = []
     for k in order:
@@ -162,20 +162,20 @@ def _surface(posed: PosedCloud) -> _MergedSurface:
 
 
 def _variance(errors: FloatArray, normals: FloatArray) -> FloatArray:
-    """Return the variance of a distance along normals for errors along rays, infinite where it is not known."""
+    """Return the variance of a distance along normals for errors along rays; infinite if unknown."""
     variance = np.sum(errors * normals, axis=1) ** 2
     return np.where(np.isfinite(variance) & (variance > 0.0), variance, np.inf)
 
 
 def _information(sigma: FloatArray) -> FloatArray:
-    """Return 1 / sigma^2, that of the median where none is known."""
+    """Return 1 / sigma^2, with the median of the known sigmas for unknown ones."""
     known = np.isfinite(sigma) & (sigma > 0.0)
     typical = float(np.median(sigma[known])) if known.any() else 1.0
     return np.asarray(1.0 / np.where(known, sigma, typical) ** 2)
 
 
 def _merge(earlier: _MergedSurface, later: _MergedSurface) -> None:
-    """Add to `earlier` what `later` says of its points, and keep these no more in `later`."""
+    """Merge points of `later` into `earlier`, and remove them from `later`."""
     from scipy.spatial import cKDTree
 
     posed = earlier.posed

@@ -1,14 +1,13 @@
-"""What a calibrated lens may still be off by: smooth displacements over its image, in families of like shape.
+"""Model the remaining errors of a calibrated lens: smooth displacements over its image, in three families.
 
-What a calibration leaves is mostly along the radius and alike all around (a curve too stiff, a focal length), then of a
-lens whose axis or plane is tilted (of first order in the azimuth; D. C. Brown, "Decentering Distortion of Lenses",
-1966), then anything smooth. The part that is a rotation of the camera is kept apart where the pose is free to follow
-it: no pair of images shows it then. A pose that is told does not follow, and pairs are off by that part too.
+Calibration errors are mostly radial and rotationally symmetric (a too stiff curve, the focal length), then those of a
+tilted lens or sensor (first order in the azimuth; D. C. Brown, "Decentering Distortion of Lenses", 1966), then any
+smooth displacement. If the pose is free, the part equal to a rotation of the camera is separated, because no image pair
+shows it. A fixed pose does not absorb that part, so that it displaces the pairs.
 
-These are not the displacements with which calibrations count (`kernels.departures`), though they were tried: alone they
-leave poses twice as far off, for pairs show ripples that no such polynomial is. Beside the waves over the image they do
-as well, but state poses too surely, perhaps as powers of the radius are large at its rim alone, where boards hardly are
-and pairs are many (docs/pages/accuracy-clouds.md, "Tried and left out").
+The displacements of calibrations (`kernels.departures`) were tried instead: alone they double the pose error, because
+pairs show ripples that such polynomials do not have. Together with the waves over the image the pose is as accurate,
+but its covariance too small (docs/pages/accuracy-clouds.md, "Tried and left out").
 """
 
 from __future__ import annotations
@@ -24,21 +23,20 @@ from rigkit.geometry.rotation import cross
 RADIAL_WAVES = 4
 TILTED_WAVES = 2
 MAX_WAVES = 4
-"""Half waves of a family: along the radius, and over the image, both ways together. Narrower ones are noise to
-a pose."""
+"""Half waves of each family, along the radius or in both image directions together. Shorter ones do not affect a
+pose."""
 IMAGE_GRID = 24
-"""Pixels to either side that say what a displacement is over the image."""
+"""Pixels along each side of the grid over which displacements are normalised."""
 
 
 class ErrorModes(NamedTuple):
-    """Displacements that a lens may be off by, each of unit standard deviation in a family of 1 px rms over the image.
+    """Modes of lens errors with unit standard deviation, scaled so that each family has 1 px RMS over the image.
 
     Attributes
     ----------
-    displacements : (N, 2, K) px at the pixels that were asked for.
-    turns : (3, K) rad by which the camera turns with each mode; the displacements are without it. Zero where they are
-        with it.
-    families : (K,) 0 along the radius, 1 of a tilt, 2 anything smooth.
+    displacements : (N, 2, K) px at the given pixels.
+    turns : (3, K) rad, rotation of the camera that was removed from each mode; zero if none was.
+    families : (K,) 0 radial, 1 tilt, 2 smooth.
     """
 
     displacements: FloatArray
@@ -47,9 +45,9 @@ class ErrorModes(NamedTuple):
 
 
 def error_modes(camera: Camera, pixels: Pixels, *, free_to_turn: bool) -> ErrorModes:
-    """Return the modes at pixels (N, 2), which all have rays and tell how much of the image is used.
+    """Return the modes at pixels (N, 2), which must have rays; they determine the used radius of the image.
 
-    Of a camera that is not `free_to_turn` they are with what a turn of it does to the image.
+    If the camera is `free_to_turn`, the rotation of the camera closest to each mode is removed.
     """
     axis, valid = camera.project(np.array([0.0, 0.0, 1.0]))
     centre = axis if valid else image_center(camera.size_px)
@@ -74,7 +72,7 @@ def error_modes(camera: Camera, pixels: Pixels, *, free_to_turn: bool) -> ErrorM
 
 
 def _modes(pixels: Pixels, centre: FloatArray, radius: float, size_px: tuple[int, int]) -> tuple[FloatArray, IntArray]:
-    """Return displacements (N, 2, K) and their families; the variance falls with the wave number."""
+    """Return displacements (N, 2, K) and their families; the variance decreases with the wave number."""
     away = pixels - centre
     distance = np.linalg.norm(away, axis=1)
     outwards = away / np.maximum(distance, 1e-9)[:, None]
@@ -95,8 +93,8 @@ def _modes(pixels: Pixels, centre: FloatArray, radius: float, size_px: tuple[int
 
 
 def _smooth_waves(pixels: Pixels, size_px: tuple[int, int]) -> FloatArray:
-    """Return cosines (N, W) over an image at pixels (N, 2), times the root of a variance that falls with their wave
-    number: a wide bowl is likelier than ripples."""
+    """Return cosines (N, W) over an image at pixels (N, 2), times a standard deviation that decreases with their wave
+    number."""
     number = np.arange(MAX_WAVES + 1)
     along, down = (np.cos(np.pi * number * (x[:, None] + 0.5) / s) for x, s in zip(pixels.T, size_px, strict=True))
     i, j = np.nonzero(number[:, None] + number <= MAX_WAVES)

@@ -1,8 +1,8 @@
-"""Planes in the holes of a surface: those of neighbours, where the pixels agree with them.
+"""Fill holes of a surface with planes of neighbours that agree with the pixels.
 
-A plane that is right at one place mostly is at the next (M. Bleyer, C. Rhemann and C. Rother, "PatchMatch Stereo",
-BMVC 2011). Beside an edge of depth windows show two surfaces, and the plane fitted there is of neither; those from
-further inside may go on to the edge. They are judged as all planes are.
+Neighbouring pixels mostly share a plane (M. Bleyer, C. Rhemann and C. Rother, "PatchMatch Stereo", BMVC 2011). Windows
+at a depth edge contain two surfaces, and the plane fitted there is of neither; planes from further inside may extend to
+the edge. They are tested as all planes are.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from rigkit.reconstruction.growing.surface import GrownSurface
 from rigkit.reconstruction.growing.sweep import Sweep, with_pairs
 
 REACHES = (1, 2, 4)
-"""Nodes, in eight directions, from which planes come: to the reach of a plane's own fit."""
+"""Distances, in nodes, of the neighbours in eight directions: up to the reach of a plane's fit."""
 OFFSETS = np.array([(r * i, r * j) for r in REACHES for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
 MAX_OF_RIVAL_PROPAGATED = 1.8
-"""As MAX_OF_RIVAL, of the best of many planes, none of which was measured there: what is added between 1.8 and 2.2 is
-wrong twice as often and more (22 % on motorcycle, REAL; two thirds on RENDERED dull cards)."""
+"""As MAX_OF_RIVAL, for the best of many planes that were not measured there: planes between 1.8 and 2.2 are wrong more
+than twice as often (22 % on motorcycle, REAL; two thirds on RENDERED dull cards)."""
 PROPAGATION_ROUNDS = 2
-"""More rounds reach further, and what they add is wrong more often (motorcycle, REAL: 13, 22 and 24 % in turns, while
-the other limits were still sought)."""
+"""Later rounds reach further but are wrong more often (motorcycle, REAL: 13, 22 and 24 % in rounds 1 to 3, measured
+before the other limits were final)."""
 SAME_PLANE_PX = 0.5
-"""Along the epipolar line, by which planes that say the same of a place differ: finer than the sweep's samples."""
+"""Largest difference along the epipolar line of planes that agree: finer than the sweep's samples."""
 
 
 class WholeSurface(NamedTuple):
-    """Planes at nodes, and the pairs that say the same."""
+    """Planes at nodes, and the pairs of the same nodes."""
 
     surface: GrownSurface
     grown: GrownPatches
 
 
 def kept(surface: GrownSurface, grown: GrownPatches, slope: FloatArray, sweep: Sweep, view1: GrowingView) -> BoolArray:
-    """Return at which nodes (R, C) the plane explains what is seen better than any other does: at the node, and at the
-    place where its patch measured, which may be beyond an edge."""
+    """Return a mask (R, C) of the nodes whose plane fits the images better than any parallel one, both at the node and
+    at the pixel that its patch measured, which may be beyond an edge."""
     out = surface.valid.copy()
     for pixels1 in (grown.pixels1, view1.nodes(grown.step)):
         at = out.copy()
@@ -57,9 +57,9 @@ def propagated(
     view2: GrowingView,
     cam2_from_cam1: Rigid3,
 ) -> WholeSurface:
-    """Return the surface with planes of neighbours in its holes, and the pairs with those of these planes.
+    """Return the surface with its holes filled by planes of neighbours, and the pairs with those of these planes.
 
-    `slope` (R, C) is by how many px along the epipolar line a place moves with the inverse range.
+    `slope` (R, C) is the derivative, in px along the epipolar line, by the inverse range.
     """
     nodes = view1.nodes(grown.step)
     rays, seen = view1.camera.unproject(nodes)
@@ -71,7 +71,7 @@ def propagated(
     for _ in range(PROPAGATION_ROUNDS):
         holes = np.flatnonzero(seen & ~np.isfinite(plane[..., 0]))
         around = _around(holes, seen.shape)
-        # Where nothing came since, nothing changes.
+        # Only holes close to planes of the last round can change.
         near = (fresh[around] & (around >= 0)).any(axis=1)
         holes, around = holes[near], around[near]
         best = _best(sweep, nodes.reshape(-1, 2)[holes], rays.reshape(-1, 3)[holes], plane, slope, around)
@@ -84,7 +84,7 @@ def propagated(
             values[holes] = values[origin]
     new = np.isfinite(plane[..., 0]) & ~surface.valid
     inverse = np.sum(plane * rays, axis=-1)
-    # A plane that goes on errs by how the surface bends, too.
+    # An extended plane has an additional error by the curvature of the surface.
     bends = scatter[..., None, None] * rays[..., :, None] * rays[..., None, :]
     covariance = np.where(
         new[..., None, None], surface.covariance.reshape(-1, 3, 3)[source] + bends, surface.covariance
@@ -103,15 +103,15 @@ def propagated(
 
 
 def _around(nodes: IntArray, shape: tuple[int, ...]) -> IntArray:
-    """Return the nodes around each of M (M, K), indices row by row; -1 outside of the grid."""
+    """Return the row-major indices (M, K) of the nodes around each of M; -1 outside of the grid."""
     row, column = (index[:, None] + OFFSETS[:, k] for k, index in enumerate(np.unravel_index(nodes, shape)))
     inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
     return np.where(inside, row * shape[1] + column, -1)
 
 
 class _Choice(NamedTuple):
-    """Where M places have their planes from: nodes (M,), -1 for none; which share of the planes around says the same,
-    and the mean square by which these differ from the inverse range there, (M,)."""
+    """Node (M,) whose plane each of M pixels gets, -1 for none; fraction (M,) of the neighbours' planes that agree with
+    it, and the mean squared difference (M,) of their inverse ranges."""
 
     source: IntArray
     agree: FloatArray
@@ -121,7 +121,7 @@ class _Choice(NamedTuple):
 def _best(
     sweep: Sweep, pixels1: Pixels, rays: FloatArray, plane: FloatArray, slope: FloatArray, around: IntArray
 ) -> _Choice:
-    """Return from which of the nodes `around` (M, K) each place has its plane: the one whose costs are least."""
+    """Return, for each pixel, the node of `around` (M, K) whose plane has the least cost."""
     planes, slopes = plane.reshape(-1, 3)[around], slope.reshape(-1)[around]
     inverse = np.einsum("mki,mi->mk", planes, rays)
     known = (around >= 0) & (inverse > 0.0)

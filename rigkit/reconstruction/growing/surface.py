@@ -1,10 +1,10 @@
-"""Points and normals from grown pairs: local planes through what neighbours say, robust across edges.
+"""Fit points and normals to grown pairs: local planes, robust to neighbours on another surface.
 
-Of a plane n . X = d the inverse range 1 / r = m . f with m = n / d is linear in the ray f, for any central camera and
-exactly; so is its gradient by the pixel, m . B with B the ray Jacobian. A pair gives both: the range from its place
-along the epipolar line, the gradient from its affinity (A = G - h y^T, gradient y / r^2; `affine.surface`). The plane
-at a node is fitted to what the pairs around it say, each with the covariance of its patches; neighbours on another
-surface lose their weight.
+For a plane n . X = d the inverse range 1 / r = m . f, with m = n / d, is exactly linear in the ray f for any central
+camera; so is its gradient by the pixel, m . B with B the ray Jacobian. A pair measures both: the range by its position
+on the epipolar line, the gradient by its affinity (A = G - h y^T, gradient y / r^2; `affine.surface`). The plane at a
+node is fitted to the measurements of the pairs around it, with the covariances of their patches. A robust loss
+downweights neighbours on another surface.
 """
 
 from __future__ import annotations
@@ -29,31 +29,31 @@ from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrownPatches, only
 
 PLANE_REACH_PX = 2.0 * HALF_WIDTH
-"""To either side, of the nodes that a plane is fitted to: those further away share no texture with the middle one."""
+"""Half side of the window of nodes that a plane is fitted to: patches further away do not overlap the middle one."""
 SMOOTHING_ROUNDS = 5
 TURN_OF_LOSS = 2.385
-"""In standard deviations a component: from there on a neighbour is on another surface rather than noisy."""
+"""Scale of the robust loss, in standard deviations of a component."""
 MIN_NODE_SUPPORT = 0.1
-"""Share of the nodes around, in sum of weights, below which a plane is fitted to hardly more than its own node."""
+"""Least sum of weights over the number of nodes around; below, a plane is fitted to little more than its own node."""
 MIN_COMPARED = 200
-"""Pairs of planes whose median says by how much they disagree: to a tenth."""
+"""Least number of pairs of planes whose median ratio is known to a tenth."""
 GROUPS_A_DOUBLING = 2
-"""Of such pairs, by the variance around them."""
+"""Groups of such pairs for each doubling of the variance around them."""
 WINDOW_AREA_PX = 4.0 * np.pi * (WINDOW_OF_PATCH * HALF_WIDTH) ** 2
-"""px^2 of an image to which a Gaussian window adds one independent number."""
+"""Area, px^2, of an image for each independent value after Gaussian windowing."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class NodeMeasurements:
-    """What each node says by itself, on its grid (R, C); NaN where nothing.
+    """The measurement of each node on the grid (R, C); NaN without one.
 
     Attributes
     ----------
     z : (R, C, 3) inverse range, and its gradient by the pixel.
-    covariance : (R, C, 3, 3) of z, from the noise along the epipolar line alone.
+    covariance : (R, C, 3, 3) of z, from the noise along the epipolar line only.
     frame : (R, C, 3, 3) ray and columns of the ray Jacobian in rows: z = frame m for the plane m . X = 1.
-    slope : (R, C) px along the epipolar line by which the place moves with the inverse range.
-    swept : (R, C) bool, found by a sweep and not by patches.
+    slope : (R, C) derivative, in px along the epipolar line, by the inverse range.
+    swept : (R, C) mask of the nodes whose pair is from a sweep.
     """
 
     z: FloatArray
@@ -65,14 +65,14 @@ class NodeMeasurements:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class GrownSurface:
-    """Fitted planes on the grid (R, C); NaN where there is none.
+    """Fitted planes on the grid (R, C); NaN without one.
 
     Attributes
     ----------
-    points : (R, C, 3) in the frame of camera 1, lengths in those of the translation.
+    points : (R, C, 3) in the frame of camera 1, in the unit of the translation.
     normals : (R, C, 3) unit, towards camera 1.
     plane : (R, C, 3) m of the plane m . X = 1; covariance : (R, C, 3, 3) of m.
-    support : (R, C) share of the nodes around that lie in the plane, in sum of weights.
+    support : (R, C) sum of the weights of the nodes around, over their number.
     """
 
     points: Points
@@ -83,24 +83,24 @@ class GrownSurface:
 
     @property
     def valid(self) -> BoolArray:
-        """Which nodes (R, C) have a plane."""
+        """Mask (R, C) of the nodes with a plane."""
         return np.isfinite(self.plane[..., 0])
 
     def where(self, keep: BoolArray) -> GrownSurface:
-        """Return the planes of the nodes `keep` (R, C) alone."""
+        """Return only the planes of the nodes `keep` (R, C)."""
         known: dict[str, Any] = {f.name: only(keep, getattr(self, f.name)) for f in fields(self)}
         return replace(self, **known)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PairRays:
-    """The rays of grown pairs, which stay as the pose moves: those of K nodes of the grid.
+    """The rays of K grown pairs, which do not depend on the pose.
 
     Attributes
     ----------
-    grown : the pairs; nodes : (K,) indices, row by row.
+    grown : the pairs; nodes : (K,) row-major indices.
     rays1, rays2 : (K, 3) with the ray Jacobians jacobians1, jacobians2 (K, 3, 2).
-    seen : (K,) bool, in both fields of view.
+    seen : (K,) mask of the pairs in both fields of view.
     """
 
     grown: GrownPatches
@@ -128,9 +128,9 @@ class PairRays:
         )
 
     def measured(self, cam2_from_cam1: Rigid3) -> NodeMeasurements:
-        """Return what the pairs say of the surface, node by node."""
+        """Return the measurements of the surface at the nodes."""
         z, along, slope, good = self._values(cam2_from_cam1)
-        # d place = -h d(1/r) r^2, and along h the same for the affinity and the gradient.
+        # d pixel = -h d(1/r) r^2, and along h the same for the affinity and the gradient.
         to_z = np.zeros((len(z), 3, 6))
         with np.errstate(divide="ignore", invalid="ignore"):
             to_z[:, 0, 0:2] = to_z[:, 1, 2::2] = to_z[:, 2, 3::2] = along / slope[:, None]
@@ -145,9 +145,9 @@ class PairRays:
         )
 
     def _unexplained(self) -> FloatArray:
-        """Return the covariance (K, 6, 6) of patches' errors that is no noise: much texture does not make these less.
+        """Return the covariance (K, 6, 6) of patches' errors that do not decrease with texture, as noise does.
 
-        Without it patches of strong texture contradict each other, and hardly any plane has neighbours.
+        Without it patches with strong texture contradict each other, and hardly any plane has support.
         """
         at = self.grown.valid
         place = np.where(self.grown.swept[at], 0.0, FLOOR_PX * 2.0 ** self.grown.coarser[at])
@@ -156,18 +156,18 @@ class PairRays:
         return np.asarray(sigmas[:, :, None] ** 2 * np.eye(6), np.float64)
 
     def planes(self, cam2_from_cam1: Rigid3) -> FloatArray:
-        """Return m (R, C, 3) of the planes m . X = 1 that the nodes say by themselves; NaN where they say nothing."""
+        """Return m (R, C, 3) of the planes m . X = 1 of each node's own measurement; NaN without one."""
         z, _, _, good = self._values(cam2_from_cam1)
         out = np.full(z.shape, np.nan)
         out[good] = np.linalg.solve(self._frames()[good], z[good][..., None])[..., 0]
         return self._spread(out, good)
 
     def _frames(self) -> FloatArray:
-        """Return rays and columns of the ray Jacobians in rows: ranges are along the nodes' own rays."""
+        """Return `frame` (K, 3, 3) of `NodeMeasurements`."""
         return np.concatenate([self.rays1[:, None, :], np.swapaxes(self.jacobians1, 1, 2)], axis=1)
 
     def _values(self, cam2_from_cam1: Rigid3) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Return z (K, 3), the directions (K, 2) of the epipolar lines, the slopes (K,) and which nodes have them."""
+        """Return z (K, 3), directions (K, 2) of the epipolar lines, slopes (K,), and the mask (K,) of valid ones."""
         B1, B2 = self.jacobians1, self.jacobians2
         points, valid = triangulate_rays(self.rays1, self.rays2, cam2_from_cam1, jacobians1=B1, jacobians2=B2)
         J1, J2 = pair_projection_jacobians(points, self.rays1, B1, self.rays2, B2, cam2_from_cam1)
@@ -181,7 +181,7 @@ class PairRays:
             return z, along, length / inverse**2, valid & self.seen & np.isfinite(z).all(axis=1)
 
     def _spread(self, values: FloatArray, good: BoolArray) -> FloatArray:
-        """Return values (K, ...) on the grid (R, C, ...), NaN where they are not `good`."""
+        """Return values (K, ...) on the grid (R, C, ...), NaN if not `good`."""
         shape = self.grown.valid.shape
         out = np.full((shape[0] * shape[1], *values.shape[1:]), np.nan)
         out[self.nodes[good]] = values[good]
@@ -191,17 +191,16 @@ class PairRays:
 def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -> GrownSurface:
     """Return the planes around all nodes, which are `step` px apart.
 
-    Their covariance is scaled by what the nodes around miss them by, as far as that differs from place to place by more
-    than chance: windows that show another surface, a highlight or a bend err by more than their noise. Then by what
-    planes disagree by that share no node, where as many miss: neighbouring patches share their pixels, and surfaces are
-    not flat. Those of a sweep are scaled apart: its errors are alike further around. `shared_px` is what all places
-    around err by together along their epipolar lines.
+    Their covariance is scaled twice. First by the local residuals of the nodes around, as far as these vary by more
+    than chance: windows with another surface, a highlight or a bend have larger errors. Then by the disagreement of
+    planes that share no node but have similar residuals: neighbouring patches share pixels, and surfaces are not flat.
+    Nodes of a sweep are scaled separately, because its errors are correlated over larger distances. `shared_px` is an
+    error along the epipolar lines that is common to all nodes around.
 
     Notes
     -----
-    Minimises over m sum_j w_ij (z_j - F_j m)^T C_j^-1 (z_j - F_j m), w_ij of the loss of Geman and McClure on the
-    distance of what neighbour j says, range and gradient, from the plane. The first plane is the node's own, as
-    uncertain as that is.
+    Minimises over m sum_j w_ij (z_j - F_j m)^T C_j^-1 (z_j - F_j m), with w_ij of the Geman-McClure loss on the
+    residual of neighbour j, range and gradient. The initial plane and its covariance are the node's own.
     """
     reach = max(2, round(PLANE_REACH_PX / step))
     valid = np.isfinite(measured.z[..., 0])
@@ -220,7 +219,7 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
     spread = np.full(fits.normals.shape, np.nan)
     spread[keep] = _inverse(fits.normals[keep])
     missed = of_redescending(fits.squares / (3.0 * fits.support), TURN_OF_LOSS)
-    # Of numbers whose correlation falls as a Gaussian half as many are one to their squares as to themselves.
+    # Squares of values with Gaussian correlation have half the correlation area.
     around = cv2.boxFilter(
         valid.astype(np.float64), -1, (2 * reach + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT
     )
@@ -231,7 +230,7 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
         scale = _disagreement(
             only(alike, normals), only(alike, plane), local[..., None, None] * spread, local, 2 * reach
         )
-        # No less than what patches state of their noise.
+        # Never below the stated noise of the patches.
         spread[alike] *= np.maximum(local * np.maximum(scale, 1.0) ** 2, 1.0)[alike][:, None, None]
     spread += ((shared_px / measured.slope) ** 2)[..., None, None] * ray[..., :, None] * ray[..., None, :]
     return GrownSurface(
@@ -246,10 +245,10 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
 def _disagreement(
     normals: Normals, plane: FloatArray, covariance: FloatArray, scatter: FloatArray, lag: int
 ) -> FloatArray:
-    """Return by how many of their standard deviations the normals of nodes `lag` apart differ, (R, C); 1 where none do.
+    """Return the ratio (R, C) of observed to predicted differences between normals of nodes `lag` apart; 1 without any.
 
-    It is a function of `scatter` (R, C), by what nodes around miss the planes: errors that neighbours share, as all
-    windows see the same highlight or edge, are where they scatter, too, and do not show in that.
+    It is a function of `scatter` (R, C), the local residual variance: errors that neighbours share, as a highlight or
+    an edge in all their windows, occur where residuals are large, but do not contribute to these.
     """
     across = np.eye(3) - normals[..., :, None] * normals[..., None, :]
     variance = np.einsum("...ij,...jk,...ik->...", across, covariance, across) / np.sum(plane**2, axis=-1)
@@ -274,7 +273,7 @@ def _disagreement(
 
 
 def _inverse(normal: FloatArray) -> FloatArray:
-    """Return the inverses of normal matrices (N, 3, 3), scaled: rays are of length one, their derivatives are not."""
+    """Return the inverses of normal matrices (N, 3, 3), scaled to unit diagonal for accuracy."""
     scale = 1.0 / np.sqrt(np.einsum("nii->ni", normal))
     both = scale[:, :, None] * scale[:, None, :]
     return np.asarray(np.linalg.inv(normal * both) * both)

@@ -1,10 +1,9 @@
-"""The pose of many pairs whose errors are not independent: lenses err alike nearby.
+"""Estimate the pose from many pairs whose errors are correlated by smooth lens errors.
 
-Thousands of pairs average their noise away; what is left is what the cameras' models are off by. Taken for independent
-noise it turns the pose by many of its stated standard deviations. Here the distance of a pair from its epipolar line is
-the sum of the pose's, of smooth errors of both lenses (`lens_errors`), and noise. The pose is the mean of its posterior
-distribution with the lenses' errors and their amplitudes, one a family of them, integrated out; its covariance contains
-what these leave open. Nothing that a lens may err by is believed, and nothing is left out that the pairs show.
+Noise averages out over thousands of pairs, errors of the camera models do not. If they are treated as independent
+noise, the pose is wrong by many of its standard deviations. Here a pair's epipolar distance is the sum of the pose's
+error, smooth errors of both lenses (`lens_errors`), and noise. The pose is its posterior mean with the lens errors and
+their amplitudes, one for each family, marginalised; its covariance includes their uncertainty.
 """
 
 from __future__ import annotations
@@ -28,23 +27,23 @@ from rigkit.relative_pose.refinement.residuals import level_terms, point_terms
 from rigkit.relative_pose.solvers.pose import free_directions, translation_basis
 
 AMPLITUDES_PX = np.geomspace(0.003, 1.0, 9)
-"""Of a family of a lens's errors over its image, rms, that are weighed against each other."""
+"""Grid of the RMS amplitude of a family of lens errors over the image."""
 TYPICAL_PX = 0.07
-"""Of these before any pair is seen, as a half-normal distribution: careful calibrations leave a twentieth of a pixel an
-axis. What looks like another pose leaves no trace in the distances, so that none seen is not none there; with a
-heavy tail (half-Cauchy) a tilt of pixels took the pose half a degree along."""
+"""Scale of the half-normal prior on these: careful calibrations leave 1/20 px per axis. Lens errors equivalent to a
+pose change are not visible in the distances; with a heavy-tailed prior (half-Cauchy) a tilt of pixels changed the pose
+by half a degree."""
 LENS_STEPS = 3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SystematicPose:
-    """A pose with |translation| = 1 and what it rests on.
+    """A pose with |translation| = 1.
 
     Attributes
     ----------
     covariance : (6, 6) of (left rotation perturbation rad, translation).
-    epipolar_rms_px : what the lenses' errors move pairs by across their epipolar lines, rms.
-    by_distance : (6, N) change of the pose by those of the pairs' distances in sigmas (`point_terms`).
+    epipolar_rms_px : RMS displacement of pairs from their epipolar lines by the lens errors.
+    by_distance : (6, N) derivative of the pose by the pairs' whitened distances (`point_terms`).
     """
 
     cam2_from_cam1: Rigid3
@@ -61,15 +60,16 @@ def pose_with_lens_errors(
     level_sigma_rad: float | None,
     overlap: float,
 ) -> SystematicPose:
-    """Return the mean of the posterior distribution of the pose near `start`, lenses' errors integrated out.
+    """Return the posterior mean of the pose close to `start`, with the lens errors marginalised.
 
     Parameters
     ----------
-    matches : that agree with `start`; their sigmas are those that they show.
+    matches : inliers of `start`, with sigmas scaled to their residuals.
     cameras : of both images.
-    pose_type, level_sigma_rad : as in `refine_pose`. Without freedom the pose stays, and only the misfit is measured.
-    overlap : pairs that share their pixels, so that their noise is that of one. To errors much wider than a window that
-        is independent noise of so many times its variance.
+    pose_type, level_sigma_rad : as in `refine_pose`. Without degrees of freedom the pose is kept, and only the lens
+        errors are estimated.
+    overlap : number of pairs that share the same pixels and so their noise. For lens errors much wider than a window
+        the variance of independent noise is multiplied by it.
     """
     R, t = start.rotation, unit(start.translation_mm)
     free = free_directions(PoseType.GENERAL if level_sigma_rad is not None else pose_type)
@@ -82,7 +82,7 @@ def pose_with_lens_errors(
     rows_of_lenses, families = _lens_rows(matches, lenses, R, t)
     count = len(free)
     basis = translation_basis(t)
-    # A pose that is not free stays, and so do the weights.
+    # If the pose is fixed, the weights do not change: one step.
     for _ in range(LENS_STEPS if count else 1):
         basis = translation_basis(t)
         r, J = point_terms(matches, R, t, basis)
@@ -102,7 +102,7 @@ def pose_with_lens_errors(
     to_six[:3, :3], to_six[3:, 3:] = np.eye(3), basis.T
     spread = to_six[:, free]
     by_row = -found.inverse @ (rows * weight[:, None]).T
-    # Sampson's distance is shared by both images.
+    # Sampson's distance moves both pixels.
     in_px = np.sqrt(2.0) * matches.sigma1_px[:, None] * rows_of_lenses
     moment = found.inverse[count:, count:] + np.outer(found.modes, found.modes)
     residual = np.sqrt(np.mean(np.sum(in_px @ moment * in_px, axis=1)))
@@ -112,8 +112,8 @@ def pose_with_lens_errors(
 def _lens_rows(
     matches: Matches, lenses: tuple[ErrorModes, ErrorModes], R: FloatArray, t: FloatArray
 ) -> tuple[FloatArray, IntArray]:
-    """Return by how many of their standard deviations modes of both lenses (N, K) move pairs off their epipolar lines,
-    and the modes' families (K,), in order."""
+    """Return the whitened epipolar displacements (N, K) by the modes of both lenses, and the families (K,) of these, in
+    order."""
     m = matches
     _, n1, n2 = epipolar_normals(skew(t) @ R, m.rays1, m.rays2, m.jacobians1, m.jacobians2)
     sigma = np.sqrt(m.sigma1_px**2 * np.sum(n1**2, axis=1) + m.sigma2_px**2 * np.sum(n2**2, axis=1))
@@ -127,8 +127,8 @@ def _lens_rows(
 def _of_frames(
     lenses: tuple[ErrorModes, ErrorModes], variances: FloatArray, R: FloatArray, t: FloatArray, basis: FloatArray
 ) -> FloatArray:
-    """Return the covariance (5, 5) of the pose that the cameras' frames leave open, which turn with lenses' errors of
-    these `variances`, one a family."""
+    """Return the covariance (5, 5) of the pose by the rotations of the cameras that were removed from the modes, for
+    the variance of each family."""
     out = np.zeros((5, 5))
     for lens, turn, swing in ((lenses[0], R, np.zeros((2, 3))), (lenses[1], np.eye(3), -basis @ skew(t))):
         by_mode = np.concatenate([turn, swing]) @ lens.turns
@@ -137,8 +137,8 @@ def _of_frames(
 
 
 class _PoseAndLenses(NamedTuple):
-    """Mean (P,) and covariance (P, P) of the pose's change; the variance of each family, px^2; where amplitudes are
-    likeliest, the inverse of the normal equations with their prior, and the modes (K,)."""
+    """Mean (P,) and covariance (P, P) of the pose's change; posterior mean variance of each family, px^2; and for the
+    likeliest amplitudes the inverse of the normal equations with their prior, and the modes' coefficients (K,)."""
 
     mean: FloatArray
     covariance: FloatArray
@@ -148,7 +148,7 @@ class _PoseAndLenses(NamedTuple):
 
 
 def _posterior(normal: FloatArray, right: FloatArray, count: int, families: IntArray) -> _PoseAndLenses:
-    """Return what normal equations of `count` numbers of the pose and of the modes say, whatever their amplitudes.
+    """Return the posterior, over all amplitudes, from normal equations of `count` pose parameters and the modes.
 
     Notes
     -----
@@ -194,5 +194,5 @@ def _posterior(normal: FloatArray, right: FloatArray, count: int, families: IntA
 
 
 def _log_prior(amplitudes_px: FloatArray) -> FloatArray:
-    """Return the logarithm of the density (A,) of the logarithms of amplitudes (A, F)."""
+    """Return the log prior density (A,) of the logarithms of amplitudes (A, F)."""
     return np.asarray(np.sum(np.log(amplitudes_px) - 0.5 * (amplitudes_px / TYPICAL_PX) ** 2, axis=1))

@@ -1,1 +1,1 @@
-"""How wrong a measurement with a calibrated camera or rig may be, over the image."""
+"""Bound the error of a measurement with a calibrated camera or rig over the image."""

@@ -1,8 +1,8 @@
-"""The certificate: the bound on the error of a measurement over the image, its causes, and what would halve it.
+"""Compute a certificate: the bound on the error of a measurement over the image, its causes, and how to halve it.
 
-The calibration's covariance rests on a dozen images or so, and is known to about a quarter itself. So a bound of 95 %
-is not 1.96 standard deviations, but Student's quantile with the degrees of freedom of the whole (Welch and
-Satterthwaite; JCGM 100 "GUM", annex G.4); the standard deviations of the other causes count as known.
+The calibration's covariance is estimated from about a dozen images, to about a quarter of itself. So a bound of 95 % is
+not 1.96 standard deviations but Student's quantile with effective degrees of freedom (Welch-Satterthwaite; JCGM 100
+"GUM", annex G.4). The standard deviations of the other causes count as known.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from rigkit.validation.certificate.propagation import (
 )
 
 MAP_CELLS = (33, 25)
-"""Columns and rows of places at which the bound is evaluated."""
+"""Columns and rows of the grid on which the bound is evaluated."""
 MAX_SHARE = 0.1
-"""A bound beyond this part of what is measured (of a radian, for angles), or points as uncertain: what is derived to
-first order is then too small."""
+"""Largest bound, and uncertainty of points, relative to the measured size (for angles to a radian), for which the
+first-order propagation holds; beyond, it is too small."""
 AS_NORMAL = 1e6
-"""So many degrees of freedom are as good as a normal distribution."""
+"""Degrees of freedom from which Student's distribution counts as normal."""
 
 
 def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_CELLS) -> Certificate:
     """Return the bound on the error of `task` over the image of the first camera.
 
-    Raises InputError: a depth, plane or angle with one camera; DegenerateError: nowhere do all cameras see what is
-    measured.
+    Raises InputError for a depth, plane or angle with one camera; DegenerateError if all cameras see the measured
+    object nowhere.
     """
     if not instrument.is_rig and task.quantity is not Quantity.LENGTH:
         raise InputError(
@@ -61,7 +61,7 @@ def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_
             f"{' and '.join(instrument.names)}; give a shorter length or another distance"
         )
     variance = variances(instrument, task, points, by_corner, by_calibration, by_pixel)
-    # Of several ways to hold the same thing the worst counts.
+    # Of several orientations the worst counts.
     worst = np.argmax(sum(variance.values()), axis=1)
     chosen = np.arange(len(worst))
     # Radians become degrees only here.
@@ -73,7 +73,7 @@ def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_
     quantile = _quantile(sigma, instrument.freedom, task.confidence)
     bound = quantile * np.sqrt(sum(s**2 for s in sigma.values()))
     whole = factor * (1.0 if task.quantity is Quantity.ANGLE else task.size_mm)
-    # How far a pixel's error moves the point that suffers most, mm.
+    # Largest displacement of any of the points by an error of one pixel, mm.
     farthest = np.linalg.norm(by_pixel, ord=2, axis=(-2, -1)).max(axis=1)
     uncertain = quantile * instrument.sigma_px * farthest.reshape(shape) > MAX_SHARE * task.size_mm
     in_view = seen.reshape(shape)
@@ -90,7 +90,7 @@ def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_
 
 
 def _quantile(sigma: Mapping[str, FloatArray], freedom: float, confidence: float) -> FloatArray:
-    """Return how many standard deviations of the whole the bound is at each place."""
+    """Return the bound over the total standard deviation at each place."""
     upper = 0.5 + 0.5 * confidence
     whole = np.sum([s**2 for s in sigma.values()], axis=0)
     if not np.isfinite(freedom):
@@ -101,7 +101,7 @@ def _quantile(sigma: Mapping[str, FloatArray], freedom: float, confidence: float
 
 
 def _findings(certificate: Certificate) -> list[Finding]:
-    """Return what is not counted in, and what would halve the worst bound."""
+    """Return the causes that the bound does not include, and how to halve the worst bound."""
     instrument, task = certificate.instrument, certificate.task
     found = []
     coarse = float(np.mean(certificate.coarse[certificate.in_view]))
@@ -128,14 +128,14 @@ def _findings(certificate: Certificate) -> list[Finding]:
 
 
 def _how_to_halve(shares: Mapping[str, float], certificate: Certificate) -> str:
-    """Return what to do, cause by cause, the largest first, until a quarter of the variance is left."""
+    """Return the remedies, for the largest cause first, until a quarter of the variance is left."""
     scale = 100.0 * certificate.instrument.scale_sigma
     steps: list[str] = []
     left, target = 1.0, 0.25
     for cause, share in sorted(shares.items(), key=lambda item: -item[1]):
         if left <= target or share <= 0.0:
             break
-        # This cause alone must shrink to what the others leave of the target, or to nothing much (a ninth).
+        # This cause must shrink to the rest of the target, but at most to a ninth.
         allowed = max(target - (left - share), share / 9.0)
         factor = share / allowed
         left -= share - allowed

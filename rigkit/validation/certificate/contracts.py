@@ -1,4 +1,4 @@
-"""What is measured, with what, and how wrong it may be."""
+"""Types of a certificate: the measurement task, the instrument, and the result."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rigkit.validation.sentinel.evidence import Monitored
 
 
 class Quantity(StrEnum):
-    """What is measured."""
+    """The measured quantity."""
 
     LENGTH = "length"
     DEPTH = "depth"
@@ -28,18 +28,17 @@ class Quantity(StrEnum):
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Instrument:
-    """One camera, or two of a rig, and how well they are known.
+    """One camera, or two of a rig, with their covariance.
 
     Attributes
     ----------
-    names, cameras, cam_from_rig : of one or of two cameras, in this order.
-    covariance : (P, P) of the intrinsics, camera by camera; what a lens may do beyond its model is among them
-        (`calibration.certainty.displaced`). Of two cameras also of both mounts, six each: left perturbation in rad and
-        translation in mm, zero for the camera that is the rig's frame.
+    names, cameras, cam_from_rig : of one or two cameras, in this order.
+    covariance : (P, P) of the intrinsics, camera by camera, including lens errors beyond the model
+        (`calibration.certainty.displaced`). For two cameras also of both extrinsics, six each: left perturbation in rad
+        and translation in mm; zero for the camera that is the rig's frame.
     sigma_px : standard deviation of a measured corner per coordinate.
-    scale_sigma : relative standard deviation of all lengths, from how well the boards' squares were measured; 0 where
-        nobody stated it.
-    freedom : degrees of freedom of `covariance`: a dozen images know their own disagreement to a quarter.
+    scale_sigma : relative standard deviation of all lengths, from that of the boards' squares; 0 if not stated.
+    freedom : degrees of freedom of `covariance`.
     """
 
     names: tuple[str, ...]
@@ -63,10 +62,9 @@ class Instrument:
 
     @classmethod
     def of(cls, known: Monitored, pair: tuple[str, str] | None = None) -> Instrument:
-        """Return a camera, or two of a rig: its first two, or a `pair` by their names, the one whose image the
-        certificate is drawn over first.
+        """Return a camera, or two of a rig: its first two, or a `pair` of names.
 
-        Raises InputError: a name that no camera has, or the same twice.
+        The certificate is drawn over the image of the first. Raises InputError for an unknown name, or the same twice.
         """
         names = known.names[:2] if pair is None else pair
         if len(set(names) & set(known.names)) < len(names):
@@ -99,22 +97,22 @@ class Instrument:
 
     @property
     def intrinsic_count(self) -> int:
-        """How many intrinsics all cameras have together."""
+        """Number of intrinsics of all cameras."""
         return sum(camera.parameters.size for camera in self.cameras)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """What somebody wants to measure.
+    """A measurement task.
 
     Attributes
     ----------
-    quantity : a length across the line of sight (the worse of upright and level), a depth along it, how flat a plane
-        of `size_mm` x `size_mm` looks that faces the camera (its worst point), or the angle between two edges of
-        `size_mm`, one level and one upright.
+    quantity : a length perpendicular to the line of sight (the worse of vertical and horizontal), a depth along it, the
+        flatness of a plane of `size_mm` x `size_mm` that faces the camera (its worst point), or the angle between a
+        horizontal and a vertical edge of `size_mm`.
     size_mm : the length, or the sides.
-    distance_mm : from the first camera to the middle of what is measured.
-    distance_sigma_mm : with one camera lengths rest on a distance that was measured by other means, this well.
+    distance_mm : from the first camera to the middle of the measured object.
+    distance_sigma_mm : standard deviation of that distance; one camera measures lengths with it.
     confidence : probability that the error is within the bound.
     """
 
@@ -135,25 +133,25 @@ class Task:
 
     @property
     def unit(self) -> str:
-        """Of the error: "mm", or "deg" for angles."""
+        """Unit of the error: "mm", or "deg" for angles."""
         return "deg" if self.quantity is Quantity.ANGLE else "mm"
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Certificate:
-    """How wrong a measurement may be, over the image of the first camera.
+    """The error bound of a measurement over the image of the first camera.
 
     Attributes
     ----------
-    task, instrument : what is measured, with what.
-    pixels : (R, C, 2) where the middle of what is measured appears in the first camera.
-    in_view : (R, C) whether all of it is seen by all cameras there.
+    task, instrument : of the measurement.
+    pixels : (R, C, 2) image of the object's middle in the first camera.
+    in_view : (R, C) mask of the places where all cameras see the whole object.
     bound : (R, C) the error that is exceeded with probability 1 - confidence, in `task.unit`; NaN out of view. It
-        counts in how well the calibration's covariance is known itself.
-    sigma : (R, C) of each cause by name, one standard deviation, in `task.unit`; their squares add up to the whole.
-    coarse : (R, C) where the bound is only a lower one: it is derived to first order, and there the error is a good
-        part of what is measured, or its points are as uncertain along the lines of sight.
-    findings : what is not counted in, and what would halve the worst bound.
+        includes the uncertainty of the calibration's covariance.
+    sigma : (R, C) standard deviation by each cause, in `task.unit`; their squares add up to the variance.
+    coarse : (R, C) mask of the places where the bound is only a lower one: the error, or the uncertainty of the points
+        along the lines of sight, is too large for first-order propagation.
+    findings : causes that are not included, and how to halve the worst bound.
     """
 
     task: Task
@@ -172,7 +170,7 @@ class Certificate:
 
     @property
     def median(self) -> float:
-        """The bound that half of the view keeps."""
+        """The median bound in view."""
         return float(np.nanmedian(self.bound))
 
     @property
@@ -182,18 +180,18 @@ class Certificate:
         return int(row), int(column)
 
     def share_within(self, limit: float) -> float:
-        """Return the part of the view whose bound is at most `limit`."""
+        """Return the fraction of the view whose bound is at most `limit`."""
         return float(np.mean(self.bound[self.in_view] <= limit))
 
     def shares(self) -> dict[str, float]:
-        """Return the part of the variance that each cause has where the bound is worst."""
+        """Return the fraction of the variance by each cause at the worst place."""
         row, column = self.worst_place
         variance = {cause: float(sigma[row, column]) ** 2 for cause, sigma in self.sigma.items()}
         whole = sum(variance.values())
         return {cause: value / whole for cause, value in variance.items()}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what a program needs to know; angles in degrees, places out of view as None."""
+        """Return plain numbers, strings and lists; angles in degrees, None out of view."""
         task = self.task
         return {
             "schema": "rigkit.certificate/1",

@@ -1,23 +1,23 @@
-"""How noise and calibration move a length, a depth, a plane or an angle.
+"""Propagate corner noise and calibration errors to a length, a depth, a plane or an angle.
 
-A quantity g of points X_i, which pixels q_i in the cameras see, moves to first order with the noise of the pixels and
-with the calibration theta (intrinsics and mounts) as
+The first-order change of a quantity g of points X_i, with pixels q_i in the cameras and calibration theta (intrinsics
+and extrinsics), is
 
     dg = sum_i c_i . dX_i,      dX = A (dq - D dtheta),      A = (J^T J)^-1 J^T,
 
 where J = d q / d X and D = d q / d theta stack both cameras (the points are triangulated by least squares). One camera
-sees directions only: its points lie at the stated distance, and A = r d ray / d pixel moves them across the ray.
-Every corner's noise is its own, the calibration is common to all points of one measurement, the scale of the boards to
-all lengths. The bound is the normal quantile of the confidence times the root of the sum.
+measures only directions: its points are at the stated distance, and A = r d ray / d pixel is perpendicular to the ray.
+Corners have independent noise; the calibration is common to all points of a measurement, the boards' scale to all
+lengths.
 
-Points are off along their rays by many times as much as across them, and what does not move a length or an angle to
-first order, its ends nearer or farther, does so to second: a length becomes longer, an angle smaller. With the Hessian
-H of g by the points, and C their covariance by the corners' noise, q = dX^T H dX / 2 has the mean square
+Errors along the rays are many times those perpendicular to them. If they do not change a length or an angle to first
+order, they do to second: a length becomes longer, an angle smaller. With the Hessian H of g by the points, and C their
+covariance by the corners' noise, q = dX^T H dX / 2 has the mean square
 
     E q^2 = tr(HC)^2 / 4 + tr(HCHC) / 2,
 
-which is counted to the corners (JCGM 100 "GUM", 5.1.2, note; q and dg are uncorrelated). How flat a plane looks moves
-by next to nothing to second order.
+which is added to that of the corners (JCGM 100 "GUM", 5.1.2, note; q and dg are uncorrelated). For the flatness of a
+plane it is negligible.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from rigkit.geometry.rotation import skew
 from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
 
 PLANE_POINTS = 5
-"""A plane is measured at so many points along either side."""
+"""Points along each side of a measured plane."""
 OF_CORNERS, OF_LENSES, OF_MOUNTS, OF_SCALE, OF_DISTANCE = "corners", "lenses", "mounts", "board scale", "distance"
 """Causes of error."""
 
 
 def measured_points(rays: Rays, task: Task, is_rig: bool) -> tuple[Points, FloatArray]:
-    """Return points (N, K, 3) of what is measured in the middle of N `rays`, in the first camera's frame, and the
-    gradients (N, M, K, 3) of M quantities by these points."""
+    """Return the measured points (N, K, 3) around N `rays`, in the first camera's frame, and the gradients (N, M, K, 3)
+    of M quantities by these points."""
     level = np.cross(np.broadcast_to([0.0, 1.0, 0.0], rays.shape), rays)
     steep = np.linalg.norm(level, axis=-1, keepdims=True) < 1e-6
     level = np.where(steep, [1.0, 0.0, 0.0], level)
@@ -69,7 +69,7 @@ def measured_points(rays: Rays, task: Task, is_rig: bool) -> tuple[Points, Float
     if is_rig:
         ends = np.stack([-level, level, zero, zero], axis=1), np.stack([zero, zero, -upright, upright], axis=1)
     else:
-        # length = 2 D tan(angle / 2): an end that moves across its ray by s opens the angle by s / range.
+        # length = 2 D tan(angle / 2): moving an end by s perpendicular to its ray changes the angle by s / range.
         opening = task.distance_mm * (1.0 + (half / task.distance_mm) ** 2) / np.hypot(task.distance_mm, half)
         across = []
         for direction, pair in ((level, points[:, :2]), (upright, points[:, 2:])):
@@ -85,8 +85,7 @@ def measured_points(rays: Rays, task: Task, is_rig: bool) -> tuple[Points, Float
 
 
 def hessians(points: Points, quantity: Quantity) -> FloatArray:
-    """Return the second derivatives (N, M, 3 K, 3 K) of M lengths, depths or angles, as a rig measures them, by their
-    points (N, K, 3) as `measured_points` has them."""
+    """Return the Hessians (N, M, 3 K, 3 K) of M lengths, depths or angles by their `measured_points` (N, K, 3)."""
     count = points.shape[1]
     if quantity is Quantity.ANGLE:
         edges = points[:, 1:] - points[:, :1]
@@ -111,7 +110,7 @@ def hessians(points: Points, quantity: Quantity) -> FloatArray:
 
 
 def _differences(pairs: Sequence[tuple[int, int]], count: int) -> FloatArray:
-    """Return how differences of points (from, to), one below the other, follow from all `count` points."""
+    """Return the matrix (3 P, 3 count) that maps `count` stacked points to the stacked differences of P pairs."""
     out = np.zeros((len(pairs), count))
     for row, (start, end) in enumerate(pairs):
         out[row, start], out[row, end] = -1.0, 1.0
@@ -121,8 +120,8 @@ def _differences(pairs: Sequence[tuple[int, int]], count: int) -> FloatArray:
 def gradients(
     instrument: Instrument, points: Points, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Return d quantity / d pixel (N, M, K, 2 C) of C cameras, d quantity / d calibration (N, M, P), d point / d pixel
-    (N, K, 3, 2 C), and which of the N places all cameras see."""
+    """Return d quantity / d pixel (N, M, K, 2 C) for C cameras, d quantity / d calibration (N, M, P), d point / d pixel
+    (N, K, 3, 2 C), and a mask (N,) of the places that all cameras see."""
     size = len(instrument.covariance)
     rig_from_first = instrument.cam_from_rig[0].inverse()
     in_rig = rig_from_first.apply(points)
@@ -144,7 +143,7 @@ def gradients(
     J, D = (np.where(seen[:, None, None, None], np.concatenate(part, axis=2), 0.0) for part in (jacobians, designs))
     if instrument.is_rig:
         normal = np.swapaxes(J, -1, -2) @ J
-        # Out of view anything that can be inverted will do.
+        # Any invertible matrix will do out of view.
         normal[~seen] = np.eye(3)
         try:
             by_pixel = np.linalg.solve(normal, np.swapaxes(J, -1, -2))
@@ -154,7 +153,7 @@ def gradients(
                 "are apart"
             ) from error
     else:
-        # The pseudo-inverse of a 2x3 Jacobian moves a point across its ray alone.
+        # The pseudo-inverse of a 2x3 Jacobian moves a point perpendicular to its ray.
         by_pixel = np.linalg.pinv(J)
     by_corner = np.einsum("nmkx,nkxp->nmkp", weights, by_pixel)
     return by_corner, -np.einsum("nmkp,nkpt->nmt", by_corner, D), by_pixel, seen
@@ -168,15 +167,15 @@ def variances(
     by_calibration: FloatArray,
     by_pixel: FloatArray,
 ) -> dict[str, FloatArray]:
-    """Return the variance (N, M) that each cause adds, from `points` (N, K, 3) and what `gradients` returns of them.
+    """Return the variance (N, M) by each cause, from `points` (N, K, 3) and their `gradients`.
 
-    What the mounts share with the lenses they were estimated with is the lenses': dm = C_ml C_ll^-1 dl + rest.
+    The part of the extrinsics' error that is correlated with the lenses counts as theirs: dm = C_ml C_ll^-1 dl + rest.
     """
     split = instrument.intrinsic_count
     covariance = instrument.covariance
     lens, mount = by_calibration[..., :split], by_calibration[..., split:]
     own = covariance[:split, :split]
-    # Parameters have units of their own: in standard deviations they can be compared.
+    # Parameters are scaled by their standard deviations, because they have different units.
     sigma = np.sqrt(np.diag(own))
     known = np.where(sigma > 0.0, sigma, 1.0)
     follows = covariance[split:, :split] / known @ np.linalg.pinv(own / np.outer(known, known), hermitian=True) / known
@@ -199,8 +198,8 @@ def variances(
 
 
 def _second_order(bent: FloatArray, by_pixel: FloatArray, sigma_px: float) -> FloatArray:
-    """Return the mean square (N, M) of what the corners' noise moves to second order, with the `hessians` `bent` of
-    the quantities and d point / d pixel (N, K, 3, 2 C)."""
+    """Return the mean square (N, M) of the second-order change by the corners' noise, from the `hessians` and d point /
+    d pixel (N, K, 3, 2 C)."""
     count = by_pixel.shape[1]
     root = np.zeros((len(by_pixel), 3 * count, count * by_pixel.shape[-1]))
     for k in range(count):
