@@ -11,22 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays, as_array
+from rigkit.core.arrays import FloatArray, Points, Rays, as_array
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
 from rigkit.kernels import board_pose as kernel
-from rigkit.optim.batched import BatchedProblem, minimise_each
-from rigkit.optim.damping import Damping, Stop
 
 MIN_SPREAD = 1e-6
 """Second principal extent over the first, below which points are collinear."""
 MIN_HOMOGRAPHY_GAP = 1e-9
 """Second smallest singular value over the largest, below which the homography is not unique."""
 POSE_STEP_TOLERANCE = 1e-12
-"""Relative decrease of the cost, or change of the pose in radians, at which the refinement stops."""
-STOP = Stop(steps=50, gain=POSE_STEP_TOLERANCE)
-BOARD_DAMPING = Damping(start=1e-4, floor=1e-12, ceiling=1e6)
+"""The refinement stops when a step changes the pose by less than this, in radians and relative to the distance."""
+MAX_POSE_STEPS = 50
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -221,23 +218,18 @@ def _refine(
     rays: Rays, bases: FloatArray, flat: FloatArray, weight: FloatArray, rotation: FloatArray, translation: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the refined poses and costs (K,) of K initial poses: Levenberg-Marquardt on weighted ray residuals."""
+    n = len(flat)
     # Residuals are in units of the bases.
     weighted = bases * weight[:, None, None]
-
-    def linearise(poses: tuple[FloatArray, ...]) -> BatchedProblem:
-        residual, jacobian = ray_residuals(rays, weighted, flat, *poses)
-        residual, jacobian = residual.reshape(len(poses[0]), -1), jacobian.reshape(len(poses[0]), -1, 6)
-        transposed = np.swapaxes(jacobian, 1, 2)
-        descent = -(transposed @ residual[..., None])[..., 0]
-        return BatchedProblem(transposed @ jacobian, descent, (residual**2).sum(axis=1))
-
-    def small(poses: tuple[FloatArray, ...], step: FloatArray) -> BoolArray:
-        moved_by = np.abs(step[:, 3:]).max(axis=1) / np.linalg.norm(poses[1], axis=1)
-        return np.asarray(np.abs(step[:, :3]).max(axis=1) + moved_by < POSE_STEP_TOLERANCE)
-
-    start = (rotation, translation)
-    found, cost = minimise_each(start, linearise, stepped, BOARD_DAMPING, STOP, small=small, until_all=True)
-    return found[0], found[1], cost
+    return kernel.refine(
+        rays.reshape(-1, n, 3),
+        weighted.reshape(-1, n, 2, 3),
+        flat,
+        rotation,
+        translation,
+        max_steps=MAX_POSE_STEPS,
+        tolerance=POSE_STEP_TOLERANCE,
+    )
 
 
 def stepped(poses: tuple[FloatArray, ...], step: FloatArray) -> tuple[FloatArray, ...]:

@@ -47,6 +47,11 @@ EXPORT void ray_residuals(
     ARRAY(const double, points, count, 3), int64_t count, ARRAY(const double, rotation, poses, 3, 3),
     ARRAY(const double, translation, poses, 3), int64_t poses, RESULT(double, residuals, poses, count, 2),
     RESULT(double, jacobian, poses, count, 2, POSE));
+/* Moves the poses to the minima near them. */
+EXPORT void refine_board_poses(
+    ARRAY(const double, rays, sets, count, 3), ARRAY(const double, bases, sets, count, 2, 3), int64_t sets,
+    ARRAY(const double, points, count, 3), int64_t count, ARRAY(double, rotation, poses, 3, 3),
+    ARRAY(double, translation, poses, 3), int64_t poses, int64_t max_steps, double tolerance, RESULT(double, costs, poses));
 
 /* linearise.c */
 

@@ -1,6 +1,8 @@
-"""The kernel in board_pose.c: how far the points of a rigid board lie from rays."""
+"""The kernels in board_pose.c: how far the points of a rigid board lie from rays, and where they lie nearest."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from rigkit.core.arrays import FloatArray, Mat3, Points, Rays
 from rigkit.kernels import kernels
@@ -13,3 +15,21 @@ def ray_residuals(
     turn and a shift, against rays (S, N, 3) with bases (S, N, 2, 3): S is K, or 1 for all poses."""
     residuals, jacobian = kernels().ray_residuals(rays, bases, points, rotation, translation)
     return residuals, jacobian
+
+
+def refine(
+    rays: Rays,
+    bases: FloatArray,
+    points: Points,
+    rotation: Mat3,
+    translation: FloatArray,
+    max_steps: int,
+    tolerance: float,
+) -> tuple[Mat3, FloatArray, FloatArray]:
+    """Return poses (K, 3, 3), (K, 3) each at the minimum near it, and their costs (K,), sums of squared residuals.
+
+    `max_steps` are tried at most; one of less than `tolerance`, in radians and parts of the distance, is the last. Else
+    as `ray_residuals`.
+    """
+    R, t = np.array(rotation, np.float64, order="C"), np.array(translation, np.float64, order="C")
+    return R, t, kernels().refine_board_poses(rays, bases, points, R, t, max_steps, tolerance)

@@ -121,20 +121,26 @@ INLINE void fill_basis(pose_t *pose)
     memcpy(pose->basis + 3, &second, sizeof second);
 }
 
-/* Return the pose after the step (w, b): exp([w]x) R and unit(t + b1 T1 + b2 T2). */
-INLINE pose_t moved(const pose_t *pose, const double step[5])
+/* Write exp([w]x) R to `out`. */
+INLINE void turn(const double *R, v3_t w, double *out)
 {
-    pose_t out;
-    const v3_t w = v3(step), b1 = v3(pose->basis), b2 = v3(pose->basis + 3);
     const double square = dot(w, w), angle = sqrt(square);
     const int small = angle < 1e-4;
     const double first = small ? 1.0 - square / 6.0 : sin(angle) / angle;
     const double second = small ? 0.5 - square / 24.0 : (1.0 - cos(angle)) / square;
     for (int j = 0; j < 3; j++) {
-        const v3_t down = {pose->R[j], pose->R[3 + j], pose->R[6 + j]}, once = cross(w, down);
+        const v3_t down = {R[j], R[3 + j], R[6 + j]}, once = cross(w, down);
         const v3_t turned = plus(down, plus(times(first, once), times(second, cross(w, once))));
-        out.R[j] = turned.x, out.R[3 + j] = turned.y, out.R[6 + j] = turned.z;
+        out[j] = turned.x, out[3 + j] = turned.y, out[6 + j] = turned.z;
     }
+}
+
+/* Return the pose after the step (w, b): exp([w]x) R and unit(t + b1 T1 + b2 T2). */
+INLINE pose_t moved(const pose_t *pose, const double step[5])
+{
+    pose_t out;
+    const v3_t b1 = v3(pose->basis), b2 = v3(pose->basis + 3);
+    turn(pose->R, v3(step), out.R);
     v3_t t = plus(v3(pose->t), plus(times(step[3], b1), times(step[4], b2)));
     t = times(1.0 / sqrt(dot(t, t)), t);
     memcpy(out.t, &t, sizeof t);

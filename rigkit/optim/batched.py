@@ -34,24 +34,18 @@ def minimise_each(
     moved: Callable[[Values, FloatArray], Values],
     damping: Damping,
     stop: Stop,
-    *,
-    small: Callable[[Values, FloatArray], BoolArray] | None = None,
-    until_all: bool = False,
 ) -> tuple[Values, FloatArray]:
-    """Return the states, each at its own minimum, and their costs (K,).
+    """Return the states, each at its own minimum, and their costs (K,). A result does not depend on the other problems.
 
     Parameters
     ----------
     moved : returns the states after steps (K, U).
     damping : `by_gain`, `acceleration` and `refused_floor` are ignored.
     stop : `gain_ratio` and `cost` are ignored.
-    small : returns which steps (K, U) are negligible: their problems have converged.
-    until_all : whether converged problems take further steps, which are computed anyway, until all have converged. If
-        not, the result of a problem does not depend on the others.
     """
     here = linearise(state)
     level = np.full(len(here.cost), damping.start)
-    active = np.full(len(level), True) if until_all else here.cost > 0.0
+    active = here.cost > 0.0
     for _ in range(stop.steps):
         if not active.any():
             break
@@ -63,21 +57,17 @@ def minimise_each(
         predicted = (step * (added * step + here.descent)).sum(axis=-1)
         trial = moved(state, step)
         there = linearise(trial)
-        better = there.cost < here.cost
-        if not until_all:
-            better &= active
+        better = (there.cost < here.cost) & active
         gain = np.where(better, here.cost - there.cost, 0.0)
         done = np.where(better, gain <= stop.gain * here.cost, level > damping.ceiling)
         done |= predicted <= stop.predicted_gain * here.cost
-        if small is not None:
-            done |= small(state, step)
         if better.all():
             state, here = trial, there
         else:
             state = tuple(_chosen(better, new, old) for new, old in zip(trial, state, strict=True))
             here = BatchedProblem(*(_chosen(better, new, old) for new, old in zip(there, here, strict=True)))
         level = np.where(better, np.maximum(damping.shrink * level, damping.floor), damping.growth * level)
-        active = ~done if until_all else active & ~done
+        active &= ~done
     return state, here.cost
 
 
