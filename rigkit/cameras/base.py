@@ -218,6 +218,11 @@ class Camera(ABC):
         """Return d ray / d pixel (..., 3, 2) at pixels (..., 2); the columns are perpendicular to the ray.
 
         NaN where the pixel has no ray.
+        """
+        return self.rays_and_jacobians(pixels)[2]
+
+    def rays_and_jacobians(self, pixels: Pixels) -> tuple[Rays, BoolArray, RayJacobians]:
+        """Return what `unproject` and `ray_jacobian` do.
 
         Notes
         -----
@@ -238,7 +243,7 @@ class Camera(ABC):
             out[:, 0] = (d_pixels_d_point[0] * vv - d_pixels_d_point[1] * uv) / determinant
             out[:, 1] = (d_pixels_d_point[1] * uu - d_pixels_d_point[0] * uv) / determinant
         out[..., ~valid.reshape(-1)] = np.nan
-        return np.moveaxis(out.reshape(3, 2, *valid.shape), (0, 1), (-2, -1))
+        return rays, valid, np.moveaxis(out.reshape(3, 2, *valid.shape), (0, 1), (-2, -1))
 
     def project_with_jacobians(self, points: Points) -> tuple[Pixels, BoolArray, FloatArray, FloatArray]:
         """Return pixels, valid, d pixel / d point (..., 2, 3) in px/mm, and d pixel / d parameters (..., 2, P).

@@ -79,8 +79,8 @@ class NearCamera(Camera):
         return self.lens.max_angle_rad
 
     # Directions of rays are those of the lens.
-    def ray_jacobian(self, pixels: Pixels) -> RayJacobians:
-        return self.lens.ray_jacobian(pixels)
+    def rays_and_jacobians(self, pixels: Pixels) -> tuple[Rays, BoolArray, RayJacobians]:
+        return self.lens.rays_and_jacobians(pixels)
 
     @property
     def axis_px(self) -> Pixels:

@@ -48,7 +48,7 @@ class CalibrationShifts:
         """Rays (N, 3) of the corners in image 1 and in image 2, and their derivatives by the pixel (N, 3, 2), by the
         cameras as they are and as each move has them."""
         each = [((r.camera1, r.pixels1), (r.camera2, r.pixels2)) for r in (self.base, *self.moved)]
-        return [[(camera.unproject(p)[0], camera.ray_jacobian(p)) for camera, p in both] for both in each]
+        return [[camera.rays_and_jacobians(p)[::2] for camera, p in both] for both in each]
 
     def points(self) -> FloatArray:
         """Return how the points move along each axis (K, N, 3), mm; NaN where that is not known."""

@@ -94,8 +94,9 @@ class Reconstruction:
 
     def measured_rays(self) -> tuple[Rays, Rays, RayJacobians, RayJacobians]:
         """Return the rays of `pixels1` and of `pixels2`, and their derivatives by the pixels."""
-        (rays1, _), (rays2, _) = self.camera1.unproject(self.pixels1), self.camera2.unproject(self.pixels2)
-        return rays1, rays2, self.camera1.ray_jacobian(self.pixels1), self.camera2.ray_jacobian(self.pixels2)
+        rays1, _, jacobians1 = self.camera1.rays_and_jacobians(self.pixels1)
+        rays2, _, jacobians2 = self.camera2.rays_and_jacobians(self.pixels2)
+        return rays1, rays2, jacobians1, jacobians2
 
     def same_points(self, other: Reconstruction) -> bool:
         """Return whether both have the very same points: of one geometry, and the same corners."""

@@ -116,14 +116,15 @@ class PairRays:
         """Return the rays of all pairs."""
         at = grown.valid
         pixels1, pixels2 = grown.pixels1[at], grown.pixels2[at]
-        (rays1, seen1), (rays2, seen2) = camera1.unproject(pixels1), camera2.unproject(pixels2)
+        rays1, seen1, jacobians1 = camera1.rays_and_jacobians(pixels1)
+        rays2, seen2, jacobians2 = camera2.rays_and_jacobians(pixels2)
         return cls(
             grown=grown,
             nodes=np.flatnonzero(at.ravel()),
             rays1=rays1,
             rays2=rays2,
-            jacobians1=camera1.ray_jacobian(pixels1),
-            jacobians2=camera2.ray_jacobian(pixels2),
+            jacobians1=jacobians1,
+            jacobians2=jacobians2,
             seen=seen1 & seen2,
         )
 

@@ -11,9 +11,9 @@ between lenses that distort the map is none: that moved matches by up to 0.02 px
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -54,6 +54,8 @@ SIMULATED, 6 to 24 directions, none to a quarter of the matches wrong: of 1.5 ma
 found are below a twentieth of what is true, of 3 below two thirds, of 5 none are below half."""
 REACH_SIGMAS = 0.2
 """Derivatives are differences over this part of the standard deviations of theta."""
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -142,8 +144,7 @@ def evidence_of_matches(monitored: Monitored, matches: Sequence[PairMatches]) ->
     n = layout.count
     information, scores, variances, disagreements = [], [], [], []
     squares, left_squares, count, freedom = 0.0, 0.0, 0, 0.0
-    for pair in matches:
-        residual, jacobian, good = _linearised(monitored, pair)
+    for pair, (residual, jacobian, good) in zip(matches, _linearised(monitored, matches), strict=True):
         if len(residual) == 0:
             raise DegenerateError("check: the lenses see none of the matches; check which camera took which picture")
         left, weight, sigma = _unexplained(residual, jacobian, layout.mount(pair.second))
@@ -175,30 +176,58 @@ def evidence_of_matches(monitored: Monitored, matches: Sequence[PairMatches]) ->
     )
 
 
-def _linearised(monitored: Monitored, pair: PairMatches) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return the Sampson distances (M,) px of the matches that the cameras see, their derivatives (M, T), and which of
-    N these are."""
-    reach = REACH_SIGMAS * np.sqrt(np.diag(monitored.covariance))
-    views = ((pair.first, pair.pixels1), (pair.second, pair.pixels2))
-    typical = [_SeenRays.by(monitored.cameras[c], pixels) for c, pixels in views]
-    residual = _distances(monitored, pair, typical)
-    layout = monitored.layout
+def _linearised(monitored: Monitored, matches: Sequence[PairMatches]) -> list[tuple[FloatArray, FloatArray, BoolArray]]:
+    """Return, for each of `matches`, the Sampson distances (M,) px of those that the cameras see, their derivatives
+    (M, T), and which of N these are."""
+    found = {}
+    for numbers in dict.fromkeys((pair.first, pair.second) for pair in matches):
+        own = [k for k, pair in enumerate(matches) if (pair.first, pair.second) == numbers]
+        pixels1, pixels2 = (np.concatenate([getattr(matches[k], name) for k in own]) for name in ("pixels1", "pixels2"))
+        residual, jacobian = _derivatives(monitored, numbers, (pixels1, pixels2))
+        ends = np.cumsum([len(matches[k].pixels1) for k in own[:-1]], dtype=np.int64)
+        for k, r, J in zip(own, np.split(residual, ends), np.split(jacobian, ends), strict=True):
+            good = np.isfinite(r) & np.isfinite(J).all(axis=1)
+            found[k] = r[good], J[good], np.asarray(good)
+    return [found[k] for k in range(len(matches))]
+
+
+def _derivatives(
+    monitored: Monitored, numbers: tuple[int, int], pixels: tuple[Pixels, Pixels]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the Sampson distances (N,) px of matches of two cameras and their derivatives (N, T)."""
+    layout, reach = monitored.layout, REACH_SIGMAS * np.sqrt(np.diag(monitored.covariance))
+    poses = [monitored.cam_from_rig[c] for c in numbers]
+    seen = [_SeenRays.by(monitored.cameras[c], p) for c, p in zip(numbers, pixels, strict=True)]
+    residual = _distances(poses, seen)
     jacobian = np.zeros((len(residual), layout.count))
-    for k in np.flatnonzero(reach > 0.0).tolist():
-        step = np.zeros(layout.count)
-        step[k] = reach[k]
-        moved = [c for c, _ in views if layout.cameras[c].start <= k < layout.cameras[c].stop]
-        ends = []
-        for changed in (monitored.changed(step), monitored.changed(-step)):
-            # Of a lens that stays, rays stay.
-            seen = [
-                _SeenRays.by(changed.cameras[c], pixels) if c in moved else same
-                for (c, pixels), same in zip(views, typical, strict=True)
-            ]
-            ends.append(_distances(changed, pair, seen))
+
+    def differ(k: int, ends: list[FloatArray]) -> None:
         jacobian[:, k] = (ends[0] - ends[1]) / (2.0 * reach[k])
-    good = np.isfinite(residual) & np.isfinite(jacobian).all(axis=1)
-    return residual[good], jacobian[good], np.asarray(good)
+
+    # A lens changes its rays alone, and its mount none.
+    for side, c in enumerate(numbers):
+        camera, lens, mount = monitored.cameras[c], layout.cameras[c], layout.mounts[c]
+        for k, step in _steps(lens, reach):
+            changed = [camera.with_parameters(camera.parameters + change) for change in (step, -step)]
+            differ(k, [_distances(poses, _but(seen, side, _SeenRays.by(one, pixels[side]))) for one in changed])
+        for k, step in _steps(mount, reach) if mount is not None else ():
+            moved = [poses[side].moved(change) for change in (step, -step)]
+            differ(k, [_distances(_but(poses, side, one), seen) for one in moved])
+    return residual, jacobian
+
+
+def _steps(own: slice, reach: FloatArray) -> Iterator[tuple[int, FloatArray]]:
+    """Yield the numbers of the parameters in `own` that may differ, each with a step along it alone."""
+    for k, size in enumerate(reach[own].tolist()):
+        if size > 0.0:
+            step = np.zeros(own.stop - own.start)
+            step[k] = size
+            yield own.start + k, step
+
+
+def _but(items: Sequence[Item], at: int, item: Item) -> list[Item]:
+    """Return `items` with `item` in the place `at`."""
+    return [*items[:at], item, *items[at + 1 :]]
 
 
 def _unexplained(residual: FloatArray, jacobian: FloatArray, mount: slice) -> tuple[FloatArray, FloatArray, float]:
@@ -249,13 +278,14 @@ class _SeenRays:
 
     @classmethod
     def by(cls, camera: Camera, pixels: Pixels) -> _SeenRays:
-        rays, valid = camera.unproject(pixels)
-        return cls(rays, camera.ray_jacobian(pixels), valid)
+        rays, valid, jacobians = camera.rays_and_jacobians(pixels)
+        return cls(rays, jacobians, valid)
 
 
-def _distances(monitored: Monitored, pair: PairMatches, seen: Sequence[_SeenRays]) -> FloatArray:
-    """Return the Sampson distances (N,) px of a pair's matches, NaN where a camera does not see them."""
-    motion = _motion(monitored, pair.first, pair.second)
+def _distances(poses: Sequence[Rigid3], seen: Sequence[_SeenRays]) -> FloatArray:
+    """Return the Sampson distances (N,) px of matches of two cameras in `poses` cam_from_rig, NaN where one of them
+    does not see them."""
+    motion = poses[1] @ poses[0].inverse()
     essential = skew(motion.translation_mm) @ motion.rotation
     first, second = seen
     found = sampson_distances(essential, first.rays, second.rays, first.jacobians, second.jacobians)
