@@ -97,8 +97,7 @@ def judge(
     also : findings from elsewhere.
     far, clusters : results of `FarProjection.of` and `cluster_numbers` (V,), if known.
     in_force : those of "model" and "board_shape" that were "auto", so that this is no remedy.
-    solved : observations and fit of the calibration, if known.
-    order : names of all images in the order given, also of those left out.
+    solved, order : observations and fit of the calibration, if known, and the names of all images in the order given.
     """
     far = FarProjection.of(calibration) if far is None else far
     clusters = _clusters(calibration.views) if clusters is None else clusters
