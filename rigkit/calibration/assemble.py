@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -105,6 +106,17 @@ def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:
             "calibration: the views leave the focal length open (all boards nearly parallel to the image, or too few "
             "corners); take views in which the board is tilted by 20 to 50 degrees in several directions"
         )
+
+
+def with_solution(
+    calibration: Calibration, observations: Observations, state: State, residuals: Residuals, kept: BoolArray
+) -> Calibration:
+    """Return the calibration with camera, views and boards of another solution, for diagnosis."""
+    return replace(
+        calibration.with_near(state.camera),
+        views=view_results(observations, state, residuals, kept),
+        boards=board_shapes(observations, state.shape, state.unknowns),
+    )
 
 
 def view_results(

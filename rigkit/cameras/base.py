@@ -256,9 +256,8 @@ class Camera(ABC):
         flat = points.reshape(-1, 3)
         d_pixels_d_point = np.zeros((2, 3, flat.shape[0]))
         d_pixels_d_parameters = np.zeros((2, self.parameters.size, flat.shape[0]))
-        with np.errstate(all="ignore"):
-            at = flat[:, 0], flat[:, 1], flat[:, 2]
-            u, v, valid = self._derivatives(at, d_pixels_d_point, d_pixels_d_parameters)
+        x, y, z = flat.T
+        u, v, valid = self.derivatives(x, y, z, d_pixels_d_point, d_pixels_d_parameters)
         pixels = np.stack([u, v], axis=-1)
         if not valid.all():
             _blank(pixels, valid)

@@ -61,17 +61,13 @@ class KannalaBrandt(CompiledCamera):
         slope = np.array([1.0, *((3.0 + 2.0 * k) * a for k, a in enumerate(self.parameters[4:].tolist()))])
         object.__setattr__(self, "_max_angle", math.sqrt(first_root(slope, math.pi**2)))
 
-    def _factor(self, theta2: FloatArray) -> FloatArray:
-        """|m| / theta."""
-        return horner(np.concatenate([[1.0], self.parameters[4:]]), theta2)
-
     def _shape(self) -> tuple[FloatArray, tuple[float, float]]:
         return self.parameters[4:], (self._max_angle, 0.0)
 
     def _profile(self, radius2: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         radius = np.sqrt(radius2)
         knots = np.linspace(0.0, self._max_angle, KNOTS)
-        values = knots * self._factor(knots * knots)
+        values = knots * horner(np.concatenate([[1.0], self.parameters[4:]]), knots * knots)
         valid = radius <= values[-1]
         radius = np.where(valid, radius, 0.0)
         odd = np.zeros(10)

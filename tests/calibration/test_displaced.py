@@ -78,9 +78,9 @@ def far_variance(known: UncertainCamera, calibration: Calibration, pixels: Float
     sigmas = np.sqrt(np.diag(known.covariance))
     corners = projection_design(camera, FarProjection.of(calibration).corners.rays)
     there = corners.transpose(1, 0, 2).reshape(p + 3, -1)
-    hides = np.linalg.lstsq(there[p:].T, (sigmas[:, None] * there[:p]).T, rcond=None)[0]
+    compensation = np.linalg.lstsq(there[p:].T, (sigmas[:, None] * there[:p]).T, rcond=None)[0]
     design = projection_design(camera, calibration.camera.unproject(pixels)[0])
-    left = sigmas[:, None] * design[:, :p] - np.einsum("wp,iwm->ipm", hides, design[:, p:])
+    left = sigmas[:, None] * design[:, :p] - np.einsum("wp,iwm->ipm", compensation, design[:, p:])
     return np.asarray(np.einsum("ikm,kl,ilm->m", left, known.covariance / np.outer(sigmas, sigmas), left))
 
 
@@ -156,7 +156,7 @@ def test_a_rival_is_followed_without_a_turn_and_by_small_amounts() -> None:
     found, other = (calibrate(views, SIZE, model="scaramuzza", degree=k, board="flat", folds=0) for k in (6, 7))
     calibration = replace(found, rivals=(Rival("scaramuzza 7", other.camera, LIKELY),))
     alone, beside = (
-        float(np.linalg.norm(FarProjection.of(one).hides_departures @ lens_modes(one).modes))
+        float(np.linalg.norm(FarProjection.of(one).departure_compensation @ lens_modes(one).modes))
         for one in (found, calibration)
     )
     rim = found.camera.unproject(np.array([[20.0, 20.0], [1600.0, 1220.0]]))[0]

@@ -11,7 +11,13 @@ from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, projection_
 from rigkit.calibration import calibrate as module
 from rigkit.calibration.calibrate import calibrate, calibrate_together
 from rigkit.calibration.certainty import uncertainty
-from rigkit.calibration.certainty.uncertainty import Along, FarProjection, followed, projection_design, worst_direction
+from rigkit.calibration.certainty.uncertainty import (
+    Along,
+    FarProjection,
+    projection_design,
+    step_to_lens,
+    worst_direction,
+)
 from rigkit.calibration.choosing.between_models import rival_fits, rival_shapes
 from rigkit.calibration.choosing.choice import FittedModel, HeldOut, choose, described, settled
 from rigkit.calibration.choosing.lens_choice import choose_lenses, twins
@@ -121,7 +127,7 @@ def test_another_lens_is_followed_where_the_model_can() -> None:
     step = 1e-4 * camera.parameters
     turn = exp_so3(np.array([0.002, -0.001, 0.003]))
     other = camera.with_parameters(camera.parameters + step)
-    found, rotation = followed(camera, other, rays @ turn.T, np.abs(step))
+    found, rotation = step_to_lens(camera, other, rays @ turn.T, np.abs(step))
     pixels = camera.project(rays @ turn.T)[0]
     there = other.project(rays @ turn.T @ rotation.T)[0]
     design = projection_design(camera, rays @ turn.T)[:, : camera.parameters.size]
@@ -170,7 +176,7 @@ def test_where_no_board_was_a_richer_rival_counts_with_what_it_leaves_open() -> 
         worst_direction(one.covariance(rim) - one.beyond_model(Along.of(one.camera, rim))) for one in (alone, own)
     )
     assert (open_ > 1.5 * known).all()
-    away = np.array([np.outer(d, d) for d in both.away(Along.of(found.camera, rim))[0]])
+    away = np.array([np.outer(d, d) for d in both.shifts_px(Along.of(found.camera, rim))[0]])
     added = worst_direction(both.covariance(rim) - alone.covariance(rim) - away) ** 2
     assert added == pytest.approx(0.5 * (open_**2 - known**2), rel=0.3)
     # Where boards were it knows nearly as much.

@@ -107,4 +107,4 @@ def test_a_closed_formula_leaves_nothing_out() -> None:
 def test_terms_left_out_are_fields_of_their_own(sessions: list[Calibration]) -> None:
     far = FarProjection.of(sessions[0])
     assert far.remainder is not None
-    assert far.remainder.away(far.corners.design).shape == (LEFT_OUT, len(far.corners.rays), 2)
+    assert far.remainder.shifts_px(far.corners.design).shape == (LEFT_OUT, len(far.corners.rays), 2)

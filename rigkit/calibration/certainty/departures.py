@@ -55,14 +55,14 @@ class Departures:
     ----------
     size_px : (width, height) of the images.
     covariance : (J, J) px^2, second moments about zero of the amounts of the J displacements, given the images.
-    followed : (P, J) change of the fitted parameters with each displacement.
-    followed_by_pupil : (2, J) the same of the pupil's terms; (0, J) for a central lens.
+    parameter_changes : (P, J) change of the fitted parameters with each displacement.
+    pupil_changes : (2, J) the same of the pupil's terms; (0, J) for a central lens.
     """
 
     size_px: tuple[int, int]
     covariance: FloatArray
-    followed: FloatArray
-    followed_by_pupil: FloatArray
+    parameter_changes: FloatArray
+    pupil_changes: FloatArray
 
     @classmethod
     def of(cls, calibration: Calibration) -> Departures:
@@ -72,17 +72,17 @@ class Departures:
         if not (np.isfinite(products).all() and products[-1, -1] >= 0.0):
             # A lens beyond the range of floating-point numbers, from a damaged file.
             products = np.zeros_like(products)
-        followed, left, variance = _without_parameters(calibration, products, len(sigmas), freedom)
+        changes, left, variance = _without_parameters(calibration, products, len(sigmas), freedom)
         covariance = _averaged(left[:-1, :-1] / variance, left[:-1, -1] / variance)
-        moved = sigmas[:, None] * followed[:, :-1]
+        moved = sigmas[:, None] * changes[:, :-1]
         own = calibration.camera.parameters.size
         return cls(calibration.camera.size_px, covariance, moved[:own], moved[own:])
 
-    def left_over(self, pixels: Pixels, design: FloatArray) -> FloatArray:
+    def unabsorbed(self, pixels: Pixels, design: FloatArray) -> FloatArray:
         """Return the displacements (2, J, M) at pixels (M, 2) less the part that the parameters absorb; `design`
         (2, K, M) are the projection's derivatives there, those by the parameters first."""
-        own = design[:, : len(self.followed)]
-        return displacements(pixels, self.size_px) - np.swapaxes(np.swapaxes(own, 1, 2) @ self.followed, 1, 2)
+        own = design[:, : len(self.parameter_changes)]
+        return displacements(pixels, self.size_px) - np.swapaxes(np.swapaxes(own, 1, 2) @ self.parameter_changes, 1, 2)
 
 
 def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
@@ -119,10 +119,10 @@ def _without_parameters(
     products (K - p, K - p) of the others without those, and the variance of the residuals, the last row, between
     images."""
     of_parameters = products[:p, :p] + RIDGE * max(np.trace(products[:p, :p]), 1.0) / p * np.eye(p)
-    followed = np.linalg.solve(of_parameters, products[:p, p:])
-    left = products[p:, p:] - products[p:, :p] @ followed
+    changes = np.linalg.solve(of_parameters, products[:p, p:])
+    left = products[p:, p:] - products[p:, :p] @ changes
     variance = max(float(left[-1, -1]) / max(freedom - p, 1), SMALLEST_PX**2) * calibration.overdispersion**2
-    return followed, left, variance
+    return changes, left, variance
 
 
 def information_of_lens(calibration: Calibration, camera: Camera, turn: Mat3) -> FloatArray:

@@ -191,10 +191,10 @@ def lens_modes(calibration: Calibration, *, near: bool = False) -> LensModes:
     """Return the model inadequacy of a calibrated lens, with the errors of its parameters, and with `near` those of its
     pupil."""
     far = FarProjection.of(calibration)
-    modes, followed = significant_modes(far), far.departures.followed
+    modes, changes = significant_modes(far), far.departures.parameter_changes
     if near:
-        followed = np.concatenate([followed, far.departures.followed_by_pupil])
-    return LensModes(modes, -followed @ modes, -far.hides_departures @ modes)
+        changes = np.concatenate([changes, far.departures.pupil_changes])
+    return LensModes(modes, -changes @ modes, -far.departure_compensation @ modes)
 
 
 def with_modes(
@@ -239,11 +239,11 @@ def significant_modes(far: FarProjection) -> FloatArray:
         return np.zeros((DISPLACEMENTS, 0))
     # In units of the total sigma, so that places count alike.
     at, whole = at[known], whole[known]
-    relative = far.left_over(at).transpose(1, 2, 0) / whole[:, None]
+    relative = far.unabsorbed(at).transpose(1, 2, 0) / whole[:, None]
     fields = relative.reshape(DISPLACEMENTS, -1)
     covariance = far.departures.covariance.copy()
-    for away in far.away(at):
-        amounts = _amounts_like(far, at, whole, fields, away)
+    for shift_px in far.shifts_px(at):
+        amounts = _amounts_like(far, at, whole, fields, shift_px)
         covariance += np.outer(amounts, amounts)
     values, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(values, 0.0))
@@ -255,32 +255,34 @@ def significant_modes(far: FarProjection) -> FloatArray:
     return np.asarray((root @ turn)[:, matters])
 
 
-def _amounts_like(far: FarProjection, at: Along, whole: FloatArray, fields: FloatArray, away: FloatArray) -> FloatArray:
-    """Return the amounts (J,) with which the displaced camera, its parameters adapted, moves M rays closest to `away`
-    (M, 2) px, in units of `whole` (M,) px. `fields` (J, 2 M) are the displacements, in these units, less the part that
-    parameters and a rotation absorb.
+def _amounts_like(
+    far: FarProjection, at: Along, whole: FloatArray, fields: FloatArray, shift_px: FloatArray
+) -> FloatArray:
+    """Return the amounts (J,) with which the displaced camera, its parameters adapted, moves M rays closest to
+    `shift_px` (M, 2) px, in units of `whole` (M,) px. `fields` (J, 2 M) are the displacements, in these units, less the
+    part that parameters and a rotation absorb.
 
     At first order, huge displacements that parameters and a rotation compensate almost completely could represent any
     difference, but the exact camera would not. So the rotation is fitted to zero and large amounts are penalised
     (ridge); the penalty is the one with which the exact displaced camera has the least error.
     """
     p = len(far.sigmas)
-    turned = np.einsum("wj,iwm->jmi", far.hides_departures, at.design[:, p:]) / whole[:, None]
+    turned = np.einsum("wj,iwm->jmi", far.departure_compensation, at.design[:, p:]) / whole[:, None]
     values, axes = np.linalg.eigh(far.departures.covariance)
     root = axes * np.sqrt(np.maximum(values, 0.0))
     rows = np.concatenate([fields, turned.reshape(DISPLACEMENTS, -1)], axis=1).T @ root
-    wanted = np.concatenate([(away / whole[:, None]).ravel(), np.zeros(2 * len(at.rays))])
+    wanted = np.concatenate([(shift_px / whole[:, None]).ravel(), np.zeros(2 * len(at.rays))])
     left, size, right = np.linalg.svd(rows, full_matrices=False)
     best, amounts = float((wanted**2).sum()), np.zeros(DISPLACEMENTS)
     for penalty in size[0] * np.geomspace(SOFTEST, HARDEST, PENALTIES):
         tried = root @ (right.T @ (size / (size**2 + penalty**2) * (left.T @ wanted)))
-        parameters = np.append(far.camera.parameters - far.departures.followed @ tried, tried)
+        parameters = np.append(far.camera.parameters - far.departures.parameter_changes @ tried, tried)
         try:
             moved = DisplacedCamera(far.camera.size_px, parameters, far.camera, np.eye(DISPLACEMENTS))
             shown, valid = moved.project(at.rays)
         except InputError:
             continue
-        off = ((np.where(valid[:, None], shown, np.inf) - at.pixels - away) / whole[:, None]).ravel()
+        off = ((np.where(valid[:, None], shown, np.inf) - at.pixels - shift_px) / whole[:, None]).ravel()
         error = float((off**2).sum())
         if error < best:
             best, amounts = error, tried

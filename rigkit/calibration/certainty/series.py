@@ -47,10 +47,10 @@ class Remainder:
     amounts: FloatArray
 
     @classmethod
-    def of(cls, calibration: Calibration, covariance: FloatArray, hides: FloatArray) -> Remainder | None:
-        """Return that of a calibrated lens with the `covariance` (P, P) of its parameters; `hides` (3, P) are the
-        rotations that compensate a step of each best where boards were. None where the model is no series, or its last
-        term is not significant."""
+    def of(cls, calibration: Calibration, covariance: FloatArray, compensation: FloatArray) -> Remainder | None:
+        """Return that of a calibrated lens with the `covariance` (P, P) of its parameters; `compensation` (3, P) are
+        the rotations that compensate a step of each best where boards were. None where the model is no series, or its
+        last term is not significant."""
         terms = calibration.camera.series[-TERMS:][::-1]
         if len(terms) < TERMS:
             return None
@@ -62,7 +62,7 @@ class Remainder:
             # Regression of the parameters on this one.
             along = left[:, term] / variance
             step = along * np.sign(size) * np.sqrt(max(size * size - variance, 0.0))
-            steps.append(np.concatenate([step, -hides @ step]))
+            steps.append(np.concatenate([step, -compensation @ step]))
             left -= np.outer(along, left[term])
             value -= along * size
         if not steps[0].any():
@@ -71,7 +71,7 @@ class Remainder:
         values, axes = np.linalg.eigh(amounts_of(calibration, lambda design: _left_out(design, last, before)))
         return cls(last, before, (axes * np.sqrt(np.maximum(values, 0.0))).T)
 
-    def away(self, design: FloatArray) -> FloatArray:
+    def shifts_px(self, design: FloatArray) -> FloatArray:
         """Return the displacements (LEFT_OUT, M, 2) px of the projection by its independent parts, one standard
         deviation each; `design` (2, P + 3, M) are the derivatives by parameters and rotations."""
         return np.asarray(np.einsum("kj,ijm->kmi", self.amounts, _left_out(design, self.last, self.before)))

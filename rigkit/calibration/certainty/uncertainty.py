@@ -113,8 +113,9 @@ class FarProjection:
     correlation, sigmas : (P, P) and (P,) of its parameters.
     rays_valid : (M,) which of up to 400 corners, spread over all views, have a ray.
     corners : the projection along those N rays.
-    hides : (3, P) the rotation that compensates a step of one standard deviation of each parameter.
-    departures, hides_departures : model inadequacy of the lens, and (3, J) the rotations that compensate displacements.
+    compensation : (3, P) the rotation that compensates a step of one standard deviation of each parameter.
+    departures, departure_compensation : model inadequacy of the lens, and (3, J) the rotations that compensate
+        displacements.
     corners_left : (2, P + J, N) displacement of the corners by such steps and displacements after these rotations.
     rivals : cameras of other models, each with the change of the parameters (P,) that fits `camera` to it where boards
         were, and the rotation of its rays (3, 3). Elsewhere the two differ.
@@ -127,9 +128,9 @@ class FarProjection:
     sigmas: FloatArray
     rays_valid: BoolArray
     corners: Along
-    hides: FloatArray
+    compensation: FloatArray
     departures: Departures
-    hides_departures: FloatArray
+    departure_compensation: FloatArray
     corners_left: FloatArray
     rivals: tuple[tuple[Rival, FloatArray, Mat3], ...]
     remainder: Remainder | None
@@ -151,10 +152,10 @@ class FarProjection:
         known = calibration.widening**2 * calibration.covariance
         sigmas = np.sqrt(np.maximum(np.diag(known), 0.0))
         at, departures = Along.of(camera, rays), Departures.of(calibration)
-        left = np.concatenate([sigmas[:, None] * at.design[:, :p], departures.left_over(at.pixels, at.design)], axis=1)
+        left = np.concatenate([sigmas[:, None] * at.design[:, :p], departures.unabsorbed(at.pixels, at.design)], axis=1)
         turned = at.design[:, p:]
-        hides = _hiding_rotations(turned, left)
-        left -= hides.T @ turned
+        compensation = _compensating_rotations(turned, left)
+        left -= compensation.T @ turned
         safe = np.where(sigmas > 0.0, sigmas, 1.0)
         correlation = known / np.outer(safe, safe)
         return cls(
@@ -164,12 +165,12 @@ class FarProjection:
             sigmas=sigmas,
             rays_valid=valid,
             corners=at,
-            hides=hides[:, :p],
+            compensation=compensation[:, :p],
             departures=departures,
-            hides_departures=hides[:, p:],
+            departure_compensation=compensation[:, p:],
             corners_left=left,
-            rivals=tuple((one, *followed(camera, one.camera, rays, sigmas)) for one in calibration.rivals),
-            remainder=Remainder.of(calibration, known, hides[:, :p] / safe),
+            rivals=tuple((one, *step_to_lens(camera, one.camera, rays, sigmas)) for one in calibration.rivals),
+            remainder=Remainder.of(calibration, known, compensation[:, :p] / safe),
         )
 
     def covariance(self, rays: FloatArray) -> FloatArray:
@@ -179,9 +180,9 @@ class FarProjection:
 
     def beyond_model(self, at: Along) -> FloatArray:
         """Return the part of the covariance (M, 2, 2) from model inadequacy and rivals."""
-        return self._beyond(self.left_over(at), at) + self._less_sure(at.rays)
+        return self._beyond(self.unabsorbed(at), at) + self._rival_excess(at.rays)
 
-    def _less_sure(self, rays: Rays) -> FloatArray:
+    def _rival_excess(self, rays: Rays) -> FloatArray:
         """Return the excess (M, 2, 2) of the rivals' own covariances along `rays` (M, 3) over that of the chosen lens,
         weighted by their probabilities (Buckland et al. 1997, eq. 9): if a rival is right, its covariance is.
 
@@ -215,16 +216,16 @@ class FarProjection:
 
     def _beyond(self, left: FloatArray, at: Along) -> FloatArray:
         out = _propagated(self.departures.covariance, left)
-        for away in self.away(at):
-            out += away[:, :, None] * away[:, None, :]
+        for shift_px in self.shifts_px(at):
+            out += shift_px[:, :, None] * shift_px[:, None, :]
         return out
 
-    def left_over(self, at: Along) -> FloatArray:
+    def unabsorbed(self, at: Along) -> FloatArray:
         """Return the displacements less the part that parameters and rotation absorb, (2, J, M) px."""
-        left = self.departures.left_over(at.pixels, at.design)
-        return _less_rotation(left, self.hides_departures, at.design[:, len(self.sigmas) :])
+        left = self.departures.unabsorbed(at.pixels, at.design)
+        return _less_rotation(left, self.departure_compensation, at.design[:, len(self.sigmas) :])
 
-    def away(self, at: Along) -> list[FloatArray]:
+    def shifts_px(self, at: Along) -> list[FloatArray]:
         """Return the displacements (M, 2) px of the rays in other lenses that may be the true one: each rival, with the
         chosen lens fitted to it where boards were, times the root of its probability, and the truncated terms of the
         series."""
@@ -234,7 +235,7 @@ class FarProjection:
             moved = np.where(seen[:, None], there - at.pixels, 0.0) - np.einsum("ipm,p->mi", at.design[:, :p], step)
             out.append(np.sqrt(rival.likely) * moved)
         if self.remainder is not None:
-            out += list(self.remainder.away(at.design))
+            out += list(self.remainder.shifts_px(at.design))
         return out
 
     @cached_property
@@ -272,7 +273,7 @@ class FarProjection:
     def _of_parameters(self, design: FloatArray) -> FloatArray:
         p = len(self.sigmas)
         return _propagated(
-            self.correlation, _less_rotation(self.sigmas[:, None] * design[:, :p], self.hides, design[:, p:])
+            self.correlation, _less_rotation(self.sigmas[:, None] * design[:, :p], self.compensation, design[:, p:])
         )
 
 
@@ -283,7 +284,7 @@ class _Alone:
 
     camera: Camera
     covariance: FloatArray
-    hides: FloatArray
+    compensation: FloatArray
 
     @classmethod
     def of(cls, calibration: Calibration, camera: Camera, turn: Mat3, rays: Rays) -> _Alone:
@@ -293,24 +294,24 @@ class _Alone:
         covariance = scaled_pinv(information_of_lens(calibration, camera, turn))
         sigma = calibration.sigma_px * calibration.overdispersion * calibration.widening
         design, p = projection_design(camera, rays @ turn.T), len(covariance)
-        return cls(camera, covariance * sigma**2, _hiding_rotations(design[:, p:], design[:, :p]))
+        return cls(camera, covariance * sigma**2, _compensating_rotations(design[:, p:], design[:, :p]))
 
     def along(self, rays: Rays) -> FloatArray:
         """Return the covariance (M, 2, 2) of the projection along rays (M, 3) of the lens itself."""
         design, p = projection_design(self.camera, rays), len(self.covariance)
-        return _propagated(self.covariance, _less_rotation(design[:, :p], self.hides, design[:, p:]))
+        return _propagated(self.covariance, _less_rotation(design[:, :p], self.compensation, design[:, p:]))
 
 
-def _hiding_rotations(turned: FloatArray, moved: FloatArray) -> FloatArray:
+def _compensating_rotations(turned: FloatArray, moved: FloatArray) -> FloatArray:
     """Return the rotations (3, K) that compensate displacements `moved` (2, K, M) of M pixels best; `turned` (2, 3, M)
     is d pixel / d rotation."""
     square = (turned @ np.swapaxes(turned, 1, 2)).sum(axis=0)
     return np.asarray(symmetric_pinv(square) @ (turned @ np.swapaxes(moved, 1, 2)).sum(axis=0))
 
 
-def _less_rotation(moved: FloatArray, hides: FloatArray, turned: FloatArray) -> FloatArray:
-    """Return displacements (2, K, M) after the rotations `hides` (3, K) that compensate them."""
-    return np.asarray(moved - np.einsum("wk,iwm->ikm", hides, turned))
+def _less_rotation(moved: FloatArray, compensation: FloatArray, turned: FloatArray) -> FloatArray:
+    """Return displacements (2, K, M) after the rotations `compensation` (3, K) that compensate them."""
+    return np.asarray(moved - np.einsum("wk,iwm->ikm", compensation, turned))
 
 
 def _propagated(parameters: FloatArray, design: FloatArray) -> FloatArray:
@@ -345,7 +346,7 @@ def _projected(camera: Camera, rays: FloatArray, range_mm: float) -> tuple[Pixel
     return pixels, design
 
 
-def followed(camera: Camera, other: Camera, rays: Rays, sigmas: FloatArray) -> tuple[FloatArray, Mat3]:
+def step_to_lens(camera: Camera, other: Camera, rays: Rays, sigmas: FloatArray) -> tuple[FloatArray, Mat3]:
     """Return the change of the parameters (P,) of a camera that fits it to another one along `rays` (N, 3), and the
     rotation other_from_camera (3, 3) of the rays fitted with it; `sigmas` (P,) scale the parameters."""
     pixels, valid = camera.project(rays)

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.certainty.covariance import motion_of_world
-from rigkit.calibration.certainty.uncertainty import followed
+from rigkit.calibration.certainty.uncertainty import step_to_lens
 from rigkit.calibration.choosing.choice import FittedModel, HeldOut
 from rigkit.calibration.result import Candidate, Rival
 from rigkit.calibration.solving.fit import Fit, fit_other_lens
@@ -120,7 +120,7 @@ def between_models(
     rays = spread_rays(points[chosen.kept])
     here, far = chosen.state, far_camera(chosen.state.camera)
     for one in rivals:
-        step, turn = followed(far, one.rival.camera, rays, sigmas[: far.parameters.size])
+        step, turn = step_to_lens(far, one.rival.camera, rays, sigmas[: far.parameters.size])
         # The pupil moves along the axis of its own lens: its terms are compared directly.
         terms = one.state.camera.parameters[one.rival.camera.parameters.size :]
         pupil = terms - here.camera.parameters[far.parameters.size :]

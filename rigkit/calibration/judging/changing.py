@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.assemble import board_shapes, view_results
+from rigkit.calibration.assemble import with_solution
 from rigkit.calibration.judging.turned import flipped_pictures
 from rigkit.calibration.judging.two_kinds import two_kinds
 from rigkit.calibration.judging.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
@@ -171,12 +171,7 @@ def _solved_for(
     _, directions, amounts = evidence.explained(columns)
     for rounds in range(LENS_ROUNDS):
         if rounds:
-            solved = replace(
-                calibration.with_near(start.camera),
-                views=view_results(observations, start, residuals, fit.kept),
-                boards=board_shapes(observations, start.shape, start.unknowns),
-            )
-            now = view_evidence(solved, clusters)
+            now = view_evidence(with_solution(calibration, observations, start, residuals, fit.kept), clusters)
             if now is None:
                 return at_first
             evidence, (_, _, amounts) = now, now.explained(columns)

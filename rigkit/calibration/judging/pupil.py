@@ -70,13 +70,13 @@ class MovingPupil:
     mm_per_rad2, sigma_mm_per_rad2 : forward movement per squared angle, and its standard deviation from the scatter
         between images.
     freedom : degrees of freedom of the latter.
-    followed : (P,) change of the camera's parameters if the movement were modelled.
+    parameter_changes : (P,) change of the camera's parameters if the movement were modelled.
     """
 
     mm_per_rad2: float
     sigma_mm_per_rad2: float
     freedom: float
-    followed: FloatArray
+    parameter_changes: FloatArray
 
     @classmethod
     def of(cls, calibration: Calibration) -> MovingPupil | None:
@@ -123,7 +123,9 @@ class MovingPupil:
         it best."""
         safe = np.where(far.sigmas > 0.0, far.sigmas, 1.0)
         moved = np.einsum(
-            "ipm,p->im", far.corners.design, np.append(self.followed, -far.hides @ (self.followed / safe))
+            "ipm,p->im",
+            far.corners.design,
+            np.append(self.parameter_changes, -far.compensation @ (self.parameter_changes / safe)),
         )
         return float(np.sqrt((moved**2).sum(axis=0).mean()))
 

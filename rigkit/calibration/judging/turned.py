@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.assemble import board_shapes, view_results
+from rigkit.calibration.assemble import with_solution
 from rigkit.calibration.choosing.board_orientation import with_views_turned
 from rigkit.calibration.judging.two_kinds import MIN_LEAD, split_in_two
 from rigkit.calibration.judging.view_evidence import ViewEvidence, columns_of, view_evidence
@@ -81,11 +81,8 @@ def flipped_pictures(
     if not tried or not before > 0.0:
         return None
     back = min(tried, key=lambda one: one.squares)
-    solved = replace(
-        calibration.with_near(back.state.camera),
-        views=view_results(back.observations, back.state, evaluate(back.state, back.observations), fit.kept),
-        boards=board_shapes(back.observations, back.state.shape, back.state.unknowns),
-    )
+    residuals = evaluate(back.state, back.observations)
+    solved = with_solution(calibration, back.observations, back.state, residuals, fit.kept)
     now = view_evidence(solved, clusters)
     return None if now is None else _finding_of(back, before, now)
 

@@ -216,21 +216,16 @@ class _Options:
                 continue
             model = self.model if isinstance(self.model, str) else self.model[name]
             degree = self.degree[name] if isinstance(self.degree, Mapping) else self.degree
-            asked.append(
-                (
-                    name,
-                    alone,
-                    Request(
-                        size_px=self.sizes_px[name],
-                        model=model,
-                        degree=degree,
-                        board=self.board,
-                        folds=self.folds,
-                        progress=silent,
-                        pupil=self.pupil,
-                    ),
-                )
+            request = Request(
+                size_px=self.sizes_px[name],
+                model=model,
+                degree=degree,
+                board=self.board,
+                folds=self.folds,
+                progress=silent,
+                pupil=self.pupil,
             )
+            asked.append((name, alone, request))
         names = [name for name, _, _ in asked]
         found |= dict(zip(names, calibrate_together(asked, known=self.begun, progress=progress), strict=True))
         if self.pupil == "auto" and any(found[name].pupil is not None for name in names):

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.certainty.uncertainty import followed
+from rigkit.calibration.certainty.uncertainty import step_to_lens
 from rigkit.calibration.choosing.between_models import same_model, spread_rays
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solving.solver import solve_rig
@@ -64,7 +64,7 @@ def _turns(
     for camera, other, own, run in zip(here.cameras, there.cameras, rays, layout.cameras, strict=True):
         far, far_other = far_camera(camera), far_camera(other)
         p = far.parameters.size
-        step, turn = followed(far, far_other, own, sigmas[run][:p])
+        step, turn = step_to_lens(far, far_other, own, sigmas[run][:p])
         # The pupil moves along the axis of its own lens: its terms are compared directly.
         pupil = other.parameters[far_other.parameters.size :] - camera.parameters[p:]
         steps.append(np.concatenate([step, pupil]))
