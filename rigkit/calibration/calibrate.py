@@ -185,7 +185,8 @@ def _with_verdicts(
     rivals: Sequence[FittedModel],
     likely: Mapping[str, float],
 ) -> Calibration:
-    """Return the result of one solution with its verdicts."""
+    """Return the result of one solution with its verdicts; raises DegenerateError where the views do not determine
+    it."""
     request, fit = begun.request, found.chosen.fit
     others = _others(tried, far_camera(fit.state.camera).model) if len(models_of(tried)) > 1 else []
     close = rival_fits(found.observations, fit, rivals, likely)
@@ -202,10 +203,12 @@ def _with_verdicts(
     )
     in_force = [name for name, value in (("model", request.model), ("board_shape", request.board)) if value == "auto"]
     moved = moved_lens(found.observations, fit) if request.folds else ()
+    far = FarProjection.of(result, from_boards=True)
+    require_determined(result, far.of_parameters_px)
     verdicts = judge(
         result,
         [*moved, *_largest_size_chosen(found.beyond, result, in_force)],
-        far=_determined(result),
+        far=far,
         clusters=found.observations.clusters(),
         in_force=in_force,
         solved=(found.observations, fit),
@@ -221,13 +224,6 @@ def _others(tried: Sequence[FittedModel], model: str) -> list[Candidate]:
         return []
     against = choose(own, MIN_SIGMAS)
     return described([*(o for o in tried if o not in own), against], against)[:-1]
-
-
-def _determined(result: Calibration) -> FarProjection:
-    """Return the uncertainty of the projection; raises DegenerateError where the views do not determine the camera."""
-    far = FarProjection.of(result, from_boards=True)
-    require_determined(result, far.of_parameters_px)
-    return far
 
 
 def _largest_size_chosen(

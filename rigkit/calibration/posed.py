@@ -107,7 +107,7 @@ def _shaped(
 ) -> tuple[Observations, Fit, float | None, tuple[Candidate, ...]]:
     """Return the fit with the board shape asked for, its held-out error, and the candidates; the lens is held."""
     lens = fit.state.camera
-    held = fit_kept(observations, replace(fit.state, camera=HeldLens.of(lens)), fit.kept)
+    held = fit_kept(observations, replace(fit.state, camera=HeldLens(lens.size_px, np.zeros(0), lens)), fit.kept)
     flat = FittedModel("board flat", held, heldout_squares(observations, held, folds))
     observations, chosen, _, candidates = with_board_shape(observations, flat, board, folds, silent)
     if chosen is flat:
@@ -131,11 +131,6 @@ class HeldLens(Camera):
     lens: Camera
 
     model: ClassVar[str] = "held"
-
-    @classmethod
-    def of(cls, lens: Camera) -> HeldLens:
-        """Return `lens` with its parameters held."""
-        return cls(lens.size_px, np.zeros(0), lens)
 
     def parameter_names(self) -> tuple[str, ...]:
         return ()

@@ -175,8 +175,9 @@ class FarProjection:
 
     def covariance(self, rays: FloatArray) -> FloatArray:
         """Return the covariance (M, 2, 2) of the projection along rays (M, 3)."""
-        at = Along.of(self.camera, rays)
-        return self._of_parameters(at.design) + self.beyond_model(at)
+        at, p = Along.of(self.camera, rays), len(self.sigmas)
+        own = _less_rotation(self.sigmas[:, None] * at.design[:, :p], self.compensation, at.design[:, p:])
+        return _propagated(self.correlation, own) + self.beyond_model(at)
 
     def beyond_model(self, at: Along) -> FloatArray:
         """Return the part of the covariance (M, 2, 2) from model inadequacy and rivals."""
@@ -269,12 +270,6 @@ class FarProjection:
         """Standard deviation at the worst corner."""
         known = self.at_corners_px[np.isfinite(self.at_corners_px)]
         return float(known.max()) if known.size else float("inf")
-
-    def _of_parameters(self, design: FloatArray) -> FloatArray:
-        p = len(self.sigmas)
-        return _propagated(
-            self.correlation, _less_rotation(self.sigmas[:, None] * design[:, :p], self.compensation, design[:, p:])
-        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -15,9 +15,9 @@ import numpy as np
 
 from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut, choose, models_of, settled
 from rigkit.calibration.choosing.heldout import heldout_squares
-from rigkit.calibration.choosing.models_tried import Request, agreeing, compared, fit_of_views, reweighted
+from rigkit.calibration.choosing.models_tried import Request, agreeing, compared, reweighted
 from rigkit.calibration.choosing.one_model import ModelOutcome
-from rigkit.calibration.solving.fit import fit_other_lens
+from rigkit.calibration.solving.fit import fit_kept, fit_other_lens
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 
@@ -38,10 +38,13 @@ def lenses_on_flat_boards(
 ) -> list[FittedModel]:
     """Return the options refitted to the same corners of the views that agree with them, with held-out errors."""
     keep, _ = agreeing(observations, options)
-    seen = observations.subset(np.flatnonzero(keep))
-    same = options if keep.all() else [replace(o, fit=fit_of_views(seen, o.fit, keep)) for o in options]
-    seen = reweighted(seen, same)
-    return compared(seen, same, request.folds, request.progress)
+    chosen = np.flatnonzero(keep)
+    seen = observations.subset(chosen)
+    if not keep.all():
+        fits = [fit_kept(seen, o.fit.state.subset(chosen), o.fit.kept[chosen], settle=True) for o in options]
+        options = [replace(option, fit=fit) for option, fit in zip(options, fits, strict=True)]
+    seen = reweighted(seen, options)
+    return compared(seen, options, request.folds, request.progress)
 
 
 def best_sizes(cameras: Sequence[Sequence[FittedModel]]) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from rigkit.calibration.choosing.choice import FittedModel
 from rigkit.calibration.choosing.heldout import heldout_squares
 from rigkit.calibration.result import Candidate
-from rigkit.calibration.solving.fit import Fit, fit_kept, fit_model, identifiable, not_identifiable, robust_sigma
+from rigkit.calibration.solving.fit import fit_kept, fit_model, identifiable, not_identifiable, robust_sigma
 from rigkit.calibration.solving.shape import SHAPES
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
@@ -106,12 +106,6 @@ def fit_all(
         assert error is not None
         raise error
     return options, failed
-
-
-def fit_of_views(observations: Observations, fit: Fit, keep: BoolArray) -> Fit:
-    """Return the fit of the views `keep` (V,), whose `observations` are given, from the fit of all views."""
-    chosen = np.flatnonzero(keep)
-    return fit_kept(observations, fit.state.subset(chosen), fit.kept[chosen], settle=True)
 
 
 def agreeing(observations: Observations, options: list[FittedModel]) -> tuple[BoolArray, tuple[tuple[str, str], ...]]:

@@ -60,7 +60,7 @@ CHANGES = {
         "resized some",
     ),
     "shift": Finding.look(
-        # After its pose a board tells two numbers of what an image does to it at first order: a shear has no others.
+        # After its pose a board determines two parameters of the image's change at first order: those of a shear.
         "the picture is shifted on the sensor from image to image, or sheared while it was read row by row",
         "switch image stabilisation off, hold camera and board still, and retake all, unless a program turned or "
         "cropped some",

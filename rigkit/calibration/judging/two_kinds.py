@@ -74,7 +74,7 @@ def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | Non
         "focus": columns["focus"],
         "shift": columns["shift"],
         "lens": columns["lens"],
-        "camera": _camera_rows(evidence),
+        "camera": slice(COMMON.start, COMMON.start + len(evidence.scale) - CHANGE_COLUMNS["bend"]),
     }
     known = evidence.common_covariance()
     found = {name: kinds for name, rows in lenses.items() if (kinds := split_in_two(evidence, rows, known)) is not None}
@@ -174,8 +174,3 @@ def _otherwise(calibration: Calibration, evidence: ViewEvidence, kinds: Kinds) -
     line = _explained(kinds.amounts, kinds.weight, places).min() + np.log(len(at))
     step = _explained(kinds.amounts, kinds.weight, steps.reshape(-1, len(at)).astype(float)).min()
     return float(min(line, step + 2.0 * np.log(len(at))))
-
-
-def _camera_rows(evidence: ViewEvidence) -> slice:
-    """Return the camera's parameters among the rows of the evidence."""
-    return slice(COMMON.start, COMMON.start + len(evidence.scale) - CHANGE_COLUMNS["bend"])

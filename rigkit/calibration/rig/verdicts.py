@@ -43,11 +43,8 @@ def diagnose_rig(
         for camera in rig.cameras
         for note in modelled_pupil(camera.calibration)
     ]
-    return (headline, *pupils, *_lags(rig), *others)
-
-
-def _lags(rig: RigCalibration) -> list[Finding]:
-    return [Finding.good(f"{'; '.join(lag_words(rig))}: boards are taken where they were then")] if rig.lags else []
+    lags = [Finding.good(f"{'; '.join(lag_words(rig))}: boards are taken where they were then")] if rig.lags else []
+    return (headline, *pupils, *lags, *others)
 
 
 def lag_words(rig: RigCalibration) -> list[str]:

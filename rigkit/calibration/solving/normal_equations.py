@@ -174,7 +174,10 @@ class NormalEquations:
         """
         inverse = pose_inverses(self.pp)
         back = inverse @ np.swapaxes(self.gp, -1, -2)
-        reduced = self.gg - _gemm(self.gp, back)
+        views, count, six = self.gp.shape
+        # The sum over views of gp_v @ back_v as one matrix product.
+        product = self.gp.transpose(1, 0, 2).reshape(count, views * six) @ back.reshape(views * six, -1)
+        reduced = self.gg - product
         scale = 1.0 / np.sqrt(np.maximum(np.diag(reduced), np.finfo(float).tiny))
         scaled = 0.5 * (reduced + reduced.T) * scale[:, None] * scale
         try:
@@ -214,12 +217,6 @@ def pose_inverses(pp: FloatArray) -> FloatArray:
     if doubtful.any():
         inverse[doubtful] = np.linalg.pinv(pp[doubtful], hermitian=True)
     return np.asarray(inverse)
-
-
-def _gemm(gp: FloatArray, back: FloatArray) -> FloatArray:
-    """Return sum over views of gp_v @ back_v as one matrix product."""
-    views, count, six = gp.shape
-    return np.asarray(gp.transpose(1, 0, 2).reshape(count, views * six) @ back.reshape(views * six, -1))
 
 
 def _solve_positive(matrix: FloatArray, rhs: FloatArray) -> FloatArray:

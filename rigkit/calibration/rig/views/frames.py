@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.choosing.board_orientation import same_looks
+from rigkit.calibration.choosing.board_orientation import board_turn, same_looks
 from rigkit.calibration.rig.solving.state import Key
 from rigkit.calibration.rig.views.observations import (
     FrameObservations,
@@ -19,7 +19,6 @@ from rigkit.calibration.rig.views.observations import (
     Places,
     RigViews,
     outer_corners,
-    turns_of,
 )
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points
@@ -86,7 +85,10 @@ def _targets(own: FrameObservations, places: Places) -> dict[Key, _Target]:
         return {}
     out = {}
     boards = {entry.board_id: entry.view.board for entry in best.values()}
-    looks = {name: (outer_corners(board), turns_of(board)) for name, board in boards.items()}
+    looks = {
+        name: (outer_corners(board), tuple(board_turn(board, turns) for turns in same_looks(board)))
+        for name, board in boards.items()
+    }
     for (key, entry), rotation, shift in zip(best.items(), *target_poses(list(best.values()), places), strict=True):
         corners, orientations = looks[entry.board_id]
         if entry.board_id in places:

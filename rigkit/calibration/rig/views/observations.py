@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.choosing.board_orientation import board_turn, same_looks
+from rigkit.calibration.choosing.board_orientation import board_turn
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.solving.state import Key
 from rigkit.cameras.base import Camera
@@ -94,11 +94,6 @@ def outer_corners(board: Board) -> Points:
     """Return the four outer corners in the board's frame, (4, 3) mm."""
     far = [(board.columns - 1) * board.square_x_mm, (board.rows - 1) * board.square_y_mm, 0.0]
     return np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]) * far
-
-
-def turns_of(board: Board) -> tuple[Rigid3, ...]:
-    """Return numbered_from_old of every possible orientation of the board."""
-    return tuple(board_turn(board, turns) for turns in same_looks(board))
 
 
 def frame_observations(own: Sequence[tuple[str, BoardView]], result: Calibration) -> FrameObservations:
