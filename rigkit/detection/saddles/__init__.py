@@ -1,1 +1,1 @@
-"""Where corners of a chessboard may be: brightness, rings, saddle points."""
+"""Candidate chessboard corners: image preparation, saddle points, the ring test."""

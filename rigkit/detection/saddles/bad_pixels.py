@@ -1,7 +1,7 @@
-"""Pixels that show nothing of the scene: hot and dead ones, salt and pepper of a bad line.
+"""Hot and dead pixels, and salt-and-pepper noise.
 
-No lens makes a single pixel stand out of all of its neighbours by far, so what does is the sensor's doing. A sparse
-look tells whether an image has such pixels at all; if so, all are found and replaced by what lies around them.
+Since a lens blurs over more than a pixel, a pixel that differs strongly from all of its neighbours is a defect. A
+sparse sample determines whether an image has such pixels; if so, all are replaced by the median of their neighbours.
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.kernels import front
 
 LOOKED_AT = 6000
-"""Pixels of the sparse look, in whole rows."""
+"""Number of pixels in the sparse sample, in whole rows."""
 
 MIN_EVIDENT = 3
-"""So many of them stand out where an image has bad pixels: one in 2000. Fewer move few corners, and by little."""
+"""Smallest number of bad pixels in the sample, one in 2000: fewer affect few corners, and little."""
 
 BAD_PIXEL_SIGMAS, SPAN_SHARE = 8.0, 0.15
-"""A pixel stands out if it differs from its neighbours by so many standard deviations of the noise, and by this part of
-the range of brightness: sharpened corners ring by less."""
+"""Smallest difference of a bad pixel from its neighbours, in standard deviations of the noise and as a part of the
+range of brightness: ringing at sharpened corners is smaller."""
 
 MIN_CLEAR_OF = 7
-"""A bad pixel is so much brighter than so many of its eight neighbours, or so much darker: where many are bad, some lie
-side by side. Of the corner of a square, five neighbours are."""
+"""A bad pixel is brighter, or darker, than this number of its eight neighbours by that difference: some bad pixels are
+adjacent. The pixel at the corner of a square differs from five."""
 
 REPAIR_ROUNDS = 2
-"""What three bad pixels in a row have hidden of each other shows when those beside them are gone."""
+"""Rounds of repair: of three adjacent bad pixels the middle one is found after the others are replaced."""
 
 NEIGHBOUR_STEPS: IntArray = np.array([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1) if v or u])
 
 
 def without_bad_pixels(grey: GreyImage) -> GreyImage:
-    """Return `grey` with its bad pixels replaced by the median of the good ones around them; as it is without any."""
+    """Return `grey` with its bad pixels replaced by the median of their good neighbours; unchanged without any."""
     step = _evident(grey)
     if step is None:
         return grey
@@ -45,7 +45,7 @@ def without_bad_pixels(grey: GreyImage) -> GreyImage:
 
 
 def _evident(grey: GreyImage) -> float | None:
-    """Return by how much bad pixels stand out, None where a sparse look finds hardly any."""
+    """Return the threshold on the difference of bad pixels from their neighbours, None if there are hardly any."""
     height, width = grey.shape
     apart = max(3, width * height // LOOKED_AT)
     first = 1 + (height - 3) % apart // 2
@@ -61,14 +61,14 @@ def _evident(grey: GreyImage) -> float | None:
 
 
 def _repair(image: GreyImage, step: float) -> None:
-    """Replace the pixels that stand out by `step` by the median of those around them that do not, IN PLACE."""
+    """Replace the pixels that differ by `step` from their neighbours by the median of the good ones, IN PLACE."""
     height, width = image.shape
     row, column = np.nonzero(cv2.absdiff(image, cv2.medianBlur(image, 3)) > step)
     rows, columns = row[:, None] + NEIGHBOUR_STEPS[:, 0], column[:, None] + NEIGHBOUR_STEPS[:, 1]
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
     rows, columns = np.where(inside, rows, row[:, None]), np.where(inside, columns, column[:, None])
     own, around = image[row, column].astype(np.float32)[:, None], image[rows, columns].astype(np.float32)
-    # Where the frame ends nothing contradicts.
+    # Neighbours outside the image count as different.
     brighter, darker = (((step < off) | ~inside).sum(axis=1) >= MIN_CLEAR_OF for off in (own - around, around - own))
     bad = np.zeros(image.shape, bool)
     which = np.flatnonzero(brighter | darker)

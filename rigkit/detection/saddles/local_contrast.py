@@ -1,8 +1,9 @@
-"""Images whose parts differ in brightness by far more than a board's squares do: heat images, scenes against the light.
+"""Images with a range of brightness far larger than that of a board's squares: thermal images, scenes against the
+light.
 
-Of 16 bits a person in front of a board takes most in a heat image, and the squares of the board a hundredth. Such an
-image is searched once more with its local mean taken away and its local deviation made the same everywhere; where
-boards are then known, the image is stretched to their brightness.
+In a thermal image of 16 bits a person may take most of the range, and a board a hundredth. Such an image is searched
+again with its local mean subtracted and its local deviation normalised; then the image is stretched to the range of the
+boards found.
 """
 
 from __future__ import annotations
@@ -14,21 +15,21 @@ from rigkit.core.arrays import FloatArray
 from rigkit.detection.saddles.response import FloatImage, GreyImage, sample
 
 WINDOW_PART = 1.0 / 16.0
-"""Standard deviation of the window, as a part of the image's shorter side: boards with squares of a fortieth to a sixth
-of it keep their contrast."""
+"""Standard deviation of the window over the image's shorter side: boards with squares of a fortieth to a sixth of it
+keep their contrast."""
 
 MIN_DEVIATION = 0.02
-"""Smallest local deviation that is made up for, as a part of the largest: below is the noise of empty walls."""
+"""Smallest local deviation that is normalised, over the largest: smaller ones are noise of uniform areas."""
 
 MIDDLE, GAIN = 127.5, 50.0
 """Grey levels of the local mean, and of one local deviation."""
 
 DARK_LEVEL, BRIGHT_LEVEL = 25.0, 205.0
-"""Grey levels that the dark and the bright squares are stretched to."""
+"""Grey levels of the dark and the bright squares after stretching."""
 
 
 def equalised(grey: GreyImage) -> FloatImage:
-    """Return `grey` with equal mean and deviation everywhere, in grey levels 0..255."""
+    """Return `grey` with equal local mean and deviation everywhere, in grey levels 0..255."""
     values = grey.astype(np.float32)
     window = WINDOW_PART * min(values.shape)
     off = values - cv2.GaussianBlur(values, (0, 0), window)
@@ -38,9 +39,9 @@ def equalised(grey: GreyImage) -> FloatImage:
 
 
 def stretched(grey: GreyImage, boards: list[FloatArray]) -> GreyImage:
-    """Return `grey` linear in brightness, 0..255, with the squares of `boards` between DARK_LEVEL and BRIGHT_LEVEL.
+    """Return `grey` scaled linearly, 0..255, with the squares of `boards` at DARK_LEVEL and BRIGHT_LEVEL.
 
-    `boards` : (R, C, 2) pixels of the corners each, NaN where unknown; without any the image comes back as it is.
+    `boards` : (R, C, 2) pixels of the corners of each, NaN where unknown. Without boards the image is unchanged.
     """
     corners = [(b[:-1, :-1] + b[:-1, 1:] + b[1:, :-1] + b[1:, 1:]).reshape(-1, 2) for b in boards]
     middles = 0.25 * np.concatenate([*corners, np.zeros((0, 2))])

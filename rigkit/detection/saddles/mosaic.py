@@ -1,7 +1,7 @@
-"""Raw images of colour cameras: a mosaic of pixels that see red, green or blue (Bayer's or another pattern of 2 x 2).
+"""Raw images of colour cameras: mosaics of red, green and blue pixels (Bayer or another 2 x 2 pattern).
 
-A board is black and white, so its pixels differ by the sensitivity of their colour alone. Brought to one scale they are
-a grey image of full resolution, without the interpolation that makes an image of colours out of them.
+A board is black and white, so that its pixels differ only by the sensitivity of their colour. Scaled to equal
+sensitivity they are a grey image of full resolution, without demosaicing.
 """
 
 from __future__ import annotations
@@ -13,22 +13,23 @@ from rigkit.detection.saddles.response import FloatImage, GreyImage
 from rigkit.kernels import front
 
 GLANCE, LOOK = 1500, 20000
-"""Squares of 2 x 2 pixels that tell whether there is a mosaic, and those that tell its scales."""
+"""Number of cells of 2 x 2 pixels by which a mosaic is detected, and of those by which it is scaled."""
 
 MOSAIC_SHARE = 0.03
-"""A place in the squares that is, in the median, brighter or darker than its square by this part of it is of another
-colour. 586 pictures of boards and photographs have 0.009 at most, mosaics 0.1 to 0.5 unless they are white-balanced,
-when there is nothing to do."""
+"""Smallest median difference of a position in the cells from their mean, over that mean, in a mosaic. 586 images of
+boards and photographs have 0.009 at most, mosaics 0.1 to 0.5 unless they are white-balanced, when nothing is to be
+done.
+"""
 
 PLACES = ((0, 0), (0, 1), (1, 0), (1, 1))
-"""In a square: row, column."""
+"""Positions in a cell: row, column."""
 
 MIN_LEVELS = 12.0
-"""Darker squares, grey levels, say nothing: rounding is a part of them."""
+"""Smallest mean of a cell, grey levels, that is used: rounding affects darker ones."""
 
 
 def without_mosaic(grey: GreyImage) -> GreyImage:
-    """Return `grey` with the four places of its squares of 2 x 2 pixels on one scale; as it is where they are so."""
+    """Return `grey` with the four positions of its 2 x 2 cells on one scale; unchanged if it is not a mosaic."""
     if not front.has_mosaic(grey, _step(grey, GLANCE), MIN_LEVELS, MOSAIC_SHARE):
         return grey
     values = _squares(grey, LOOK)
@@ -42,13 +43,13 @@ def without_mosaic(grey: GreyImage) -> GreyImage:
 
 
 def _step(grey: GreyImage, count: int) -> int:
-    """Return how many squares lie from one to the next where about `count` are looked at."""
+    """Return the step, in cells, for a sample of about `count` cells."""
     height, width = (side // 2 for side in grey.shape)
     return max(1, int(np.sqrt(height * width / count)))
 
 
 def _squares(grey: GreyImage, count: int) -> FloatArray:
-    """Return the brightness at the four PLACES of about `count` squares, (4, N)."""
+    """Return the brightness at the four PLACES of about `count` cells, (4, N)."""
     step = _step(grey, count)
     down, across = (side // 2 // step for side in grey.shape)
     cells = grey[: 2 * step * down, : 2 * step * across].reshape(down, 2 * step, across, 2 * step)
@@ -56,8 +57,8 @@ def _squares(grey: GreyImage, count: int) -> FloatArray:
 
 
 def _line(own: FloatArray, mean: FloatArray, bright: BoolArray) -> tuple[np.float32, np.float32]:
-    """Return gain and offset that take the brightness of one place to the mean of the square, by the dark and by the
-    bright half of the squares: the middle halves of either, where fewer are of other colours."""
+    """Return gain and offset from the brightness of one position to the mean of the cell, from the dark and the bright
+    half of the cells."""
     (dark_own, dark_mean), (bright_own, bright_mean) = (_middle(own[half], mean[half]) for half in (~bright, bright))
     span = bright_own - dark_own
     gain = (bright_mean - dark_mean) / span if span > 1.0 else bright_mean / bright_own
@@ -65,7 +66,7 @@ def _line(own: FloatArray, mean: FloatArray, bright: BoolArray) -> tuple[np.floa
 
 
 def _middle(own: FloatArray, mean: FloatArray) -> tuple[float, float]:
-    """Return the means of both over the squares whose ratio of them is usual."""
+    """Return the means of both over the cells with a ratio between its quartiles, which excludes coloured objects."""
     ratio = own / np.maximum(mean, 1.0)
     low, high = np.quantile(ratio, (0.25, 0.75))
     typical = (ratio >= low) & (ratio <= high)

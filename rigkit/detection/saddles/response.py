@@ -1,9 +1,8 @@
-"""Where an image could have a chessboard corner: an image pyramid, its saddle response, and the peaks of the response.
+"""Candidate chessboard corners: an image pyramid, its saddle response, and the peaks of the response.
 
-A chessboard corner is a saddle of the brightness. On an image L smoothed a little, the response is minus the
-determinant of the Hessian, D = Lxy^2 - Lxx Lyy: large at saddles, zero along straight edges, negative at blobs, and
-indifferent to the direction of the lines. What counts as large follows from the image's own median response, that is
-its noise.
+A chessboard corner is a saddle of the brightness. On a slightly smoothed image L the response is minus the determinant
+of the Hessian, D = Lxy^2 - Lxx Lyy: large at saddles, zero along straight edges, negative at blobs, and independent of
+the direction of the lines. The threshold follows from the median response of the image, that is from its noise.
 """
 
 from __future__ import annotations
@@ -23,39 +22,38 @@ from rigkit.kernels import front
 FloatImage = NDArray[np.float32]
 
 BASE_PIXELS = 2.6e6
-"""The finest level of the search has at most this many pixels; only the sub-pixel fit looks at larger images."""
+"""Largest number of pixels of the finest level of the search; only the sub-pixel fit uses the full resolution."""
 
 OCTAVES = 4
-"""Levels of the search, each of half the size of the one before: blurred corners are saddles only at coarse levels, and
-those that ink has joined, or that are round, only where that is less than a pixel. The fourth takes 1.5 % more."""
+"""Levels of the search, each of half the size of the previous one. Blurred corners, and corners whose squares merge or
+are round, are saddles on coarse levels only. The fourth level takes 1.5 % more time."""
 
 SMOOTH = np.array([1.0, 4.0, 6.0, 4.0, 1.0], np.float32) / 16.0
-"""Binomial of sigma 1."""
+"""Binomial filter with a standard deviation of 1."""
 
 NOISE_FACTOR = 8.0
-"""A peak stands out of the noise from this multiple of the median |D| upwards."""
+"""Threshold on peaks over the median of |D|."""
 
 THRESHOLD_FLOOR, THRESHOLD_CEILING = 2.0, 16.0
-"""Bounds of the threshold on D for an image that spans 200 grey levels, in (grey levels per px^2)^2; they go with the
-square of the span, and the floor with that of the light: where the brightest is half as bright, so are the differences.
-Below the floor is only quantisation and compression, and the median of a richly textured image must not hide the
-corners of a board in it."""
+"""Bounds of the threshold on D for an image with a span of 200 grey levels, in (grey levels per px^2)^2. They scale
+with the square of the span, the floor also with that of the local brightness. D below the floor is due to quantisation
+and compression; the ceiling limits the threshold in images with much texture."""
 
 MIN_SPAN = 2.5
-"""An image that spans fewer grey levels shows nothing but its quantisation."""
+"""Smallest span of grey levels: a smaller one is quantisation."""
 
 TYPICAL = 4e3
-"""Pixels that the median response and the span of brightness are taken from: the median is good to 3 %."""
+"""Number of pixels of the sample for median response and span of brightness; it gives the median to 3 %."""
 
 EXTREME = 0.005
-"""The span of brightness leaves out this part at either end: glints, dead pixels."""
+"""Share of pixels at either end that the span of brightness excludes: glints, dead pixels."""
 
 PIXELS_A_PEAK, MAX_PEAKS = 240, 6400
-"""Keep the strongest peaks of a level, one for so many of its pixels, or the second number if that is more: texture and
-noise have more, a board never."""
+"""The number of peaks kept on a level is one per PIXELS_A_PEAK pixels, at least MAX_PEAKS: texture and noise may have
+more, a board never."""
 
 PEAK_SQUARE_PX, SHARES = 32, 1024
-"""How strong a peak is, is seen beside the strongest one in its square of so many pixels, to one part in so many: a
+"""Peaks are ranked by their response over the largest in their block of so many pixels, quantised to so many steps: a
 board in the shade has weaker corners than a page of text in the sun."""
 
 
@@ -79,8 +77,8 @@ class Level:
 def grey_image(image: NDArray[np.generic]) -> GreyImage:
     """Return an 8- or 16-bit, grey or RGB(A) image in grey levels 0..255: uint8 as such, all others as float32.
 
-    16-bit images are scaled by their own brightest value (the 99.9 % quantile), because 10- and 12-bit sensors do not
-    fill the range. Floating-point images are taken as 0..255 as they are, NaN as dark.
+    16-bit images are scaled by their 99.9 % quantile, because 10- and 12-bit sensors do not use the full range.
+    Floating-point images are assumed to be in 0..255, NaN as dark.
 
     Raises InputError: not an image of 1, 3 or 4 channels, or of another type, or smaller than 16x16.
     """
@@ -93,7 +91,7 @@ def grey_image(image: NDArray[np.generic]) -> GreyImage:
         raise InputError(
             f"image: {array.shape[1]}x{array.shape[0]} pixels are too few to hold a chessboard; give a whole picture"
         )
-    # Files say in which order their bytes are; it is no other type.
+    # Arrays from files may have another byte order.
     array = array.astype(array.dtype.newbyteorder("="), copy=False)
     if array.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise InputError(f"image: type {array.dtype} is not supported; convert it to uint8 or uint16")
@@ -112,8 +110,7 @@ def grey_image(image: NDArray[np.generic]) -> GreyImage:
 
 
 def _finite(image: NDArray[np.generic]) -> FloatImage:
-    """Return a floating-point image as float32, with what is no number as dark, and what is infinite as bright, as the
-    rest gets."""
+    """Return a floating-point image as float32, with NaN and infinities replaced by the extreme finite values."""
     with np.errstate(over="ignore"):
         values: FloatImage = image.astype(np.float32, copy=False)
         if np.isfinite(values.sum(dtype=np.float64)):
@@ -129,7 +126,7 @@ def pyramid(grey: GreyImage) -> list[Level]:
 
 
 def each_level(grey: GreyImage) -> Iterator[Level]:
-    """Yield the levels of the search, the finest first, each made when it is asked for."""
+    """Yield the levels of the search, the finest first."""
     scale = 1
     while grey.size > scale**2 * BASE_PIXELS:
         scale *= 2
@@ -144,9 +141,7 @@ def each_level(grey: GreyImage) -> Iterator[Level]:
 
 def _shrunk(grey: GreyImage, factor: int) -> GreyImage:
     """Return the means of `factor` x `factor` pixels."""
-    if factor == 1:
-        return grey
-    return front.shrunk(grey, factor)
+    return grey if factor == 1 else front.shrunk(grey, factor)
 
 
 @functools.cache
@@ -172,7 +167,7 @@ def sample(image: GreyImage, pixels: NDArray[np.floating]) -> FloatImage:
     """Return `image` at `pixels` (..., 2), bilinear, the border repeated; (...) float32."""
     flat = np.asarray(pixels, np.float32).reshape(-1, 2)
     if image.dtype == np.uint8:
-        # OpenCV would round to whole grey levels. Only the part that is looked at is converted.
+        # OpenCV rounds 8-bit results: convert the sampled part to float32.
         seen = flat[np.isfinite(flat).all(axis=1)]
         if len(seen):
             last = np.array(image.shape[::-1]) - 1

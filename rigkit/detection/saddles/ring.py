@@ -1,18 +1,17 @@
-"""Whether a saddle is a chessboard corner: the brightness on a ring around it.
+"""The ring test: whether a saddle is a chessboard corner, by the brightness on a ring around it.
 
-Around a corner the brightness is the same on opposite sides and changes exactly twice in half a turn, and the corner
-itself is as bright as the ring on average, whatever the angles, the blur and the slope of the light. Where it rises
-(angle from u to v) lies line A, where it falls line B; so the ring gives the two line directions and the
-polarity: which quadrants are bright.
+Around a corner the brightness is equal on opposite sides and changes exactly twice in half a turn. The centre has the
+mean brightness of the ring, for all angles, blurs and gradients of the light. Line A is where brightness rises (angle
+from u to v), line B where it falls; the ring thus gives both directions and the polarity.
 
-Blur bends the borders of the quadrants near the corner, up to right angles in its middle, so the places where the ring
-changes from dark to bright are not on the lines. What blur does to the harmonics of the angle is known, though: that of
-order m of a corner blurred by a Gaussian of sigma s shrinks by R_m(r / s) on the ring of radius r (Hankel transform),
+Blur bends the borders of the quadrants near the corner, so that the transitions on the ring are not on the lines. Its
+effect on the angular harmonics is known: on the ring of radius r a Gaussian blur of standard deviation s multiplies the
+harmonic of order m by R_m(r / s) (Hankel transform),
 
     y = r^2 / (2 s^2),  R_2 = 1 - (1 - e^-y) / y,  R_4 = 1 - (4 + 2 e^-y) / y + 6 (1 - e^-y) / y^2.
 
-Two bright quadrants of angle b have harmonics 2 and 4 of ratio cos b. Harmonic 2 on a ring of half the radius tells y,
-harmonics 2 and 4 of the ring the angle, and the phase of harmonic 2 where the middle of the bright quadrants is.
+Two bright quadrants of angle b have harmonics 2 and 4 with the ratio cos b. Harmonic 2 on a second ring of half the
+radius determines y, harmonics 2 and 4 the angle b, and the phase of harmonic 2 the middle of the bright quadrants.
 """
 
 from __future__ import annotations
@@ -25,33 +24,32 @@ from rigkit.core.arrays import FloatArray
 from rigkit.kernels.front import HALF, RingRules
 
 CIRCLE = np.stack([f(np.arange(2 * HALF) * (np.pi / HALF)) for f in (np.cos, np.sin)], axis=-1).astype(np.float32)
-"""Where they lie on a ring of radius 1, (2 HALF, 2)."""
+"""Sample positions on a ring of radius 1, (2 HALF, 2)."""
 
 MAX_ODD = 0.25
-"""Largest energy of the part that changes sign on opposite sides, relative to the part that does not. Of the corners of
-boards, noisy, blurred, or crossed by a shadow's edge, 0.05 % show more; of what noise and texture make, 20 %."""
+"""Largest energy of the odd part (opposite signs on opposite sides) over that of the even part. 0.05 % of the corners
+of boards, noisy, blurred, or crossed by a shadow edge, have more; of false corners of noise and texture 20 %."""
 
 MAX_CENTRE = 0.16
-"""Largest difference of the centre from the mean of the ring, relative to the contrast. Rings inside the four squares
-show less than 0.06; more where they reach beyond, which spoils the directions as well, and between dots or letters."""
+"""Largest difference of the centre from the mean of the ring, over the contrast. It is less than 0.06 for rings within
+the four squares, and larger for rings that extend beyond, whose directions are wrong too, or between dots or
+letters."""
 
 EVEN_ODD, EVEN_CENTRE = 0.05, 0.5
-"""The same of the centre where so little changes sign on opposite sides: motion that is not along one of a corner's
-lines smears bright or dark squares into its middle, and leaves it as even as it was; so do squares that run over into
-others (too much light, ink that spreads), up to half of the contrast. What covers corners or stands beside them does
-not."""
+"""The bound of the centre is larger, EVEN_CENTRE, if the odd part is at most EVEN_ODD. Motion across both lines, or
+squares that merge with others (saturation, spreading ink), change the centre by up to half of the contrast but keep the
+symmetry; occlusions do not."""
 
 QUICK_ODD, QUICK_CENTRE, QUICK_EVEN_CENTRE, QUICK_SHARP = 0.5, 0.6, 1.2, 1.12
-"""Every fourth of the samples tells most of what is no corner, at a quarter of the cost: the energy of the odd part
-relative to that of the even part, the centre off the mean relative to its deviation, the response relative to its
-variance. Of 29157 rings that pass the other tests, in rendered and real images, two are lost; of those of noise and
-texture two in three need not be read."""
+"""Bounds of a quick test on every fourth sample: odd over even energy, difference of the centre over the deviation, and
+response over the variance. Of 29157 rings that pass the full test, in RENDERED and REAL images, it rejects two; of
+those of noise and texture it rejects two of three."""
 
 LARGEST_GAIN = 8.0
-"""Largest R_2 / R_4 that is made up for: beyond it, in the middle of a strong blur, harmonic 4 is only noise."""
+"""Largest R_2 / R_4 that is corrected: beyond it, for strong blur, harmonic 4 is noise."""
 
 MAX_COSINE = 0.99
-"""Bound of cos b: flatter quadrants than 8 degrees are noise."""
+"""Largest cos b: quadrants of less than 8 degrees are noise."""
 
 GAINS = 64
 """Entries of the table of R_2(r / s) / R_4(r / s) over R_2(r / 2 s) / R_2(r / s), which goes from 1/4 to 1."""
@@ -59,7 +57,7 @@ GAINS = 64
 
 @functools.cache
 def _gains() -> FloatArray:
-    """Return R_2 / R_4 where harmonic 2 on the inner ring, relative to that on the ring, is 1/4 to 1 in GAINS steps."""
+    """Return R_2 / R_4 for GAINS ratios, from 1/4 to 1, of harmonic 2 on the inner ring to that on the ring."""
     y = np.geomspace(1e-2, 1e4, 2000)
     fall = np.exp(-y)
     second, quarter = 1.0 - (1.0 - fall) / y, 1.0 - (1.0 - np.exp(-0.25 * y)) / (0.25 * y)
@@ -86,5 +84,5 @@ def ring_rules(max_odd: float = MAX_ODD, max_centre: float = MAX_CENTRE) -> Ring
 
 
 def line_vectors(angles: FloatArray) -> FloatArray:
-    """Return the unit vectors of the lines A and B (N, 2, 2); the other two arms of a corner point the other way."""
+    """Return the unit vectors of the lines A and B (N, 2, 2); the other two arms of a corner are opposite."""
     return np.stack([np.cos(angles), np.sin(angles)], axis=-1)

@@ -15,18 +15,18 @@ from rigkit.kernels import front
 from rigkit.kernels.front import near_any
 
 RING_RADIUS = 2.6
-"""Of the ring, in pixels of the level: fits squares of 6 px, and 5 where they are seen straight on."""
+"""Radius of the ring in pixels of the level, for squares of 6 px, or 5 px in frontal views."""
 
 MAX_SHARPNESS = 0.095
-"""Largest response of a corner, relative to the square of its contrast on the ring. Edges without blur, smoothed as
-the level is, make 0.08, sharpened ones 0.09, whatever the angles and down to squares of 4 px; noise makes 0.12. Of the
-corners of boards in noise a few show more, which growth finds; of those that noise makes, a third."""
+"""Largest response of a corner over the square of its contrast on the ring. Edges without blur, smoothed as the level,
+give 0.08, sharpened ones 0.09, for all angles and down to squares of 4 px; noise gives 0.12. A few corners of boards in
+noise exceed it, which growth adds; of false corners of noise a third."""
 
 KNOWN_PX = 2.0
-"""A corner this near to one of a finer level is the same, in pixels of its own level."""
+"""A corner closer than this to one of a finer level is the same, in pixels of its own level."""
 
 MAX_STEP = 1.5
-"""A Newton step to the saddle that leads further than this from the peak of the response went wrong, level px."""
+"""Largest Newton step from the peak of the response to the saddle, px of the level."""
 
 
 NOWHERE: FloatArray = np.zeros((0, 2))
@@ -39,7 +39,7 @@ class Corners:
 
     Attributes
     ----------
-    pixels : (N, 2) full resolution, a few tenths of a pixel good.
+    pixels : (N, 2) full resolution, accurate to a few tenths of a pixel.
     angles : (N, 2) rad. Line A (dark to bright with growing angle) in [0, pi), line B (bright to dark) in (A, A + pi).
     contrast : (N,) grey levels.
     scale : (N,) of the level on which the corner was found.
@@ -64,15 +64,14 @@ class Corners:
 
 @dataclass(frozen=True, eq=False)
 class Saddles:
-    """Saddle points, and corners that are not among those of the whole image.
+    """Saddle points, and the corners of each level.
 
     Attributes
     ----------
     pixels : (N, 2) full resolution.
-    by_level : the corners of each level, also those that a finer one has found, and those that are corners only if
-        something moved.
-    moved : which of each level are such.
-    still : the others, each once.
+    by_level : the corners of each level, including those found on a finer one and those with motion blur.
+    moved : which corners of each level have motion blur.
+    still : the corners without motion blur, each once.
     """
 
     pixels: FloatArray
@@ -82,10 +81,10 @@ class Saddles:
 
     @cached_property
     def smeared(self) -> Corners:
-        """The corners that are some only if something moved, each once; only images without boards need them."""
+        """The corners with motion blur, each once; only images without boards need them."""
         others: list[Corners] = []
         for own, moved in zip(self.by_level, self.moved, strict=True):
-            # A coarser level may show what is smeared on a finer one as it should be.
+            # On a coarser level a corner may show no motion blur.
             others.append(_without_known(own, moved, [*self.still, *others]))
         return joined(others)
 
@@ -93,7 +92,7 @@ class Saddles:
 def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple[Corners, Saddles]:
     """Return the chessboard corners of all levels, each once (the finest level wins), and all saddles.
 
-    `finer` : those of the levels before, if only coarser `levels` are to be looked at.
+    `finer` : corners of finer levels, if `levels` are only coarser ones.
     """
     kept = [] if finer is None else [finer]
     own: list[Corners] = []
@@ -117,7 +116,7 @@ def each_once(by_level: Iterable[Corners]) -> Corners:
 
 
 def _corners_of(level: Level, known: Sequence[Corners]) -> front.CornersOfLevel:
-    """Return the saddles and corners of `level`; those that are `known`, of finer levels, are repeated."""
+    """Return the saddles and corners of `level`, with those `known` from finer levels marked as repeated."""
     return front.corners(
         level.smooth,
         *peaks(level),
@@ -130,7 +129,7 @@ def _corners_of(level: Level, known: Sequence[Corners]) -> front.CornersOfLevel:
 
 
 def _without_known(found: Corners, which: BoolArray, known: list[Corners]) -> Corners:
-    """Return those of `found`, and `which` (N,), that no finer level has found already."""
+    """Return the corners `which` (N,) of `found` that are not among those `known` from finer levels."""
     before = [k.pixels for k in known if len(k)]
     if before and which.any():
         which = which & ~near_any(found.pixels, np.concatenate(before), KNOWN_PX * float(found.scale[0]))

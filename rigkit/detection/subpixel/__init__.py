@@ -1,1 +1,1 @@
-"""Where a corner is, and how well that is known: the fit of two edges to the pixels around it."""
+"""Sub-pixel positions of corners and their standard deviations, by fits of an edge model."""
