@@ -1,4 +1,4 @@
-"""What a board is seen in as a whole: the pixels that show it and nothing else, and what is around its squares."""
+"""The part of an image to which a whole board is fitted: its pixels, and the surroundings of the board."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from rigkit.detection.subpixel.edge_model import END_SIGMAS, MIN_REACH, WINDOW_R
 from rigkit.kernels.boards import Picture
 
 NO_END = 10.0
-"""Squares that go on do so for so many more."""
+"""Number of further squares assumed where squares continue."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Surroundings:
-    """What is around the corners of a board, before the first and beyond the last ones along columns and along rows.
+    """The surroundings of a board's corners, before the first and beyond the last ones along columns and along rows.
 
     Attributes
     ----------
-    outer : (2, 2) how wide the outer squares are, in squares; infinite where squares go on, or may do.
-    reach : (2, 2) pixels are used so far beyond the corners there, squares.
-    holes : (R, C) places without a corner, of which nothing near is used.
+    outer : (2, 2) width of the outer squares, in squares; infinite if further squares may follow.
+    reach : (2, 2) distance beyond the corners up to which pixels are used, in squares.
+    holes : (R, C) missing corners, near which no pixels are used.
     """
 
     outer: FloatArray
@@ -33,14 +33,15 @@ class Surroundings:
 
     @staticmethod
     def paper(size: tuple[int, int]) -> Surroundings:
-        """Return those of a whole board of R x C corners on paper."""
+        """Return the surroundings of a whole board of R x C corners on paper."""
         return Surroundings(np.ones((2, 2)), np.full((2, 2), WINDOW_REACH), np.zeros(size, np.bool_))
 
     @staticmethod
     def read(outer: FloatArray, pixels: FloatArray, blur: float, holes: BoolArray) -> Surroundings:
-        """Return those of a lattice (R, C, 2) beside whose corners `outer` (R, C, 4) squares were read (NaN: none).
+        """Return the surroundings of a lattice (R, C, 2) from the widths `outer` (R, C, 4) of outer squares (NaN:
+        none).
 
-        As `edge_model.NEIGHBOUR_LINES` has them: above, below, right, left.
+        Their order is that of `edge_model.NEIGHBOUR_LINES`: above, below, right, left.
         """
         sides = outer[:, 0, 3], outer[:, -1, 2], outer[0, :, 0], outer[-1, :, 1]
         steps = np.diff(pixels[:, :2], axis=1), np.diff(pixels[:, -2:], axis=1), np.diff(pixels[:2], axis=0)
@@ -55,7 +56,7 @@ class Surroundings:
         return Surroundings(wide.reshape(2, 2), reach.reshape(2, 2), holes)
 
     def of(self, rows: slice, columns: slice) -> Surroundings:
-        """Return those of some rows and columns: squares go on where these are not the first or last ones."""
+        """Return the surroundings of some rows and columns; inside the board squares continue."""
         outer, reach = self.outer.copy(), self.reach.copy()
         for axis, (part, count) in enumerate(zip((columns, rows), self.holes.shape[::-1], strict=True)):
             for end, inner in enumerate((part.start > 0, part.stop < count)):
@@ -66,13 +67,13 @@ class Surroundings:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoardWindow:
-    """The part of the image that a board is fitted to, in pixels that are means of `scale` x `scale` of the image.
+    """The part of the image to which a board is fitted, in pixels that are means of `scale` x `scale` image pixels.
 
     Attributes
     ----------
-    grey : (H, W), inside : (H, W) where that is the image; beyond there is nothing, but squares go on.
-    first : (2,) the middle of the first pixel, in the image.
-    surroundings, ends : of the board; (2, 2) where it ends, squares.
+    grey : (H, W), inside : (H, W) whether a pixel is within the image.
+    first : (2,) centre of the first pixel, in the image.
+    surroundings, ends : of the board; (2, 2) positions of its ends, squares.
     """
 
     grey: Picture
@@ -86,7 +87,7 @@ class BoardWindow:
     def around(
         image: GreyImage, pixels: FloatArray, scale: int, margin: int, surroundings: Surroundings
     ) -> BoardWindow | None:
-        """Return that around corners (R, C, 2); None where it is far larger than the image."""
+        """Return the window around corners (R, C, 2); None if it is far larger than the image."""
         outer = extended(pixels, 1).reshape(-1, 2)
         low, high = np.floor(outer.min(axis=0)) - margin, np.ceil(outer.max(axis=0)) + margin
         height, width = image.shape
@@ -101,7 +102,7 @@ class BoardWindow:
         grey[here], inside[here] = part, 1.0
         if scale > 1:
             grey, inside = (cv2.resize(plane, (wide, tall), interpolation=cv2.INTER_AREA) for plane in (grey, inside))
-        # Where the squares go on they do so beyond all that is seen.
+        # Continuing squares extend beyond the window.
         beyond = np.where(np.isfinite(surroundings.outer), surroundings.outer, NO_END)
         last = np.array(pixels.shape[1::-1]) - 1.0
         ends = np.stack([-beyond[:, 0], last + beyond[:, 1]], axis=1)
@@ -109,7 +110,7 @@ class BoardWindow:
         return BoardWindow(np.asarray(grey), np.asarray(inside) > 0.999, scale, first, surroundings, ends)
 
     def used(self, places: FloatArray, blur: float) -> BoolArray:
-        """Return (H, W) which pixels at `places` (H, W, 2) show the board and nothing else."""
+        """Return which pixels (H, W), at board positions `places` (H, W, 2), show only the board."""
         reach, holes = self.surroundings.reach, self.surroundings.holes
         last = np.array(holes.shape[::-1]) - 1.0
         with np.errstate(invalid="ignore"):
@@ -126,9 +127,9 @@ class BoardWindow:
 
 
 def extended(pixels: FloatArray, rings: int) -> FloatArray:
-    """Return the lattice (R, C, 2) with `rings` of corners more around it.
+    """Return the lattice (R, C, 2) extrapolated by `rings` of corners.
 
-    Steps between corners go on turning and growing in proportion, as no step ever turns back then.
+    Steps between corners are extrapolated geometrically as complex numbers, so that no step reverses.
     """
     lattice = pixels[..., 0] + 1j * pixels[..., 1]
     for _ in range(rings):
@@ -138,12 +139,12 @@ def extended(pixels: FloatArray, rings: int) -> FloatArray:
 
 
 def _longer(lattice: np.ndarray) -> np.ndarray:
-    """Return complex places (R, C) with a row more on both sides."""
+    """Return complex positions (R, C) with a row added on both sides."""
     steps = np.diff(lattice, axis=0)
     before, after = _next(steps[0], steps[1]), _next(steps[-1], steps[-2])
     return np.concatenate([(lattice[0] - before)[None], lattice, (lattice[-1] + after)[None]])
 
 
 def _next(last: np.ndarray, one_before: np.ndarray) -> np.ndarray:
-    """Return the complex step that follows; where places of a misread board coincide, the last one again."""
+    """Return the next complex step; the last one again if positions of a wrong lattice coincide."""
     return np.asarray(np.divide(last**2, one_before, out=last.copy(), where=one_before != 0.0))

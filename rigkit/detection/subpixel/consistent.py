@@ -1,5 +1,4 @@
-"""What a lattice says of its own corners after a fit: which empty cells are to be tried, which of these have corners,
-and which corners lie where the others say that they cannot."""
+"""Consistency of a lattice after a fit: empty cells to be tried, confirmation of corners in them, outlying corners."""
 
 from __future__ import annotations
 
@@ -15,34 +14,35 @@ from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.uncertain_corners import strays
 
 MIN_NEIGHBOURS = 3
-"""An empty cell is tried if so many of its eight neighbours are known."""
+"""Smallest number of known corners among the eight neighbours of an empty cell that is tried."""
 
 MIN_CHECKED = 12
 MIN_TESTED = 9
-"""A board of fewer corners, or of fewer that so many others predict, is not checked against itself."""
+"""Smallest number of corners of a board, and of a prediction, and smallest number of predicted corners, for the
+test."""
 
 HOLE_MOVE = 0.12
 HOLE_CONTRAST = 0.3
 HOLE_RESIDUAL = 2.0
 HOLE_SIGMA = 3.0
-"""What a corner in an empty cell must show: how far from its prediction (cells); contrast, relative residual and sigma
-relative to the corners around it."""
+"""Requirements on a corner in an empty cell: largest distance from its prediction (cells), smallest contrast, largest
+residual and sigma, each relative to the corners around it."""
 
 DISPLACED_CELLS = 0.06
 DISPLACED_SIGMAS = 8.0
-"""A corner further than this from where its neighbours say (in cells; and times the board's typical deviation; and
-times the standard deviation expected of it) is something else: a finger, a glint, the end of a ruler."""
+"""A corner is an outlier if its distance from its prediction exceeds DISPLACED_CELLS, DISPLACED_SIGMAS times the median
+of the board, and DISPLACED_SIGMAS times its expected standard deviation: a finger, a glint, the end of a ruler."""
 
 COVERED_NOISE, COVERED_FACTOR = 0.06, 6.0
 COVERED_OFF = 3.5
-"""A corner whose noise, relative to its contrast, exceeds this and this times the board's typical one, and that lies
-off by this times the typical deviation, is covered in part, by the edge of a ruler or of a hand: its sides are not
-alike. On rendered boards under a ruler the factor is 12 and more, on boards with marks in their squares seldom 6; the
-noise is 0.065 and more. Glare on single squares of blurred boards, where little other noise is left, makes 0.04."""
+"""A corner is partly covered if its noise over contrast exceeds COVERED_NOISE and COVERED_FACTOR times the median of
+the board, and its distance from its prediction COVERED_OFF times the median: an edge of a ruler or a hand makes its
+sides unequal. On RENDERED boards under a ruler the factor is 12 and more and the noise 0.065 and more; on boards with
+markers the factor is seldom 6; glare on single squares of blurred boards with little noise gives 0.04."""
 
 
 def with_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray]:
-    """Return the lattice with predictions in the empty cells `inside` among known ones, and which cells these are."""
+    """Return the lattice with predictions in those empty cells `inside` that have known neighbours, and these cells."""
     known = lattice.known
     holes: BoolArray = inside & ~known
     if holes.any():
@@ -57,7 +57,7 @@ def with_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray]
 
 
 def confirmed(item: RefinedLattice, start: Lattice, holes: BoolArray) -> RefinedLattice:
-    """Return `item` without those of the `holes` where the fit saw no proper corner."""
+    """Return `item` without those of the `holes` where the fit does not confirm a corner."""
     known = item.lattice.known
     settled = known & ~holes
     contrast = item.lattice.contrast
@@ -82,7 +82,7 @@ def _around(values: FloatArray, known: BoolArray) -> FloatArray:
 
 
 def checked(item: RefinedLattice, parts: Sequence[tuple[slice, slice]]) -> RefinedLattice:
-    """Return `item` without corners that are covered in part or lie where their neighbours say they cannot."""
+    """Return `item` without corners of its `parts` that are partly covered or contradict their neighbours."""
     known = item.lattice.known
     shape = fit_cells(item.lattice.pixels, known, leave_out=True)
 
@@ -93,7 +93,7 @@ def checked(item: RefinedLattice, parts: Sequence[tuple[slice, slice]]) -> Refin
 
     off = item.lattice.pixels[known] - shape.pixels
     distance = np.hypot(off[:, 0], off[:, 1])
-    # A prediction from a few corners on one side is no judge of another.
+    # Predictions from a few corners on one side are not reliable.
     judged = np.zeros_like(known)
     judged[known] = (shape.support >= MIN_CHECKED) & (shape.gain < 1.5)
     cells = spread(distance / shape.cell_px())

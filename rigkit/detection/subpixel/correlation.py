@@ -1,14 +1,14 @@
-"""How much less, or more, certain corners are than if the noise of neighbouring pixels were independent.
+"""Factors of the corners' standard deviations due to correlated noise of neighbouring pixels.
 
-Demosaiced, smoothed or enlarged images have noise that neighbours share; that of JPEG and of sharpening changes its
-sign from pixel to pixel. A corner is placed by a sum of the pixels weighted by their influence, so has the variance
+Demosaicing, smoothing and enlarging cause positively correlated noise; JPEG and sharpening cause noise of alternating
+sign. A corner's position is a sum of pixels weighted by their influence. Its variance is therefore
 
     sum over lags of  w(lag) r(lag)
 
-times that under as much independent noise, r being the correlation of the noise of two pixels `lag` apart and w that of
-their influences, w(0) = r(0) = 1. Influence lies on the two lines through the corner: across a line it is a Gaussian of
-standard deviation s, along it of one sign on this side of the corner and of the other beyond it. What mirroring at the
-corner changes (`edge_fit`) is noise alone, and says r, for all corners of a board together.
+times that under independent noise of equal variance, with r the correlation of the noise of two pixels `lag` apart and
+w that of their influences, w(0) = r(0) = 1. The influence is concentrated on the two lines through the corner: across a
+line it is a Gaussian of standard deviation s, along it its sign changes at the corner. The antisymmetric part of the
+residuals (`edge_fit`) is noise only, and determines r for all corners of a board together.
 """
 
 from __future__ import annotations
@@ -22,39 +22,39 @@ from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit
 from rigkit.kernels import edges
 
 LIGHT_SHARE = 0.16
-"""So much of a shift of the corner looks like a gradient of the light, which is fitted, too: 0.13 to 0.18 for edges of
-s from 0.4 to 2 px and squares of 25 and 50 px."""
+"""Share of a shift of the corner that the fitted gradient of the light absorbs: 0.13 to 0.18 for edges with s from 0.4
+to 2 px and squares of 25 and 50 px."""
 
 LOST_ERROR = 0.3
-"""How well it is known what the fit takes out of the noise, relative: squares of 8 to 50 px, sharp and blurred."""
+"""Relative uncertainty of the share of the noise that the fit absorbs, for squares of 8 to 50 px, sharp and blurred."""
 
 MIN_LEFT = 0.05
-"""A smaller share of the noise than this, left by the fit, would say nothing."""
+"""Smallest share of the noise in the residuals of the fit that is used."""
 
 COVERED_TIMES = 2.0
-"""Where there is so many times the noise that is usual on the board, it is not the camera's alone."""
+"""Corners with more than this times the board's noise are not used for the correlation."""
 
 MIN_ALIKE, UNEVEN_TIMES = 0.1, 1.5
-"""A corner has more than noise beside it where neighbouring pixels share so much, in parts of the noise and times the
-square of the board's factor, and its own factor is the second number times the board's. Of 6480 corners of rendered
-boards under noise alone two have both (RENDERED); at edges of shadows, fingers and glare it is 1.6 to 4."""
+"""A corner's window shows more than noise if neighbouring pixels are correlated by more than MIN_ALIKE times the square
+of the board's factor, and its own factor exceeds UNEVEN_TIMES the board's. Of 6480 corners of boards with noise only
+(RENDERED) two exceed both; at edges of shadows, fingers and glare the ratio is 1.6 to 4."""
 
 MIN_SIGMA_FACTOR = 0.5
-"""Of sigma: noise that cancels over a few pixels never does so altogether."""
+"""Lower bound of the factor of sigma."""
 
 
 def sigma_factors(
     fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray, boards: int, radius_px: float
 ) -> FloatArray:
-    """Return the factor (P,) for the sigmas of each of P `boards`: 1 where no correlation is seen beyond doubt.
+    """Return the factor (P,) of the sigmas of each of P `boards`: 1 without significant correlation.
 
     Parameters
     ----------
-    fit : of N corners, with noise told from other residuals.
-    good : (N,) corners to rely on.
-    sides : (N, 2, 2) the cells' sides, px.
-    owner : (N,) the board of each corner.
-    radius_px : of the fit.
+    fit : of N corners, with noise separated from other residuals.
+    good : (N,) corners to be used.
+    sides : (N, 2, 2) sides of the cells, px.
+    owner : (N,) index of the board of each corner.
+    radius_px : of the windows of the fit.
     """
     return edges.sigma_factors(_noise_of(fit, good, sides, owner), boards, factor_rules(radius_px))
 
@@ -62,11 +62,12 @@ def sigma_factors(
 def uneven_factors(
     fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray, typical: FloatArray, radius_px: float
 ) -> FloatArray:
-    """Return the factor (N,) for the sigmas of corners beside those of their boards, `typical` (P,): 1 but for corners
-    beside which there is more than noise.
+    """Return the additional factor (N,) of each corner's sigma: 1, and more for corners whose windows show more than
+    noise.
 
-    The edge of a shadow, glare or a finger in the window leaves what is the same over many pixels, and what of it looks
-    like a shift of the corner is in none of the residuals. Arguments else as of `sigma_factors`.
+    A shadow edge, glare or a finger in the window causes residuals that are correlated over many pixels; the part of
+    them that looks like a shift of the corner is not in the residuals. `typical` (P,) are the factors of the boards,
+    the other arguments as in `sigma_factors`.
     """
     return edges.uneven_factors(_noise_of(fit, good, sides, owner), typical, factor_rules(radius_px))
 
@@ -74,14 +75,14 @@ def uneven_factors(
 def board_factors(
     fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray, boards: int, radius_px: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return `sigma_factors` (P,), and beside these `uneven_factors` (N,)."""
+    """Return `sigma_factors` (P,) and `uneven_factors` (N,)."""
     noise, rules = _noise_of(fit, good, sides, owner), factor_rules(radius_px)
     factors = edges.sigma_factors(noise, boards, rules)
     return factors, edges.uneven_factors(noise, factors, rules)
 
 
 def _noise_of(fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray) -> edges.NoiseOfCorners:
-    # Copied here, once for both kernels, which take arrays that lie by themselves in memory.
+    # Contiguous copies, once for both kernels.
     alone = np.ascontiguousarray
     return edges.NoiseOfCorners(
         *(alone(fit.products), alone(fit.pairs), alone(fit.noise), alone(fit.pixels), alone(sides)),
@@ -90,17 +91,17 @@ def _noise_of(fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray)
 
 
 def shared_noise(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bool) -> float:
-    """Return the `sigma_factors` of one board, of the `fit` of its N corners, whose cells have `sides` (N, 2, 2).
+    """Return the `sigma_factors` of one board from the `fit` of its N corners, whose cells have `sides` (N, 2, 2).
 
-    On a board that is `marked` between its corners all that is left counts as noise, and no factor of the board's does.
+    The factor of a `marked` board, with markers in its squares, is 1: all its residuals count as noise.
     """
     good, owner = fit.valid & (fit.contrast > 0.0), np.zeros(len(sides), np.int64)
     return 1.0 if marked else float(sigma_factors(fit, good, sides, owner, 1, radius_px)[0])
 
 
 def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, typical: float) -> EdgeFit:
-    """Return the `fit` of a board's N corners, whose cells have `sides` (N, 2, 2), with `uneven_factors` beside the
-    board's `typical` one."""
+    """Return the `fit` of a board's N corners with sigmas multiplied by `uneven_factors`; `typical` is the board's
+    factor, `sides` (N, 2, 2) are those of the cells."""
     good, owner = fit.valid & (fit.contrast > 0.0), np.zeros(len(sides), np.int64)
     return fit.less_sure(uneven_factors(fit, good, sides, owner, np.array([typical]), radius_px))
 

@@ -1,9 +1,9 @@
-"""Chessboard corners by maximum likelihood: Gauss-Newton on the edge model, all corners of an image at once.
+"""Maximum likelihood estimation of chessboard corners: Gauss-Newton on the edge model, all corners of an image at once.
 
-For noise that is independent and equal in all pixels, least squares is maximum likelihood and reaches the Cramer-Rao
-bound; the same normal equations predict the standard deviation. How large the noise is, is read from what the model
-leaves and mirroring at the corner changes: blur of another shape, a tone curve or sharpening leave much, but the same
-on both sides, and so do not move the corner.
+For independent noise of equal variance, least squares is maximum likelihood and attains the Cramer-Rao bound; the
+normal equations also give the standard deviation. The noise is estimated from the part of the residuals that is
+antisymmetric about the corner. Blur of another shape, a tone curve or sharpening cause symmetric residuals, which do
+not shift the corner.
 """
 
 from __future__ import annotations
@@ -30,36 +30,36 @@ from rigkit.detection.subpixel.edge_model import (
 from rigkit.kernels.edges import LAGS, Rules, fit_corners
 
 BLUR_RANGE = (0.28, 5.0)
-"""s of a perfectly sharp image is the pixel's own 0.29; above 5 px there is no edge to speak of."""
+"""Bounds of s: it is 0.29 in a perfectly sharp image, due to the pixels; above 5 px there are hardly any edges."""
 
 ANGLE_SIGMA_RAD = 0.1
 LOG_BLUR_SIGMA = 0.7
 LIGHT_SIGMA_PER_PX = 0.01
-"""How well the lattice's angles, the start's log s and an even light (g = 0) are known beforehand. These matter only
-where squares are so small that the pixels cannot tell; there, a gradient of the light passes for a shifted corner."""
+"""Prior standard deviations of the lattice's angles, the initial log s and the gradient g of the light about 0. They
+matter only for very small squares, where a gradient of the light is not distinguishable from a shift of the corner."""
 
 MAX_MOVE_PX, MAX_TURN_RAD, MAX_BLUR_CHANGE, MAX_LIGHT_CHANGE = 1.0, 0.2, 0.3, 0.3
-"""A step is cut where it would leave the region in which the model is nearly linear: position, angles, relative blur,
-light."""
+"""Largest changes per step of position, angles, relative blur and light, for which the model is nearly linear."""
 
 BLUR_LAG = 2.0
-"""The last step may change s by this part of it for each px that it may move the corner: a wrong s hardly moves the
-corner, but adds to the residuals and so to the predicted sigma, most of all on sharp edges."""
+"""Convergence requires a relative change of s below this times the bound on the corner's move, per px: a wrong s hardly
+shifts the corner, but increases the residuals and thus the predicted sigma, most of all for sharp edges."""
 
 MIN_MIRRORED, MAX_MIRRORED_PX = 12, 2.0
-"""Noise is read from so many pixels with a mirror image at least, and not where a corner has ended so far from the
-middle of its window: little of the window has a mirror image then."""
+"""Smallest number of pixels with a mirror image from which noise is estimated, and largest distance of the corner from
+the centre of its window: further off few pixels have a mirror image."""
 
 ROUNDING_VARIANCE = 1.0 / 12.0
-"""Of grey levels, the least in 8-bit images: in flat squares rounding is the same everywhere and leaves nothing, but at
-the edges, where the corner comes from, its error varies evenly over a level."""
+"""Lower bound of the noise variance in 8-bit images, in squared grey levels. Rounding causes no residuals in uniform
+squares, but a uniformly distributed error at the edges, which determine the corner."""
 
 MIN_VARIANCE = 1e-6
 FIT_RIDGE = 1e-9
-"""Of grey levels, and on the normal equations' diagonal: keep an image without noise or without contrast solvable."""
+"""Lower bound of the variance in other images, and ridge of the normal equations, for images without noise or
+contrast."""
 
 VALID_MOVE_PX, VALID_MOVE_CELLS = 1.5, 0.2
-"""A fit that ends further from its start, in px or in sides of its cell, has found something else."""
+"""Largest distance of a valid fit from its start, in px and in sides of its cell."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -68,16 +68,16 @@ class EdgeFit:
 
     Attributes
     ----------
-    outcomes : (N, 35) as of `kernels.edges`: what follows, side by side.
+    outcomes : (N, 35) of `kernels.edges`, with the following attributes as columns.
     pixels : (N, 2)
     sigma_px : (N,) predicted standard deviation per axis, from the noise and the curvature of the likelihood.
     blur : (N,) s, px.
-    contrast : (N,) 2 b, negative if bright and dark are the other way round than expected.
+    contrast : (N,) 2 b, negative if the polarity is opposite to the expected one.
     residual : (N,) root mean square, grey levels.
-    noise : (N,) the same of the part that mirroring changes, as that of independent noise.
+    noise : (N,) root mean square noise, estimated from the antisymmetric part of the residuals.
     used : (N,) number of pixels.
-    products, pairs : (N, 13) for each of `kernels.edges.LAGS` the sum of the products of what mirroring changes at two
-        pixels so far apart, and of how many; 0 where the noise is not known or that of rounding.
+    products, pairs : (N, 13) for each of `kernels.edges.LAGS` the sum of the products of the antisymmetric residuals of
+        two pixels at that lag, and the number of pairs; 0 if the noise is unknown or due to rounding.
     valid : (N,) the fit converged near its start, with pixels on all sides.
     """
 
@@ -128,13 +128,13 @@ class EdgeFit:
         return EdgeFit(self.outcomes[which])
 
     def with_part(self, which: BoolArray, part: EdgeFit) -> EdgeFit:
-        """Return this with the corners `which` (N,) as in `part`."""
+        """Return the fit with the corners `which` (N,) replaced by `part`."""
         out = self.outcomes.copy()
         out[which] = part.outcomes
         return EdgeFit(out)
 
     def less_sure(self, times: FloatArray, *, all_is_noise: bool = False) -> EdgeFit:
-        """Return this with sigmas `times` (N,) as large; `all_is_noise` : what the fit leaves counts as noise."""
+        """Return the fit with sigmas multiplied by `times` (N,); `all_is_noise` : all residuals count as noise."""
         out = EdgeFit(self.outcomes.copy())
         out.sigma_px[:] *= times
         if all_is_noise:
@@ -157,18 +157,18 @@ def fit_edges(
     curvature_sigma: FloatArray | None = None,
     contrast: FloatArray | None = None,
 ) -> EdgeFit:
-    """Fit the edge model to `image` (as `grey_image` returns it) around the corners that are near `pixels` (N, 2).
+    """Return the fits of the edge model to `image` (as from `grey_image`) at corners near `pixels` (N, 2).
 
     Parameters
     ----------
-    sign : (N,) +1 where brightness grows with the angle across line 1.
+    sign : (N,) +1 where brightness increases with the angle across line 1, else -1.
     blur : (N,) expected s.
     radius_px : pixels further from the corner are not used.
-    iterations : Gauss-Newton steps at most.
-    mirrored : tell noise from other residuals; otherwise all counts as noise.
-    converged_px : the last step moves the corner by less than this; the next one would by a hundredth of it.
-    curvature_sigma : (N, 2) how well the geometry's curvatures are known, 1/px; where 0, and without, both are kept.
-    contrast : (N,) expected contrast; where NaN, and without, it is read from the window.
+    iterations : largest number of Gauss-Newton steps.
+    mirrored : separate noise from other residuals; otherwise all count as noise.
+    converged_px : the fit ends when a step moves the corner by less; the next step would be about a hundredth of it.
+    curvature_sigma : (N, 2) standard deviations of the geometry's curvatures, 1/px; None or 0: curvatures are fixed.
+    contrast : (N,) expected contrast; None or NaN: it is estimated from the window.
     """
     expected = np.full(len(pixels), np.nan) if contrast is None else contrast
     loose = np.zeros((len(pixels), 2)) if curvature_sigma is None else curvature_sigma

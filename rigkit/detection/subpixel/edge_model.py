@@ -1,17 +1,17 @@
-"""The brightness around a chessboard corner as a model of eleven parameters.
+"""A model of the brightness around a chessboard corner, with eleven parameters.
 
     I(p) = (1 + g . (p - c)) (a + b S(d1 / s) S(d2 / s))
 
-with d1, d2 the distances of pixel p from the two lines through the corner, a and b brightness and half contrast, g the
-gradient of the light. S is the step of an edge as a Gaussian lens and the square of a pixel blur it, of standard
-deviation s together. The lines have curvatures, so that a fisheye's bent rows do not pull the corner aside. Parameters:
-corner (2), angles of the lines (2), s, a, b, g (2), curvatures (2).
+with d1, d2 the distances of pixel p from the two lines through the corner, a and b mean brightness and half contrast, g
+the gradient of the light. S is a step edge blurred by a Gaussian lens and the square pixel, with a total standard
+deviation s. The lines are curved, since the bent rows of a fisheye would otherwise bias the corner. Parameters: corner
+(2), angles of the lines (2), s, a, b, g (2), curvatures (2).
 
-The corner of a square that stands alone, on the sides n1 and n2 (+1, -1) of the lines, has S1 S2 + n2 S1 + n1 S2 in
-place of S1 S2, and 4 b is its contrast.
+For the corner of an isolated square, on the sides n1 and n2 (+1, -1) of the lines, S1 S2 is replaced by S1 S2 + n2 S1 +
+n1 S2, and the contrast is 4 b.
 
-The model is symmetric about the corner but for curvature and light, so what it gets wrong otherwise (the shape of the
-blur, sharpening) does not move the corner; but it adds to the residuals, and so to the predicted sigma.
+Except for curvature and light the model is symmetric about the corner. Other model errors (the shape of the blur,
+sharpening) therefore do not bias the corner, but increase the residuals and thus the predicted sigma.
 """
 
 from __future__ import annotations
@@ -23,53 +23,54 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 
 TAIL_SIGMAS = 3.0
-"""An edge is felt so far away, s: the edges of the neighbouring lines are reckoned with where they are nearer."""
+"""Reach of an edge's blur, in s: edges of neighbouring lines within it are part of the model."""
 
 PIXEL_KURTOSIS = -1.0 / 120.0
-"""Fourth cumulant of a uniform distribution of width 1: of a pixel's square along its sides, px^4."""
+"""Fourth cumulant of a uniform distribution of width 1, that of a pixel's square along its sides, px^4."""
 
 SHARP_BLUR_PX = 0.6
-"""Below this s the pixel's square shows: a series in its cumulants would be wrong by half a grey level at s = 0.4."""
+"""Below this s the square of the pixel is modelled exactly: the series in its cumulants is wrong by half a grey level
+at s = 0.4."""
 
 WINDOW_REACH = 0.5
-"""Pixels are used up to this from the corner along the sides of its cell: the windows of neighbouring corners meet and
-do not overlap, so that every pixel is used and the errors of neighbours are independent."""
+"""Half size of the window in sides of the cell: windows of neighbouring corners touch but do not overlap, so that every
+pixel is used and the errors of neighbours are independent."""
 
 NEAR_SIGMAS, NEAR_PX = 3.0, 1.5
-"""Pixels are used so near to one of the lines (s and px added up): those beyond only repeat how bright squares are."""
+"""Largest distance of used pixels from one of the lines, in s plus px: others carry no information on the corner."""
 
 END_SIGMAS = 2.5
 MIN_REACH = 0.25
-"""Where the lattice ends, what lies behind the next line is not known: paper, a narrow margin, another square. Pixels
-nearer to that line, s, are left out, but never those so near to the corner, in parts of the way to that line."""
+"""At the border of the lattice the image beyond the next line is unknown (paper, a narrow margin, another square).
+Pixels closer than END_SIGMAS to that line are not used, except those within MIN_REACH of the distance to it."""
 
 PAPER_SIGMAS = 0.0
-"""The same where it is known how bright it is beyond: the model holds as far as the line."""
+"""As END_SIGMAS if the brightness beyond the line is known: all pixels up to the line are used."""
 
 
 NEIGHBOUR_LINES = ((-1, 0), (1, 0), (0, 1), (0, -1))
-"""Where, in rows and columns, the lines before and after line 1 and line 2 have their corners."""
+"""Offsets, in rows and columns, of the corners on the lines before and after line 1 and line 2."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Geometry:
-    """What the lattice says of N corners.
+    """The geometry of N corners from the lattice.
 
     Attributes
     ----------
-    sides : (N, 2, 2) the cell's sides along column and row, px: directions of line 1 and 2, and the window.
+    sides : (N, 2, 2) sides of the cell along column and row, px: directions of line 1 and 2, and size of the window.
     curvature : (N, 2) of the two lines, 1/px, positive towards +90 degrees.
     gaps : (N, 2, 2) distance of the neighbouring lines before and after line 1 and line 2 (along +90 degrees), px.
-    ends : (N, 2, 2) whether the lattice has no corner on that line beside this one.
-    reach : (N, 2, 2) how far the window goes towards that line, in sides of the cell, at most
-        WINDOW_REACH; None: by rule.
-    paper : (N, 2, 2) how bright it is beyond that line, relative to the corner's mean and in units of the model's b;
-        NaN where squares go on there, or where it is not known. None: everywhere.
-    tilts : (N, 2, 2) by how much that line is turned against this one, towards +90 degrees, rad; None: nowhere.
-    window_blur : (N,) s that windows are made for: a smaller one where other things are near the lines. None:
-        the expected one.
-    single : (N, 2) of the corner of one square alone, on which side of line 1 and 2 that lies, +1 towards +90 degrees
-        or -1; 0 where four squares meet. None: everywhere.
+    ends : (N, 2, 2) whether the lattice has no neighbouring corner on that line.
+    reach : (N, 2, 2) extent of the window towards that line, in sides of the cell, at most WINDOW_REACH; None: the
+        default.
+    paper : (N, 2, 2) brightness beyond that line, relative to the corner's mean and in units of the model's b; NaN if
+        squares continue, or if it is unknown. None: all NaN.
+    tilts : (N, 2, 2) angle between that line and the line through this corner, towards +90 degrees, rad; None: 0.
+    window_blur : (N,) s for which windows are made, smaller if there are other structures near the lines. None: the
+        expected s.
+    single : (N, 2) for the corner of an isolated square, its side of line 1 and 2, +1 towards +90 degrees or -1; 0
+        where four squares meet. None: all 0.
     """
 
     sides: FloatArray
@@ -84,7 +85,7 @@ class Geometry:
     window_blur: FloatArray | None = None
 
     def of(self, which: BoolArray) -> Geometry:
-        """Return that of the corners `which` (N,)."""
+        """Return the geometry of the corners `which` (N,)."""
         optional = {"reach": self.reach, "paper": self.paper, "tilts": self.tilts, "single": self.single}
         optional["window_blur"] = self.window_blur
         known = {name: part[which] for name, part in optional.items() if part is not None}
@@ -92,15 +93,15 @@ class Geometry:
 
 
 def tilted(geometry: Geometry, cells: BoolArray) -> Geometry:
-    """Return the `geometry` of the `cells` (R, C) of a lattice with `tilts`, and `gaps` beside the corner itself.
+    """Return the `geometry` of the `cells` (R, C) of a lattice with `tilts`, and with `gaps` along the corner's normal.
 
-    The gaps are those at the neighbouring corners, which lie aslant. Beyond the ends of the lattice its lines go on
-    turning as they do on the other side.
+    The given gaps refer to the neighbouring corners, which are at an angle. Beyond the ends of the lattice the tilts of
+    the opposite side are extrapolated.
     """
     sides = np.full((cells.shape[0] + 2, cells.shape[1] + 2, 2, 2), np.nan)
     row, column = np.nonzero(cells)
     length = np.sqrt((geometry.sides**2).sum(axis=2, keepdims=True))
-    # Neighbours that fell together have no direction.
+    # Coincident neighbours have no direction.
     own = geometry.sides / np.where(length > 0.0, length, np.nan)
     sides[1:-1, 1:-1][cells] = own
     tilts = np.empty(geometry.gaps.shape)
@@ -109,7 +110,7 @@ def tilted(geometry: Geometry, cells: BoolArray) -> Geometry:
         tilts[:, line, k % 2] = here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]
     tilts = np.where(np.isnan(tilts), -tilts[:, :, ::-1], tilts)
     tilts[np.isnan(tilts)] = 0.0
-    # How far along line 1 and 2 the corner after, along row and column, lies.
+    # Offset along line 1 and 2 of the next corner along row and column.
     aslant = (geometry.sides[:, ::-1] * own).sum(axis=2) * (1.0, -1.0)
     return replace(geometry, gaps=geometry.gaps - tilts * aslant[:, :, None], tilts=tilts)
 
