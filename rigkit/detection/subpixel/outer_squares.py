@@ -1,9 +1,9 @@
-"""What lies beyond the outermost squares of a board, and where they end.
+"""The ends of the outermost squares of a board, and the brightness beyond, which blur brings into the corners' windows.
 
-Blur brings both into the windows of the outermost corners. Sheets are cut, and margins begin, anywhere: of some boards
-the outer squares are half as wide as the others. On the way out from such a corner the two squares differ in brightness
-to the end of them, where a blurred difference is halved, and beyond they do not, unless there are squares that the
-lattice has not. The mean of both sides goes, over the same edge, from that of the corner to the brightness beyond.
+Sheets may be cut, and margins begin, anywhere: the outer squares of some boards are half as wide as the others. Along
+the edge outwards from an outermost corner, the difference of the squares on both sides vanishes at their end, where a
+blurred difference is halved, unless there are squares that the lattice lacks. Their mean changes there from that of the
+corner to the brightness beyond.
 """
 
 from __future__ import annotations
@@ -21,40 +21,42 @@ from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geom
 from rigkit.kernels.light import PaperRules, find_paper
 
 MIN_PAPER_BLUR = 1.0
-"""In a sharper image, px, what lies beyond the outermost squares moves corners by less than half their sigma, even of
-boards with cut squares (10 real images: 0.018 px; with blur 1.5 px it is 0.055 px, 1.1 sigmas)."""
+"""Smallest s, px, for which the image beyond the outermost squares is modelled: in sharper images it shifts corners by
+less than half their sigma, even on boards with cut squares (10 REAL images: 0.018 px; with s = 1.5 px it is 0.055 px,
+1.1 sigmas)."""
 
 SUSPECT_RESIDUAL = 1.5
-"""Outermost corners that fit worse than this times what is typical of the inner ones may have more in their windows:
-chance makes 1.15."""
+"""Ratio of the residual of an outermost corner to the median of the inner ones above which its window may show more
+than the board's squares: by chance it is 1.15."""
 
 STEPS_SQUARES = np.arange(0.1, 1.6001, 0.05)
-"""Where brightness is read, in squares outwards."""
+"""Distances outwards at which brightness is read, in squares."""
 
 LATERAL_SQUARES = 0.4
-"""And so far to both sides of the edge, in squares: near the middles of the squares, where blur leaves most of their
-difference, but still inside where the edge is bent."""
+"""Distance to both sides of the edge at which brightness is read, in squares: near the middles of the squares, where
+the blurred difference is largest, but still within them if the edge is bent."""
 
 FIRST, LAST = 0.6, 1.25
-"""The difference is largest nearer than the one, in squares; squares that end beyond the other are no outer ones."""
+"""Distance within which the largest difference is sought, and largest distance of the end of outer squares, in
+squares."""
 
 GOES_ON, CUT = -0.4, 0.8
-"""Where the difference comes back the other way round, by this part of the contrast, the board goes on; but squares
-that end so early, in squares, are cut, and what differs beyond is something else."""
+"""The board continues if the difference reverses by this part of the contrast, unless the squares end before CUT
+squares, so that they are cut and the difference beyond is something else."""
 
 MAX_REFERENCE_RATIO = 2.5
-"""A corner that tells what lies beyond another one lies so near to it, in sides of its cell: paper is alike there."""
+"""Largest distance, in sides of the cell, between corners that share readings of the paper."""
 
 SEEN = 0.8413
-"""Of what lies beyond an edge a pixel sees so much one standard deviation of the blur behind it. Further out a narrow
-margin may have ended."""
+"""Share of the brightness beyond an edge at one standard deviation of the blur behind it, where it is read: further out
+a narrow margin may have ended."""
 
 MAX_PAPER = 1.6
-"""Paper is this much brighter or darker than the mean of the squares at most, in half contrasts; squares are by 1."""
+"""Largest difference of the paper from the mean of the squares, in half contrasts; that of squares is 1."""
 
 PAPER_ROUNDS, SETTLED_PX = 4, 0.03
-"""What lies beyond the outermost squares is read with the corners as they are fitted so far, and again for those that
-then move by more than the second number."""
+"""Largest number of rounds of reading the image beyond the outermost squares and fitting the corners; those that move
+by less than SETTLED_PX are not fitted again."""
 
 
 def fitted_beside_paper(
@@ -66,8 +68,8 @@ def fitted_beside_paper(
     owner: IntArray,
     wanted: BoolArray | None = None,
 ) -> EdgeFit:
-    """Return the `fit` of N corners with those (of the `wanted`, (N,), where not all are) `fitted` again that see what
-    lies beyond their board, `owner` (N,); the same `fit` where none do."""
+    """Return the `fit` of N corners, of boards `owner` (N,), after fitting those again whose windows extend beyond
+    their board; the same `fit` if none do. `wanted` (N,) limits these corners, `fitted` fits them."""
     again = beside_paper(geometry, fit, owner)
     again = again if wanted is None else again & wanted
     moving = again
@@ -83,7 +85,7 @@ def fitted_beside_paper(
 
 
 def beside_paper(geometry: Geometry, fit: EdgeFit, owner: IntArray) -> BoolArray:
-    """Return which of N corners may see what lies beyond their board; `owner` (N,) is the number of that."""
+    """Return which of N corners, of boards `owner` (N,), may have windows extending beyond their board."""
     good = fit.valid & (fit.contrast > 0.0)
     soft = np.zeros(int(owner.max(initial=-1)) + 1, np.bool_)
     for k in range(len(soft)):
@@ -96,7 +98,7 @@ def beside_paper(geometry: Geometry, fit: EdgeFit, owner: IntArray) -> BoolArray
     ends = geometry.ends.reshape(-1, 4)
     relative = fit.residual / np.where(good, fit.contrast, np.inf)
     typical = np.full(len(soft), np.inf)
-    # Those that have corners on all sides; of a board that has none, all.
+    # Corners with neighbours on all sides; on boards without such corners all.
     inner = good & ~ends.any(axis=1)
     for k in np.flatnonzero(soft).tolist():
         mine = owner == k
@@ -106,10 +108,10 @@ def beside_paper(geometry: Geometry, fit: EdgeFit, owner: IntArray) -> BoolArray
 
 
 def with_paper(image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatArray, owner: IntArray) -> Geometry:
-    """Return the `geometry` of N corners `fit` with `paper` beyond their ends, and `gaps` to where it begins.
+    """Return the `geometry` of N corners `fit` with `paper` beyond their ends, and `gaps` up to the paper.
 
-    `sign` (N,) as for `edge_fit.fit_edges`, `owner` (N,) the number of each corner's board. Each reading is the median
-    of those near it on its side of the board.
+    `sign` (N,) as for `edge_fit.fit_edges`, `owner` (N,) the index of each corner's board. Readings are medians over
+    nearby corners on the same side of the board.
     """
     paper, gaps = find_paper(
         *(image, fit.pixels, geometry.sides, geometry.gaps, geometry.ends),
@@ -121,8 +123,8 @@ def with_paper(image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatAr
 def outer_squares(
     image: GreyImage, geometry: Geometry, pixels: FloatArray, contrast: FloatArray, blur: FloatArray, sign: FloatArray
 ) -> FloatArray:
-    """Return how wide the outermost squares beside N corners of a board are, (N, 2, 2), in squares; NaN where none is
-    seen to end.
+    """Return the widths (N, 2, 2), in squares, of the outermost squares at N corners of a board; NaN if no end is
+    found.
 
     `pixels` (N, 2), `contrast` and `blur` (N,) of the corners; `sign` (N,) as for `edge_fit.fit_edges`.
     """

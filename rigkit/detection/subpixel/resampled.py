@@ -1,4 +1,4 @@
-"""Parts of an image, resampled: stretched along one direction and made smaller along another."""
+"""Affinely resampled parts of an image."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import FloatImage, GreyImage
 
 MARGIN_CELLS = 3.0
-"""What is resampled goes on so many squares beyond the corners."""
+"""Margin of the resampled part around the corners, in squares."""
 
 DRAWN_EVERY_PX = 2.0
-"""It is read at places so far apart, px of the image, at most: what blur has made smaller has nothing finer in it."""
+"""Largest distance of sample positions, px of the image, before averaging: blurred images have no finer detail."""
 
 MAX_RESAMPLED = 1.6e7
-"""Larger parts are not resampled."""
+"""Largest number of samples."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -40,34 +40,34 @@ class Resampled:
 
     @property
     def sigma_factor(self) -> float:
-        """Standard deviation per axis (rms) in the image of what has one of 1 in both directions here."""
+        """Standard deviation per axis (rms) in the image for a standard deviation of 1 in both directions here."""
         return float(np.linalg.norm(np.linalg.inv(self.matrix)) / np.sqrt(2.0))
 
     def of(self, pixels: FloatArray) -> FloatArray:
-        """Return where `pixels` (..., 2) of the image are here."""
+        """Return the pixels (..., 2) of this part for `pixels` of the image."""
         return np.asarray(pixels @ self.matrix.T + self.offset)
 
     def back(self, pixels: FloatArray) -> FloatArray:
-        """Return where `pixels` (..., 2) of this are in the image."""
+        """Return the pixels (..., 2) of the image for `pixels` of this part."""
         return np.asarray((pixels - self.offset) @ np.linalg.inv(self.matrix).T)
 
 
 def resampled(image: GreyImage, lattice: Lattice, matrix: FloatArray, radius_px: float) -> Resampled | None:
-    """Return the part of `image` around `lattice` as `matrix` maps it; None where that is too large."""
+    """Return the part of `image` around `lattice`, transformed by `matrix`; None if it is too large."""
     corners = lattice.pixels[lattice.known] @ matrix.T
     side = float(np.median(np.linalg.norm(fit_cells(lattice.pixels, lattice.known).sides @ matrix.T, axis=2)))
     low = np.floor(corners.min(axis=0) - MARGIN_CELLS * side)
     size = np.ceil(corners.max(axis=0) + MARGIN_CELLS * side - low).astype(int) + 1
-    # Finer first, then means.
+    # Supersampling, then means.
     fine = int(np.ceil(1.0 / (DRAWN_EVERY_PX * np.linalg.svd(matrix)[1].min())))
     if not 0 < float(np.prod(size, dtype=np.float64)) * fine**2 < MAX_RESAMPLED:
         return None
-    # Of the image only what is drawn is converted.
+    # Only the part that is sampled is converted.
     reached = (np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) * size + low) @ np.linalg.inv(matrix).T
     first = np.floor(reached.min(axis=0)).clip(0, np.array(image.shape[::-1]) - 2).astype(int)
     end = np.ceil(reached.max(axis=0)).astype(int) + 2
     seen = image[first[1] : max(end[1], first[1] + 2), first[0] : max(end[0], first[0] + 2)].astype(np.float32)
-    # The middle of a pixel lies in the middle of the finer ones.
+    # The centre of a pixel is the centre of its finer pixels.
     there = np.column_stack([fine * matrix, fine * (matrix @ first - low) + 0.5 * (fine - 1.0)])
     columns, rows = (size * fine).tolist()
     drawn = cv2.warpAffine(seen, there, (columns, rows), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

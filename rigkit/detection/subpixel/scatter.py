@@ -1,4 +1,4 @@
-"""How much more the corners of a board scatter about smooth rows and columns than their sigmas say."""
+"""Scatter of the corners of a board about smooth rows and columns, relative to their sigmas."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
 
 DIFFERENCES = (5, 6)
 MIN_SCATTER_CORNERS, MIN_DIFFERENCES = 12, 16
-"""Orders of the differences along rows and columns, and how many corners and differences there must be."""
+"""Orders of the differences along rows and columns, and the smallest numbers of corners and differences."""
 
 UNEXPLAINED = 1.25
-"""A scatter about the lattice less than this times the expected one is what chance makes of fifty corners."""
+"""Smallest significant ratio of the scatter to the expected one: fifty corners give smaller ratios by chance."""
 
 STRONG_CURVATURE = 0.25
-"""Neighbouring steps that differ by more than this, relative to the shorter, are a lens's: a difference of order 6 of
-what turns, or grows, by that much a cell is some hundredths of a pixel in cells of 50 px, as much as good corners
-scatter."""
+"""Smallest difference of successive steps, relative to the shorter, that indicates a strong lens: differences of order
+6 of rows that turn, or grow, by that much per cell are some hundredths of a pixel in cells of 50 px, the scatter of
+good corners."""
 
 MIXED = ((3, 3), (3, 4), (4, 3), (4, 4))
-"""Orders of the differences along columns and then along rows. What a lens does to a corner it does nearly so to the
-corners beside it, so these shrink the bend twice over; scatter they leave as it is."""
+"""Orders of mixed differences, along columns and then along rows. Distortion is similar for neighbouring corners and is
+reduced by both differences; scatter is not."""
 
 SURFACES, AS_ROUGH, MIN_TERM = (3, 4), 1.5, 1e-6
 EVEN_STEPS = 0.12
-"""Degrees of the surfaces by which small boards are judged, and by how much more the first leaves, at most, if what is
-left is scatter; terms that few rows cannot tell are left out. Boards whose neighbouring steps differ by more than the
-last number, relative to the shorter, are seen through a lens that bends more than such surfaces: of REAL ones it is 0.1
-at most behind regular lenses and mostly 0.13 to 0.35 in fisheyes."""
+"""Degrees of the surfaces that are fitted to small boards, largest ratio of the residuals of the first to the second if
+they are scatter, and smallest pivot of a term. If successive steps differ by more than EVEN_STEPS, relative to the
+shorter, the surfaces do not describe the distortion: on REAL boards it is at most 0.1 with regular lenses and mostly
+0.13 to 0.35 with fisheyes."""
 
 
 def excess_scatter(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tuple[slice, slice]]) -> FloatArray:
-    """Return how much more the corners of each part scatter about smooth rows and columns than their sigmas say, (P,).
+    """Return the ratio (P,), at least 1, of the scatter of the corners of each part to that expected from their sigmas.
 
-    Judged by the DIFFERENCES along rows and columns, with and without the best perspective taken away first: the one is
-    blind to strong perspective, the other to a fisheye's bend, and the calmest of them is right. At least 1.
+    It is the smallest over the orders DIFFERENCES along rows and columns, with and without removing the best
+    perspective: removal helps for strong perspective, differences alone for a fisheye.
 
     Parameters
     ----------
@@ -53,10 +53,9 @@ def excess_scatter(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tup
 
 
 def scatter_factors(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tuple[slice, slice]]) -> FloatArray:
-    """Return by how much the sigmas of each part are to be raised, (P,): `excess_scatter` for any lens.
+    """Return the factors (P,) of the sigmas of each part: `excess_scatter`, for strong lenses also mixed differences.
 
-    Strong lenses bend rows by more than the differences along them take away; there those along rows and columns
-    together are asked as well, and the calmest is right.
+    Differences along rows do not remove the curvature of strong lenses; the smallest of all ratios is returned.
     """
     factors = excess_scatter(pixels, sigma_px, parts)
     for k in np.flatnonzero(factors > UNEXPLAINED).tolist():
@@ -68,10 +67,10 @@ def scatter_factors(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tu
 
 
 def small_scatter(pixels: FloatArray, sigma_px: FloatArray) -> float:
-    """Return by how much the sigmas of a board with too few corners for the DIFFERENCES are to be raised, at least 1.
+    """Return the factor, at least 1, of the sigmas of a board with too few corners (R, C, 2) for the DIFFERENCES.
 
-    A cubic and a quartic surface through all its corners (R, C, 2) leave the same where they leave scatter; what a
-    strong lens bends, the second one leaves much less of, and nothing is said.
+    It follows from the residuals of cubic and quartic surfaces, which are similar if they are scatter. If the quartic
+    ones are much smaller, due to a strong lens, the factor is 1.
     """
     cubic, quartic = native.surface_scatter(pixels, sigma_px, _rules())
     if not (cubic < AS_ROUGH * quartic and quartic > UNEXPLAINED):
@@ -80,7 +79,7 @@ def small_scatter(pixels: FloatArray, sigma_px: FloatArray) -> float:
 
 
 def _mixed_roughness(pixels: FloatArray, sigma_px: FloatArray, down: int, along: int) -> float:
-    """Return the typical mixed difference of `pixels` (R, C, 2) over the expected one, NaN where there are few."""
+    """Return the median mixed difference of `pixels` (R, C, 2) over the expected one, NaN if there are too few."""
     if pixels.shape[0] <= down or pixels.shape[1] <= along:
         return np.nan
     weights = [np.array([float(comb(order, k)) ** 2 for k in range(order + 1)]) for order in (down, along)]

@@ -1,10 +1,10 @@
-"""Corners beside the edge of a shadow: the light is found, taken out of the image, and the corners fitted again.
+"""Corners near the edge of a shadow: the light is estimated and divided out, and the corners are fitted again.
 
-A shadow is a factor of the light. Across its edge, seen through a window, that goes in one straight step from 1 to what
-is left; the edge model, whose light is smooth, takes part of the step for a shift of the corner. What corner and step
-are together the window tells (eleven unknowns). The corner found so is still drawn aside by what the model does not
-know of the edges: in even light that mirrors itself at the corner, but not here. So the window's pixels are divided by
-the light, and the corner is fitted in them as any other.
+A shadow multiplies the light by a factor. Within a window its edge is a straight step from 1 to that factor, which the
+edge model, with its smooth light, partly explains by a shift of the corner. Corner and step are therefore fitted
+together (eleven unknowns). The resulting corner is still biased by model errors of the edges, whose effects do not
+cancel by symmetry in uneven light. So the window's pixels are divided by the estimated light, and the corner is fitted
+in them by the edge model.
 """
 
 from __future__ import annotations
@@ -18,45 +18,45 @@ from rigkit.detection.saddles.response import FloatImage, GreyImage
 from rigkit.kernels.light import LightRules, fit_light_steps, lit_unevenly
 
 SAMPLED_ALONG, SAMPLED_LATERAL = np.array([0.15, 0.35]), 0.12
-"""Where the light on opposite arms is compared: so far along them and aside, in sides of the cell. Beside the end of a
-board, where squares may be cut, only the nearer ones are looked at."""
+"""Positions along and beside the arms at which the light on opposite sides is compared, in sides of the cell. At the
+border of a board, where squares may be cut, only the nearer ones are used."""
 
 MIN_SHADOW_LATERAL_PX = 1.0
-"""Nearer to a line its blur is seen, and nothing else."""
+"""Smallest distance of these positions from a line, whose blur is visible closer to it."""
 
 UNEVEN_LIGHT = 0.4
-"""Opposite squares differ by more than this part of the contrast beside the edges of shadows that leave less than two
-thirds of the light: REAL images without any had 63 such corners of 10 700, most of them at the ends of boards."""
+"""Smallest difference of opposite squares, over the contrast, at edges of shadows with less than two thirds of the
+light. REAL images without shadows had 63 such corners of 10 700, most of them at the borders of boards."""
 
 LIGHT_RANGE = (0.1, 0.8)
-"""What a shadow leaves of the light: of less, 8 bits show no squares, and it may be a hand."""
+"""Range of the factor of a shadow: with less light 8 bits show no squares, and it may be a hand."""
 
 LIGHT_RULES = LightRules.of(
-    # Of the window: as that of the edge model.
+    # The window of the edge model.
     radius_px=18.0,
     reach_cells=0.44,
     min_left=LIGHT_RANGE[0],
     max_left=LIGHT_RANGE[1],
     max_light=1.5,
-    # Pixels on either side of a shadow's edge that tell it.
+    # Smallest number of pixels on either side of the shadow's edge.
     min_pixels=20.0,
-    # How well lines, blur, and the width of the shadow's edge are known beforehand.
+    # Prior standard deviations of lines, blur, and width of the shadow's edge.
     line_sigma=0.05,
     log_edge_sigma=0.1,
     log_width_sigma=0.7,
     first_width=0.8,
     min_width=0.3,
     max_width=6.0,
-    # In so many directions a sharp step is sought; then corner and step are fitted with so many steps.
+    # Directions in which a sharp step is sought, and iterations of the joint fit of corner and step.
     angles=16,
     iterations=8,
 )
 
 MAX_LIGHT_STEP = np.array([0.7, 0.7, 0.2, 0.2, 0.3, 1e3, 1e3, 0.3, 1.5, 0.5, 0.3])
-"""What one of them changes at most: corner, angles, log blur, levels; direction, place, log width, light."""
+"""Largest changes per iteration of corner, angles, log blur, levels, direction, position, log width, light."""
 
 TILE_PX = 24
-"""Half the side of the window's picture in even light: what the edge model may look at."""
+"""Half side of the corrected windows, which contain the windows of the edge model."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -65,11 +65,11 @@ class LightSteps:
 
     Attributes
     ----------
-    centre : (N, 2) pixels that they are told from.
-    towards, place : (N,) direction from light to dark, rad, and how far that way the edge lies, px.
-    width : (N,) of the edge, as of a normal distribution, px.
-    left : (N,) what is left of the light beyond it.
-    pixels, sigma_px : (N, 2), (N,) the corners as found together with it, and how well.
+    centre : (N, 2) pixels, origins of the following.
+    towards, place : (N,) direction from light to dark, rad, and distance of the edge in that direction, px.
+    width : (N,) standard deviation of the edge, px.
+    left : (N,) factor of the light in the shadow.
+    pixels, sigma_px : (N, 2), (N,) the corners of the joint fit, and their standard deviations.
     """
 
     _: KW_ONLY
@@ -93,7 +93,8 @@ def beside_shadows(
 ) -> BoolArray:
     """Return which of the corners `pixels` (N, 2) of cells with `sides` (N, 2, 2) are lit unevenly.
 
-    `lateral` (N,) : how far from the lines brightness may be read, px, at most; `ends` (N,) : where the board may end.
+    `lateral` (N,) : largest distance from the lines at which brightness is read, px; `ends` (N,) : whether the board
+    may end there.
     """
     return lit_unevenly(
         image, pixels, sides, lateral, ends, SAMPLED_ALONG, SAMPLED_LATERAL, MIN_SHADOW_LATERAL_PX, UNEVEN_LIGHT
@@ -103,10 +104,10 @@ def beside_shadows(
 def light_steps(
     image: GreyImage, start: FloatArray, sides: FloatArray, curvature: FloatArray, blur: float, lateral: FloatArray
 ) -> tuple[LightSteps, BoolArray]:
-    """Return the steps of the light in the windows of corners near `start` (N, 2), and which were found.
+    """Return the steps of the light in the windows of corners near `start` (N, 2), and which fits are valid.
 
-    `sides` (N, 2, 2) and `curvature` (N, 2) of the lines as in `Geometry`, `blur` about that of their edges, px; pixels
-    further than `lateral` (N,) px from both lines are not used.
+    `sides` (N, 2, 2) and `curvature` (N, 2) of the lines as in `Geometry`, `blur` the initial s, px; pixels further
+    than `lateral` (N,) px from both lines are not used.
     """
     fitted = fit_light_steps(image, start, sides, curvature, lateral, blur, MAX_LIGHT_STEP, LIGHT_RULES)
     _, _, sigma_px, towards, place, width, left, found = fitted.T
@@ -123,7 +124,7 @@ def light_steps(
 
 
 def in_even_light(image: GreyImage, steps: LightSteps) -> tuple[FloatImage, FloatArray]:
-    """Return the windows in even light, side by side, and what moves pixels of the image to theirs (N, 2)."""
+    """Return the windows divided by their light, side by side, and the shifts (N, 2) from image pixels to theirs."""
     span = np.arange(-TILE_PX, TILE_PX + 1.0)
     offsets = np.stack(np.meshgrid(span, span), axis=-1)
     at = (steps.centre[:, None, None] + offsets).clip(0.0, np.array(image.shape[::-1]) - 1.0).astype(np.int64)
@@ -134,6 +135,5 @@ def in_even_light(image: GreyImage, steps: LightSteps) -> tuple[FloatImage, Floa
 
 
 def _edge(z: FloatArray) -> FloatArray:
-    """Return erf(z / sqrt 2), good to 3e-4."""
-    value: FloatArray = np.tanh(np.sqrt(2.0 / np.pi) * z * (1.0 + 0.044715 * z * z))
-    return value
+    """Return erf(z / sqrt 2), accurate to 3e-4."""
+    return np.asarray(np.tanh(np.sqrt(2.0 / np.pi) * z * (1.0 + 0.044715 * z * z)))

@@ -1,4 +1,4 @@
-"""Corners much less sure than others of their board: claimed only where these have them."""
+"""Corners with sigmas far larger than those of their board, kept only if they agree with predictions by the others."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, known_median
 
 UNCERTAIN_FACTOR, NEARBY_CELLS = 6.0, 2
-"""A corner with so many times the sigma that is usual on its board, and so near to it, in cells (where a board is seen
-aslant, or in the dark, many are less sure), mostly has something else in its window."""
+"""A corner is uncertain if its sigma exceeds this times the median of the board, and of its neighbours up to so many
+cells away (in oblique or dark parts many are less certain): usually its window shows something else."""
 
 IN_PLACE_CELLS, IN_PLACE_TIMES = 0.05, 2.0
-"""The others have it where it lies within so many cells of where they foretell it, or within so many times the error
-that such a prediction usually has: at the end of a row it is further off than within the board."""
+"""Largest distance of a corner that agrees with its prediction, in cells, or (the larger) relative to the expected
+error of the prediction, which is larger at the end of a row."""
 
 
 def strays(sigma_px: FloatArray, off_cells: FloatArray, gain: FloatArray) -> BoolArray:
-    """Return which corners (R, C) of a board are unsure, and not where the others have them.
+    """Return which corners (R, C) of a board are uncertain and contradict their predictions by the others.
 
     Parameters
     ----------
     sigma_px : (R, C), NaN where unknown.
-    off_cells : (R, C) how far each lies from where the others foretell it, in sides of its cell; NaN likewise.
+    off_cells : (R, C) distance of each corner from its prediction, in sides of its cell; NaN likewise.
     gain : (R, C) standard deviation of that prediction for corners of standard deviation 1.
     """
     out = uncertain(sigma_px)
@@ -34,8 +34,8 @@ def strays(sigma_px: FloatArray, off_cells: FloatArray, gain: FloatArray) -> Boo
 
 
 def uncertain(sigma_px: FloatArray) -> BoolArray:
-    """Return which corners of a board are much less sure than others, and those around them; `sigma_px` (R, C), NaN
-    where unknown."""
+    """Return which corners of a board have far larger `sigma_px` (R, C; NaN where unknown) than the board and than
+    their neighbours."""
     with np.errstate(invalid="ignore"):
         out = np.asarray(sigma_px > UNCERTAIN_FACTOR * known_median(sigma_px))
     if out.any():

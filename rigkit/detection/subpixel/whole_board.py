@@ -1,9 +1,9 @@
-"""Boards whose squares are small against the blur: the picture of the whole board is fitted at once.
+"""Joint fit of all corners of a board whose squares are small relative to the blur.
 
-Where edges spread over most of a square, a corner's window holds little but other corners' edges. What these are there,
-only the whole board says: its picture is that of even squares, bent as a smooth map through all corners has it, under a
-light that changes slowly, blurred; all corners are sought together. So many fewer unknowns are left for every corner
-that its standard deviation falls below that of single corners' windows.
+If edges extend over most of a square, a corner's window shows mainly the edges of other corners. The model is therefore
+an image of the whole board: uniform squares, transformed by a smooth map through all corners, with slowly varying
+light, and blurred. All corners are estimated jointly. With fewer unknowns per corner, their standard deviations are
+smaller than those of separate windows.
 """
 
 from __future__ import annotations
@@ -39,60 +39,60 @@ from rigkit.kernels.boards import (
 Part = tuple[slice, slice]
 
 SHARP_PX = 0.7
-"""The picture is drawn with this blur, and blurred: at one sample a px nothing of it is lost (exp(-2 pi^2 0.7^2) is
-6e-5), and within so little of it the map is as good as straight."""
+"""Blur, px, with which the model is drawn before further blur: it is band-limited at one sample per px (exp(-2 pi^2
+0.7^2) is 6e-5), and within it the map is nearly affine."""
 
 MAP_RINGS = 2
-"""The map goes on so many squares beyond the corners: blur brings no more of what is there into their windows."""
+"""Squares beyond the corners for which the map is extrapolated, as far as blur brings them into view."""
 
 PICTURE_SIGMAS, CHANGE_SIGMAS = 4.0, 2.75
-"""Pictures are blurred from so far away, s, and their changes, which only lead to the corners."""
+"""Extent of the blur kernel, in s, for the model and for its derivatives, which need less accuracy."""
 
 AROUND = 0.25
-"""Bent sides of squares leave the box of their corners by less than this part of it."""
+"""Upper bound of the extent of curved squares beyond the bounding box of their corners, over its size."""
 
 LIGHT_SQUARES = 2.0
-"""Light and blur are interpolated between values so far apart, squares."""
+"""Distance, in squares, of the nodes between which light and blur are interpolated."""
 
 MAX_EXTRAPOLATION_SQUARES = 1.5
-"""What is told by corners goes on so far beyond them, squares."""
+"""Distance, in squares, up to which displacements of corners are extrapolated."""
 
 END_SIGMA, PAPER_SIGMA, BLUR_SIGMA = 0.1, 1.0, 0.1
-"""How well it is known beforehand how large the outer squares are, in squares, how bright it is beyond them, in half
-contrasts, and that blur is everywhere the same, relative."""
+"""Prior standard deviations of the width of the outer squares (in squares), of the brightness beyond them (in half
+contrasts), and of the relative variation of the blur."""
 
 MAX_STEPS, SETTLED_SIGMAS = 6, 0.3
-"""Gauss-Newton steps at most; one that moves corners by less than this, in their sigmas, is the last: the next one
-would by a fifth of it."""
+"""Largest number of Gauss-Newton steps, and the rms move of the corners, in sigmas, at which they end: the next step
+would be about a fifth of it."""
 
 HOLE_SIGMA_PX = 0.5
-"""How well corners that nobody saw are foretold by the others."""
+"""Prior standard deviation of missing corners, predicted by the others."""
 
 FREE = 1e-6
-"""What is known of everything else."""
+"""Weight of the prior on all other unknowns."""
 
 OUTWARDS = np.array([-1.0, 1.0, -1.0, 1.0])
-"""Which way, along columns and rows, the board ends first and last."""
+"""Outward directions, along columns and rows, at the first and the last end of the board."""
 
 MIN_ROWS = 3
-"""Steps between corners have neighbours."""
+"""Smallest number of rows and of columns."""
 
 MIN_BLUR_OF_BOARD, MIN_SQUARE = 1.5, 9.0
-"""Pixels are made larger while blur is so many of them, and the smallest square."""
+"""Smallest s and smallest square, in pixels, after averaging pixels."""
 
 MIN_BLUR_PX, SMALL_SQUARES = 1.2, 9.0
-"""Boards whose squares are smaller than so many s are fitted as a whole, under a blur that is more than that with which
-the picture is drawn. Rendered ones in a fisheye are then placed better by 0.7 at 8 s and 0.55 at 5 s."""
+"""Smallest s, px, and largest squares, in s, of boards that are fitted as a whole. The errors of RENDERED boards in a
+fisheye are then multiplied by 0.7 for squares of 8 s and by 0.55 for 5 s."""
 
 MAX_HOLES = 0.1
-"""Boards that lack more of their corners are left as they are: little is known of what is there."""
+"""Largest share of missing corners of a board that is fitted as a whole."""
 
 MAX_TILE, OVERLAP = 14, 2
-"""Larger boards are fitted in tiles of so many rows and columns, which share some: the time grows with the cube."""
+"""Largest tile of a board, in rows and columns, and overlap of tiles: the time grows with the cube of the corners."""
 
 MAX_RESIDUAL = 1.25
-"""The picture of the board may leave so much more than the corners by themselves do, which have four times as many
-unknowns. It leaves more where there are marks in the squares, or a hand on them."""
+"""Largest ratio of the residual to that of separate corners, which have four times as many unknowns. It is larger with
+markers in the squares, or a hand in front of them."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -103,7 +103,7 @@ class WholeBoard:
     ----------
     pixels : (R, C, 2)
     spread_px : (R, C) standard deviation per axis under independent noise of one grey level.
-    residual : root mean square of what is left, grey levels, of pixels as large as they were made.
+    residual : root mean square residual, grey levels, of averaged pixels.
     """
 
     pixels: FloatArray
@@ -113,8 +113,8 @@ class WholeBoard:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _SheetParameters:
-    """What is sought: corners (R, C, 2), ends (2, 2), paper (4,), blur s, and light, contrast and by how much the blur
-    is wider, relative, (3, r, c) at nodes LIGHT_SQUARES apart."""
+    """The unknowns: corners (R, C, 2), ends (2, 2), paper (4,), blur s, and light, contrast and relative increase of
+    the blur (3, r, c) at nodes LIGHT_SQUARES apart."""
 
     pixels: FloatArray
     ends: FloatArray
@@ -124,8 +124,8 @@ class _SheetParameters:
 
 
 def placed_together(image: GreyImage, item: RefinedLattice) -> RefinedLattice:
-    """Return `item` with its corners placed together where its squares are small against the blur, and the picture is
-    as that of a board; else as it is."""
+    """Return `item` with jointly fitted corners if its squares are small relative to the blur and the model fits; else
+    unchanged."""
     lattice, known = item.lattice, item.lattice.known
     start, blur = lattice.pixels, known_median(item.blur_px[known])
     few = min(known.shape) < MIN_ROWS or np.count_nonzero(~known) > MAX_HOLES * known.size
@@ -161,13 +161,10 @@ def placed_together(image: GreyImage, item: RefinedLattice) -> RefinedLattice:
 
 
 def fit_whole_board(image: GreyImage, pixels: FloatArray, blur: float, around: Surroundings) -> WholeBoard | None:
-    """Return the corners near `pixels` (R, C, 2) of a board, under a blur of about `blur` px.
-
-    None where they are not found near them.
-    """
+    """Return the joint fit of corners near `pixels` (R, C, 2) with an initial s of `blur` px; None if it fails."""
     if not np.isfinite(pixels).all():
         return None
-    # Blur leaves nothing that larger pixels would not show.
+    # Averaged pixels lose nothing in a blurred image.
     steps = [float(np.linalg.norm(np.diff(pixels, axis=axis), axis=2).min()) for axis in (0, 1)]
     scale = max(int(min(blur / MIN_BLUR_OF_BOARD, min(steps) / MIN_SQUARE)), 1)
     window = BoardWindow.around(image, pixels, scale, int(np.ceil(PICTURE_SIGMAS * blur)), around)
@@ -185,7 +182,7 @@ def fit_whole_board(image: GreyImage, pixels: FloatArray, blur: float, around: S
         if not np.isfinite(state.pixels).all() or np.abs(state.pixels - start)[there].max() > MAX_MOVE_PX:
             return None
         if np.mean((moved / (spread * residual))[there] ** 2) < SETTLED_SIGMAS**2:
-            # Larger pixels have less noise, by their side: sigmas are as those in pixels of the image.
+            # The noise of averaged pixels decreases with their side, which cancels the scale of the sigmas.
             return WholeBoard(window.first + scale * state.pixels, spread, residual)
     return None
 
@@ -193,7 +190,7 @@ def fit_whole_board(image: GreyImage, pixels: FloatArray, blur: float, around: S
 def _step(
     window: BoardWindow, state: _SheetParameters, *, start: bool
 ) -> tuple[_SheetParameters, FloatArray, FloatArray, float] | None:
-    """Return the state after a Gauss-Newton step, how far each corner moved, its spread, and the residual before it."""
+    """Return the state after a Gauss-Newton step, the corners' moves and spreads, and the residual before it."""
     size = state.pixels.shape[0], state.pixels.shape[1]
     coefficients = spline_coefficients(extended(state.pixels, MAP_RINGS))
     places = board_places(coefficients, (0, 0, *window.grey.shape[::-1]), AROUND) - MAP_RINGS
@@ -213,7 +210,7 @@ def _step(
     grid = state.light.shape[1], state.light.shape[2]
     near = Shares.at(places, grid, spacing=LIGHT_SQUARES, beyond=WINDOW_REACH, cubic=False, margin=0)
     base, contrast, wider = near.interpolated(state.light)
-    # How the picture grows with the blur, relative: heat spreads so.
+    # Derivative of the model by the relative blur, from the heat equation.
     spread = state.blur**2 * cv2.Laplacian(pattern, cv2.CV_32F)
     seen, on = pattern + wider * spread, used.astype(np.float32)
     rest, weight = on * (window.grey - base - contrast * seen), on * contrast
@@ -231,11 +228,11 @@ def _step(
 def _solved(
     window: BoardWindow, state: _SheetParameters, products: FloatArray, right: FloatArray, rest: Picture, count: int
 ) -> tuple[_SheetParameters, FloatArray, FloatArray, float] | None:
-    """Return what `_step` does, from the normal equations without what is known beforehand."""
+    """Return the results of `_step` from the normal equations without prior."""
     shape, unknowns, corners = state.pixels.shape, len(right), state.pixels.size
     variance = float((rest.astype(np.float64) ** 2).sum()) / max(count - unknowns, 1)
     variance = max(variance, ROUNDING_VARIANCE / window.scale**2)
-    # After the corners: light, contrast and relative blur of each node; paper; ends; blur.
+    # The unknowns after the corners: light, contrast and relative blur of each node; paper; ends; blur.
     light, paper, ends = slice(corners, -9), slice(-9, -5), slice(-5, -1)
     known, off = np.full(unknowns, FREE), np.zeros(unknowns)
     known[corners + 2 : -9 : 3], off[corners + 2 : -9 : 3] = BLUR_SIGMA**-2, state.light[2].ravel()
@@ -264,7 +261,7 @@ def _solved(
 def _with_light(
     grey: Picture, pattern: Picture, used: BoolArray, state: _SheetParameters, beyond: Sequence[Picture]
 ) -> _SheetParameters:
-    """Return the state with the light, contrast and paper that fit best if they are everywhere the same."""
+    """Return the state with the least squares light, contrast and paper, assumed to be uniform."""
     columns = np.stack([np.ones(np.count_nonzero(used)), *(part[used] for part in (pattern, *beyond))], axis=1)
     normal = columns.T @ columns + np.diag([0.0, FREE, 1.0, 1.0, 1.0, 1.0])
     base, contrast, *paper = np.linalg.solve(normal, columns.T @ grey[used])
@@ -275,7 +272,7 @@ def _with_light(
 
 
 def _tiles(shape: tuple[int, int]) -> list[tuple[slice, slice, Part]]:
-    """Return tiles of a lattice: their rows and columns, and which of these no other tile has."""
+    """Return the tiles of a lattice: rows and columns of each, and the part that belongs to no other tile."""
     rows, columns = (_spans(count) for count in shape)
     return [(down, along, (own_down, own_along)) for down, own_down in rows for along, own_along in columns]
 
@@ -301,17 +298,15 @@ def _taps(blur: float, sigmas: float) -> Picture:
 
 
 def spline_coefficients(nodes: FloatArray) -> FloatArray:
-    """Return the coefficients (R + 2, C + 2, 2) of the cubic B-spline through `nodes` (R, C, 2), of five rows or more.
-
-    At the ends the third derivative goes on: "not a knot".
-    """
+    """Return the coefficients (R + 2, C + 2, 2) of the cubic B-spline through `nodes` (R, C, 2), of five rows or more,
+    with "not a knot" end conditions."""
     down, along = (_collocation(count) for count in nodes.shape[:2])
     return np.ascontiguousarray(np.moveaxis(down @ np.moveaxis(nodes, 2, 0) @ along.T, 0, 2))
 
 
 @functools.cache
 def _collocation(count: int) -> FloatArray:
-    """Return the matrix (N + 2, N) that turns values at N nodes into coefficients."""
+    """Return the matrix (N + 2, N) from values at N nodes to coefficients."""
     matrix = np.zeros((count + 2, count + 2))
     for k in range(count):
         matrix[k + 1, k : k + 3] = 1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0
