@@ -1,1 +1,1 @@
-"""What a board's pose or a calibrated camera adds: missed corners, parts of one board, covered ones."""
+"""Refinement of detections with known boards or calibrated cameras: missed corners, joining of parts, shadows."""

@@ -1,7 +1,7 @@
-"""Where the corners of a known board are to be expected, and how the lines through them run: what guides a second look.
+"""Predictions of the corners of a known board and of the lines through them.
 
-A calibrated camera says it from the board's pose, corrected by what the corners around leave over (the model does not
-quite follow the lens, the board is not quite flat); without a camera the corners around say it alone.
+With a calibrated camera they follow from the board's pose, corrected by the residuals of neighbouring corners (due to
+errors of the lens model or a board that is not flat); without a camera from neighbouring corners only.
 """
 
 from __future__ import annotations
@@ -23,41 +23,41 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
 HALF_STEP = 0.4
-"""Derivatives of the projection are chords of this many squares to either side: as far as the window reaches."""
+"""Step, in squares, of the differences of the projection: about the size of the window."""
 
 MIN_GUIDE_CORNERS = 12
-"""Corners found that a board must have to be a guide."""
+"""Smallest number of detected corners of a board for predictions."""
 
 MAX_GUIDE_GAIN = 4.0
-"""Predictions from corners around count up to this standard deviation, for corners of standard deviation 1."""
+"""Largest standard deviation of a prediction from neighbouring corners of standard deviation 1."""
 
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
-"""Without a camera a ring of corners is predicted at a time: the cells beside known ones."""
+"""Neighbourhood of known corners in which corners are predicted without a camera, a ring at a time."""
 
 NEIGHBOURS_USED = 8
-"""Corners by which one beside them is judged."""
+"""Number of neighbours that give the typical contrast and residual of a corner."""
 
 POSE_CELLS = 0.06
 POSE_PX = 1.5
-"""A camera whose best pose of the board misses the corners by more than this (median; the larger of the two) did not
-take the image: it is not asked."""
+"""Largest median residual of the best pose of the board, in cells or (the larger) px: with a larger one the camera did
+not take the image and is not used."""
 
 POSE_STEPS, POSE_SCALE = 5, 3.0
-"""Gauss-Newton steps of the pose, and the scale of their Cauchy weights in medians of the misses."""
+"""Gauss-Newton steps of the pose, and the scale of their Cauchy weights in median residuals."""
 
 FITTED = ("pixels", "contrast", "residual", "noise", "sigma_px", "blur")
-"""What `BoardState` holds of a fit, in its order."""
+"""Fields of `BoardState` from a fit, in order."""
 
 MAX_RESIDUAL_RATIO = 3.0
-"""Corners with more than this times the usual standard deviation, which other things in their windows raise, say
-nothing of their neighbours; nor does so much more excuse them."""
+"""Corners with more than this times the median standard deviation, due to other structures in their windows, are not
+used to predict others, and the tolerance of corners is limited to that standard deviation."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoardState:
-    """Corners of the board (R, C) with what the fit says of each, NaN where missing; contrast is positive.
+    """Corners of the board (R, C) with the results of their fits, NaN where missing; contrast is positive.
 
-    `together` : whether they were then placed together, as `placed_together` does; pixels and sigmas are of that.
+    `together` : whether pixels and sigmas are those of a joint fit (`placed_together`).
     """
 
     pixels: FloatArray
@@ -72,7 +72,7 @@ class BoardState:
 
     @classmethod
     def unfitted(cls, pixels: FloatArray, signs: FloatArray) -> BoardState:
-        """Return corners (R, C, 2) of which no fit has said anything yet."""
+        """Return corners (R, C, 2) without fit results."""
         nothing = np.full(pixels.shape[:2], np.nan)
         return cls(pixels, nothing, nothing, nothing, nothing, nothing, signs=signs)
 
@@ -85,8 +85,8 @@ class BoardState:
         return known_median(self.sigma_px[self.known])
 
     def typical_near(self, cells: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return contrast and residual that are usual around each of the `cells` (R, C), (M,) each: light, blur and the
-        squares' size differ over a board, in a shadow by as much as from one board to another."""
+        """Return median contrast and residual of the neighbours of each of the `cells` (R, C), (M,) each: light, blur
+        and size of the squares vary over a board."""
         row, column = np.nonzero(cells)
         known_row, known_column = np.nonzero(self.known & np.isfinite(self.residual))
         separation = (row[:, None] - known_row) ** 2 + (column[:, None] - known_column) ** 2
@@ -95,7 +95,7 @@ class BoardState:
         return np.median(self.contrast[around], axis=1), np.median(self.residual[around], axis=1)
 
     def with_fit(self, cells: BoolArray, fit: EdgeFit, good: BoolArray) -> BoardState:
-        """Return the state with the `good` of the corners fitted at `cells` put in."""
+        """Return the state with the `good` ones of the corners fitted at `cells`."""
         values, mine = self._copied(), good.nonzero()[0]
         where = cells.reshape(-1).nonzero()[0][mine]
         for value, name in zip(values, FITTED, strict=True):
@@ -104,20 +104,20 @@ class BoardState:
         return BoardState(*values, signs=self.signs, together=self.together)
 
     def without(self, drop: BoolArray) -> BoardState:
-        """Return the state with the corners `drop` (R, C) forgotten."""
+        """Return the state without the corners `drop` (R, C)."""
         values = self._copied()
         for value in values:
             value[drop] = np.nan
         return BoardState(*values, signs=self.signs, together=self.together)
 
     def _copied(self) -> list[FloatArray]:
-        """Return copies of what fits say of corners."""
+        """Return copies of the fields FITTED."""
         return [getattr(self, name).copy() for name in FITTED]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Guide:
-    """Where the corners of a board are and how the lines through them run: from a camera, else from corners around."""
+    """Predicts the corners of a board and the lines through them, with a camera or from neighbouring corners."""
 
     board: Board
     camera: Camera | None
@@ -125,19 +125,19 @@ class Guide:
 
     @classmethod
     def of(cls, board: Board, camera: Camera | None, state: BoardState) -> Guide:
-        """Return the guide that the corners found give; without the camera where that cannot have seen them."""
+        """Return the guide from the detected corners, without the camera if no pose of the board fits them."""
         pose = None if camera is None else _pose(board, camera, state, None)
         return cls(board, None if pose is None else camera, pose)
 
     def by(self, state: BoardState) -> Guide:
-        """Return the guide that the corners known now give."""
+        """Return the guide from the corners known now."""
         if self.camera is None:
             return self
         pose = _pose(self.board, self.camera, state, self.cam_from_board)
         return Guide(self.board, None if pose is None else self.camera, pose)
 
     def at(self, state: BoardState, cells: BoolArray) -> tuple[LocalFit, BoolArray]:
-        """Return the shape of the board at `cells` (R, C), and which of these M cells are predicted well enough."""
+        """Return the local geometry at the M `cells` (R, C), and which of them are predicted well enough."""
         if self.camera is None or self.cam_from_board is None:
             shape = fit_cells(state.pixels, cells, degree=3, ridge=(1e-3, 1e-2), leave_out=True)
             beside = cv2.dilate(state.known.astype(np.uint8), CROSS)[cells] > 0
@@ -145,7 +145,7 @@ class Guide:
         shape, valid = self._projected(self.camera, self.cam_from_board, cells)
         sound = state.known & (state.sigma_px < MAX_RESIDUAL_RATIO * state.typical_sigma)
         if sound.any():
-            # What the lens model, or a board that is not flat, leaves over changes slowly from corner to corner.
+            # Residuals due to the lens model, or to a board that is not flat, vary slowly over the board.
             every = self._projected(self.camera, self.cam_from_board, sound)[0].pixels
             left = np.full(state.pixels.shape, np.nan)
             left[sound] = state.pixels[sound] - every
@@ -166,7 +166,7 @@ class Guide:
 
 
 def _pose(board: Board, camera: Camera, state: BoardState, start: Rigid3 | None) -> Rigid3 | None:
-    """Return the pose of the board, None where the camera cannot have seen it so; `start` is one nearby, if known."""
+    """Return the robust pose of the board, None if none fits; `start` is an initial pose, if known."""
     row, column = np.nonzero(state.known)
     pixels = state.pixels[row, column]
     rays, seen = camera.unproject(pixels)
@@ -183,7 +183,7 @@ def _pose(board: Board, camera: Camera, state: BoardState, start: Rigid3 | None)
     for _ in range(POSE_STEPS):
         residual, jacobian = ray_residuals(rays, bases, points, rotation, translation)
         off = np.linalg.norm(residual, axis=1)
-        # A corner that something covers in part must not turn the board: Cauchy weights.
+        # Cauchy weights, for partly covered corners.
         weight = 1.0 / (1.0 + (off / (POSE_SCALE * max(float(np.median(off)), 1e-6))) ** 2)
         weighted = (jacobian * weight[:, None, None]).reshape(-1, 6)
         step = np.linalg.lstsq(weighted.T @ jacobian.reshape(-1, 6), -weighted.T @ residual.ravel(), rcond=None)[0]

@@ -1,4 +1,4 @@
-"""The edge model at corners of a board that is known: where it ends, and what is between its corners."""
+"""Fits of the edge model at corners of a known board, with its borders and markers."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ RADIUS_PX, FIT_STEPS = 18.0, 8
 """Radius of the window and Gauss-Newton steps, as in the last pass of `rigkit.detection.subpixel.subpixel`."""
 
 MIN_NOISE_LEFT = 1e-9
-"""Of a fit that failed there is none."""
+"""Lower bound of the noise, which is 0 for failed fits."""
 
 MARKER_BLURS = 2.0
-"""The edges of a ChArUco board's markers reach so many s towards the corners."""
+"""Extent of the blur of a ChArUco board's markers, in s."""
 
 
 def fit_corners(
@@ -36,11 +36,11 @@ def fit_corners(
     *,
     paper: bool = True,
 ) -> EdgeFit:
-    """Fit the edge model to the M `cells` (R, C) of `board` from `start` (M, 2); `shape` is theirs.
+    """Return the fits of the edge model at the M `cells` (R, C) of `board`, with geometry `shape`, from `start` (M, 2).
 
-    `signs` (M,) as `Lattice.signs`; `blur` is the s expected; `curvatures` are those of the lines and how well they are
-    known, (M, 2) each, where corners' sigmas tell more of them than `shape`. Windows end before the markers of ChArUco
-    boards. `paper` : read what lies beyond the board.
+    `signs` (M,) as `Lattice.signs`; `blur` is the expected s; `curvatures` of the lines and their standard deviations,
+    (M, 2) each, replace those of `shape`. Windows exclude the markers of ChArUco boards. `paper` : model the image
+    beyond the board.
     """
     curvature, loose = curvatures or (shape.curvature(), np.zeros((len(start), 2)))
     every = Geometry(shape.sides, curvature, shape.gaps(), ends_of(np.ones_like(cells), cells))
@@ -58,13 +58,13 @@ def fit_corners(
     if paper and isinstance(board.pattern, Chessboard):
         fit = fitted_beside_paper(image, every, fit, fitted, signs, np.zeros(len(start), np.int64))
     if isinstance(board.pattern, Charuco):
-        # What markers leave in the windows is no noise, but makes the corners uncertain all the same.
+        # Residuals due to markers in the windows are no noise, but affect the corners: all residuals count.
         fit = fit.less_sure(fit.residual / np.maximum(fit.noise, MIN_NOISE_LEFT), all_is_noise=True)
     return fit
 
 
 def _short_of_markers(board: Board, sides: FloatArray, blur: FloatArray) -> FloatArray:
-    """Return the s (M,) to start from, so small that the windows, a few s to either side of a line, are narrow."""
+    """Return the initial s (M,), reduced so that windows, a few s to either side of a line, exclude markers."""
     if isinstance(board.pattern, Charuco):
         gap = gap_to_markers(board, sides)
         blur = np.minimum(blur, (gap - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS)
@@ -72,7 +72,7 @@ def _short_of_markers(board: Board, sides: FloatArray, blur: FloatArray) -> Floa
 
 
 def gap_to_markers(board: Board, sides: FloatArray) -> FloatArray:
-    """Return how far it is (N,), px, from the lines of a ChArUco `board` to its markers; `sides` (N, 2, 2) are px."""
+    """Return the distances (N,), px, from the lines of a ChArUco `board` to its markers; `sides` (N, 2, 2) are px."""
     assert isinstance(board.pattern, Charuco)
     white = 0.5 * (1.0 - board.pattern.marker_mm / np.array(board.squares_mm))
     return np.asarray((white * np.linalg.norm(sides, axis=2)).min(axis=1))

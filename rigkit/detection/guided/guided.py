@@ -1,9 +1,9 @@
-"""A second look at boards that are known: where corners are still missing, and where all of them are exactly.
+"""Completion of known boards: missed corners are predicted and fitted, and with a camera all corners are fitted again.
 
-A board of known size says which corners there should be, a calibrated camera where (from the board's pose), and how the
-lines through them run and bend; without a camera the corners around say so. The edge model is fitted there; what it
-finds counts by the same evidence as any corner: contrast of the right sign, a residual like that of its neighbours, and
-a place where the prediction has it. What something covers stays missing.
+The size of the board determines which corners are missing. Their positions and lines are predicted by a calibrated
+camera and the board's pose, or by neighbouring corners. A fit of the edge model there is accepted if its contrast has
+the right sign, its residual is like that of its neighbours, and its position agrees with the prediction. Covered
+corners remain missing.
 """
 
 from __future__ import annotations
@@ -36,46 +36,48 @@ from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 START_BLUR_PX = 1.0
-"""s that the first fit of the corners found starts from, px."""
+"""Initial s of the first fit of the detected corners, px."""
 
 WIDE_BLUR_CELLS = 0.05
-"""A missing corner is first sought with edges so wide, in sides of the cell: they reach as far as predictions err."""
+"""Initial s of the first fit of a missing corner, in sides of the cell: about the error of predictions."""
 
 MAX_GUIDE_ROUNDS = 40
-"""Rounds of adding at most, without a camera one ring of corners each: more than any board has rows or columns."""
+"""Largest number of rounds of adding, without a camera one ring of corners each: more than any board has rows or
+columns.
+"""
 
 MIN_SIDE_PX = 4.0
-"""Corners of smaller cells are not told from noise."""
+"""Smallest side of a cell in which a corner is distinguishable from noise."""
 
 MARGIN_PX = 1.5
-"""Corners nearer to the frame have no pixels on all sides."""
+"""Smallest distance of an added corner from the image border."""
 
 MOVED_CELLS = 0.12
 MOVED_FACTOR = 8.0
 MOVED_PX = 0.3
-"""How far a corner may lie from its prediction: in sides of its cell; where a camera predicts, also times what the
-found corners lie off theirs, but this many px in any case."""
+"""Largest distance of an added corner from its prediction: in sides of its cell; with a camera also MOVED_FACTOR times
+the median distance of the known corners, but at least MOVED_PX."""
 
 OUTLIER_GUIDE_FACTOR = 5.0
-"""A corner that lies off where the camera and the corners around have it by more than this, times what is usual and its
-own standard deviation together, is covered in part."""
+"""Largest distance of a corner from its prediction by camera and neighbours, over the median distance and its own
+standard deviation combined; a partly covered corner exceeds it."""
 
 SCATTER_FLOOR_PX = 0.01
-"""No camera and no printed board is truer than this."""
+"""Lower bound of the median distance, due to imperfect calibrations and boards."""
 
 
 MIN_ADDED_CONTRAST = 0.15
-"""Contrast relative to the found corners' around: a glint takes most of it, but not all."""
+"""Smallest contrast of an added corner over that of its neighbours: a glint reduces it strongly."""
 
 MAX_ADDED_RESIDUAL, MAX_ADDED_RESIDUAL_ALONE = 1.6, 1.3
-"""Residual in grey levels relative to that of the found corners, with and without a camera that says where the corner
-is: pixels of another thing raise it."""
+"""Largest residual of an added corner, in grey levels, over that of its neighbours, with and without a camera: other
+objects in the window increase it."""
 
 MAX_ADDED_RESIDUAL_MARKED = 3.0
-"""The same on ChArUco boards, where what the windows see of the markers differs from corner to corner."""
+"""The same on ChArUco boards, where the part of the markers in the windows varies."""
 
 MAX_SIGMA_CELLS = 0.03
-"""Largest predicted standard deviation, in sides of the cell."""
+"""Largest predicted standard deviation of an added corner, in sides of the cell."""
 
 
 def complete_boards(
@@ -84,16 +86,16 @@ def complete_boards(
     boards: Sequence[Board],
     camera: Camera | None = None,
 ) -> tuple[BoardDetection, ...]:
-    """Return `detections` with the corners added that were missed, in the same order.
+    """Return `detections` with missed corners added, in the same order.
 
     Parameters
     ----------
-    image : what the detections were found in; as for `rigkit.detect_boards`.
-    detections : of these, boards of a listed size are completed; others come back as they are.
+    image : the image of the detections, as for `rigkit.detect_boards`.
+    detections : those of a listed size are completed; others are returned unchanged.
     boards : the boards that may be in the image.
-    camera : the calibrated camera, if known. It predicts corners far from those found, and all corners are fitted anew
-        with windows and lines as it sees them; corners that contradict it are dropped. Where no pose of the board
-        explains the corners found, it is left aside.
+    camera : the calibrated camera, if known. It predicts corners far from the detected ones. All corners are fitted
+        again with windows and lines from its projection, and corners that contradict it are dropped. It is ignored if
+        no pose of the board fits the detected corners.
 
     Raises
     ------
@@ -105,7 +107,7 @@ def complete_boards(
 
 
 def completed(grey: GreyImage, found: BoardDetection, boards: Sequence[Board], camera: Camera | None) -> BoardDetection:
-    """Return one detection as `complete_boards` does, from an image in grey levels."""
+    """Return one detection completed as by `complete_boards`, from an image in grey levels."""
     board = _board_of(found, boards)
     if board is None or len(found.grid) < MIN_GUIDE_CORNERS or (camera is None and found.complete):
         return found
@@ -113,7 +115,7 @@ def completed(grey: GreyImage, found: BoardDetection, boards: Sequence[Board], c
 
 
 def _board_of(found: BoardDetection, boards: Sequence[Board]) -> Board | None:
-    """Return a board of the detection's grid, the one it names if it names one."""
+    """Return a board with the detection's size, the one with its id if it has one; None if there is none."""
     fitting = [
         b for b in boards if b.size == (found.columns, found.rows) and isinstance(b.pattern, Chessboard | Charuco)
     ]
@@ -144,7 +146,7 @@ def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Ca
     row, column = np.nonzero(state.known)
     if len(row) < MIN_GUIDE_CORNERS:
         return found
-    # Noise that cancels from pixel to pixel lets sigmas be smaller; where they must be larger, the scatter shows it.
+    # The factor of correlated noise is applied only if it reduces sigmas; larger ones follow from the scatter.
     alike = state if state.together else opened
     state = replace(state, sigma_px=min(1.0, _known_factor(found, alike)) * state.sigma_px)
     sigma = _scatter(guide, state) * state.sigma_px[row, column]
@@ -154,7 +156,7 @@ def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Ca
 def _with_added(
     image: GreyImage, guide: Guide, found: BoardDetection, opened: BoardState, state: BoardState
 ) -> BoardDetection:
-    """Return `found` with those corners of `state` that it has not, but for any that contradict the others."""
+    """Return `found` with the additional corners of `state` that do not contradict the others."""
     state = _together(image, guide.board, _settled(image, guide.board, state, state.known & ~opened.known))
     added = state.known & ~opened.known & (_contradiction(guide, state, state) <= 1.0)
     added &= ~_strays(state)
@@ -171,7 +173,7 @@ def _with_added(
 
 
 def _strays(state: BoardState) -> BoolArray:
-    """Return which corners of `state` are unsure, and not where the others have them."""
+    """Return which corners of `state` are uncertain and contradict their predictions by the others."""
     known = state.known
     shape = fit_cells(state.pixels, known, leave_out=True)
     off, gain = np.full((2, *known.shape), np.nan)
@@ -181,7 +183,7 @@ def _strays(state: BoardState) -> BoolArray:
 
 
 def _settled(image: GreyImage, board: Board, state: BoardState, cells: BoolArray) -> BoardState:
-    """Return the state with the `cells` fitted anew, now that there are corners around them on all sides."""
+    """Return the state with the `cells` fitted again, after corners around them were added."""
     if not cells.any():
         return state
     known = state.known & np.isfinite(state.sigma_px)
@@ -199,15 +201,15 @@ def _with_uneven(fit: EdgeFit, sides: FloatArray, board: Board) -> EdgeFit:
 
 
 def _known_factor(found: BoardDetection, state: BoardState) -> float:
-    """Return the factor that the detector, which saw scatter and noise of the board as a whole, gave its sigmas.
+    """Return the median factor by which the detector multiplied its sigmas, for scatter and correlated noise.
 
-    `state` : the same corners, placed as the detector has placed them: alone or together.
+    `state` : the same corners, fitted separately or jointly as by the detector.
     """
     return known_median(found.sigma_px / state.sigma_px[found.grid[:, 1], found.grid[:, 0]])
 
 
 def _scatter(guide: Guide, state: BoardState) -> float:
-    """Return how much more the corners scatter about where camera and neighbours have them than their sigmas say."""
+    """Return the ratio of the corners' scatter about their predictions to their sigmas; 1 if not significant."""
     cells = state.known
     shape, seen = guide.at(state, cells)
     if not seen.any():
@@ -218,7 +220,7 @@ def _scatter(guide: Guide, state: BoardState) -> float:
 
 
 def _opened(image: GreyImage, found: BoardDetection, board: Board) -> BoardState | None:
-    """Return what the fit says of the corners found; None where they do not alternate like a chessboard's."""
+    """Return the fit results of the detected corners; None if there are too few valid ones."""
     shape = (found.rows, found.columns)
     signs = np.where(np.add.outer(np.arange(shape[0]), np.arange(shape[1])) % 2 == 1, -1.0, 1.0)
     state = BoardState.unfitted(found.lattice(), signs)
@@ -229,19 +231,19 @@ def _opened(image: GreyImage, found: BoardDetection, board: Board) -> BoardState
     fit = fit_corners(image, board, cells, local, state.pixels[cells], signs[cells], START_BLUR_PX)
     if np.median(fit.contrast) < 0.0:
         state = replace(state, signs=-signs)
-    # Once more: the fit ends when the corner stands still, and its residual means something only with the right blur.
+    # A second fit, as the residual is meaningful only with a converged blur.
     blur = float(np.median(fit.blur))
     fit = fit_corners(image, board, cells, local, state.pixels[cells], state.signs[cells], blur)
     good = fit.valid & (fit.contrast > 0.0)
     if good.sum() < MIN_GUIDE_CORNERS:
         return None
-    # The corners stay where the detector has put them: only what the fit says of them is taken.
+    # Positions remain those of the detector.
     opened = state.with_fit(cells, fit, good)
     return replace(opened, pixels=state.pixels)
 
 
 def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | None:
-    """Return the state with those missing corners that can be added now, None where there are none."""
+    """Return the state with the missing corners that can be added now, None if there are none."""
     missing = ~state.known
     if not missing.any():
         return None
@@ -271,7 +273,7 @@ def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | No
 def _confirmed(
     guide: Guide, state: BoardState, cells: BoolArray, shape: LocalFit, side: FloatArray, fit: EdgeFit
 ) -> BoolArray:
-    """Return which of the corners fitted at `cells` of `shape` are what was predicted there."""
+    """Return which of the corners fitted at `cells` of geometry `shape` (M,) are confirmed."""
     known = state.known
     moved = np.linalg.norm(fit.pixels - shape.pixels, axis=1)
     limit = MOVED_CELLS * side
@@ -280,7 +282,7 @@ def _confirmed(
         limit = np.minimum(limit, np.maximum(MOVED_FACTOR * typical * shape.gain, MOVED_PX))
     contrast, residual = state.typical_near(cells)
     good = fit.valid & (moved < limit) & (fit.contrast > MIN_ADDED_CONTRAST * contrast)
-    # Noise is the same at any contrast; what the model gets wrong grows with it.
+    # Noise is independent of the contrast, model errors grow with it.
     most = MAX_ADDED_RESIDUAL if guide.camera is not None else MAX_ADDED_RESIDUAL_ALONE
     most = MAX_ADDED_RESIDUAL_MARKED if isinstance(guide.board.pattern, Charuco) else most
     good &= fit.residual < most * residual * np.maximum(1.0, fit.contrast / contrast)
@@ -289,10 +291,10 @@ def _confirmed(
 
 
 def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
-    """Return the state with every corner fitted anew as the camera sees it."""
+    """Return the state with every corner fitted again with the geometry predicted by the camera."""
     cells = state.known.copy()
     shape, seen = guide.at(state, cells)
-    # At the end of a lens model's field a corner may be seen but not the half squares around it: it stays as it is.
+    # Corners whose neighbourhood is beyond the lens model's field of view are not fitted again.
     cells[cells] = seen
     if not seen.any():
         return state
@@ -303,13 +305,13 @@ def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
 
 
 def _together(image: GreyImage, board: Board, state: BoardState) -> BoardState:
-    """Return the state with its corners placed together where blur asks for it, as plain detection places them.
+    """Return the state with its corners fitted jointly if the blur requires it (`placed_together`).
 
-    A ChArUco board's stay as they are: with markers in them its squares are not even.
+    Corners of ChArUco boards are not: with markers their squares are not uniform.
     """
     if isinstance(board.pattern, Charuco):
         return state
-    # A corner whose own fit came to nothing has neither blur nor sigma.
+    # Failed fits have neither blur nor sigma.
     state = state.without(~np.isfinite(state.sigma_px) | ~np.isfinite(state.blur))
     lattice = Lattice(state.pixels, state.contrast, bool(state.signs[0, 0] > 0.0))
     alone = RefinedLattice(lattice, state.sigma_px, state.blur, state.residual, state.noise)
@@ -320,20 +322,20 @@ def _together(image: GreyImage, board: Board, state: BoardState) -> BoardState:
 
 
 def _tested(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
-    """Return the state with every corner fitted anew, without those that contradict the camera and the others."""
+    """Return the state with every corner fitted again, without those that contradict the camera and the others."""
     again = _again(image, guide, state)
     state = _together(image, guide.board, again)
     kept = _unanimous(guide, state)
     if not state.together or np.array_equal(kept.known, state.known):
         return kept
-    # What covers a corner had a say in where the others are.
+    # Dropped corners affected the joint fit of the others.
     return _together(image, guide.board, again.without(~kept.known))
 
 
 def _unanimous(guide: Guide, state: BoardState) -> BoardState:
-    """Return the state without the corners that contradict the camera and the corners around them.
+    """Return the state without the corners that contradict the camera and their neighbours.
 
-    Those that contradict the most go first: they may be all that speaks against their neighbours.
+    The worst are dropped first, as they affect the predictions of their neighbours.
     """
     rest = state
     for _ in range(MAX_GUIDE_ROUNDS):
@@ -347,11 +349,11 @@ def _unanimous(guide: Guide, state: BoardState) -> BoardState:
 
 
 def _contradiction(guide: Guide, state: BoardState, judges: BoardState) -> FloatArray:
-    """Return (R, C) how far each corner of `state` lies off where `judges` have it, 1 at most allowed; 0 for none."""
+    """Return the distances (R, C) of the corners of `state` from predictions by `judges`, over the allowed ones."""
     cells, own = state.known, judges.known
     off = np.zeros(cells.shape)
     shape, _ = guide.at(judges, cells)
-    # Where the lens model ends nothing is said.
+    # NaN beyond the lens model's field of view counts as 0.
     off[cells] = np.nan_to_num(np.linalg.norm(state.pixels[cells] - shape.pixels, axis=1) / np.maximum(shape.gain, 1.0))
     typical = max(float(np.median(off[own])), SCATTER_FLOOR_PX) if own.any() else SCATTER_FLOOR_PX
     sigma = np.minimum(np.where(cells, state.sigma_px, 1.0), MAX_RESIDUAL_RATIO * state.typical_sigma)

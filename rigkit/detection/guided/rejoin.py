@@ -1,7 +1,7 @@
-"""Parts of a board that something lies across, put together with the help of a calibrated camera.
+"""Joining of the parts of a partly covered board with a calibrated camera.
 
-Each part alone has its squares, not its place in the board. But the pose of one says, through the camera, where on its
-plane the corners of the other lie: they are parts of one board where that is on its grid, and its colours go on there.
+The pose of one part, from its squares and the camera, determines the positions of the other part's corners on its
+plane. They are parts of one board if these are on its grid and the colours continue.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from rigkit.geometry.board_pose import board_poses
 from rigkit.geometry.rigid3 import Rigid3
 
 MIN_REJOINED_CORNERS = 12
-"""Corners from which on a part has a pose that says where the rest of its board is."""
+"""Smallest number of corners of a part whose pose is used."""
 
 OFF_GRID = 0.15
-"""Median distance from the grid of the other part, in squares: poses of small parts err, but a plane through another
-wall, or a board beside it, is off by any part of a square."""
+"""Largest median distance from the grid of the other part, in squares: poses of small parts have errors, while other
+boards are off by arbitrary fractions of a square."""
 
 OFF_PLANE, OFF_PLANE_PX = 0.03, 0.5
-"""Median distance of the smaller part from where the pose of both together has it, in squares or (the larger) in px."""
+"""Largest median residual of the smaller part under the common pose, in squares or (the larger) in px."""
 
 SAME_REJOINED_PX = 2.0
-"""What both parts have is one corner if it lies this near, and else they are no parts of one board."""
+"""Largest distance between corners of both parts with the same grid index."""
 
 
 def rejoined(parts: Sequence[RefinedLattice], boards: Sequence[Board], camera: Camera) -> list[RefinedLattice]:
-    """Return `parts` with those that are of one board as one.
+    """Return `parts` with those of one board joined.
 
     Parameters
     ----------
-    parts : grids that have no place in a board yet.
-    boards : the boards that they may be of; those whose squares are longer one way are not considered.
-    camera : what took the image.
+    parts : lattices with unknown positions on their boards.
+    boards : the possible boards; those whose squares have unequal sides are ignored.
+    camera : of the image.
     """
     even = [board for board in boards if board.square_x_mm == board.square_y_mm]
     rest = sorted(parts, key=lambda item: -item.lattice.count)
@@ -53,7 +53,7 @@ def rejoined(parts: Sequence[RefinedLattice], boards: Sequence[Board], camera: C
             if both is None:
                 k += 1
                 continue
-            # With more of the board its pose says more: the others are asked again.
+            # The larger part has a better pose: try the others again.
             del rest[k]
             one, k = both, 0
         out.append(one)
@@ -61,7 +61,7 @@ def rejoined(parts: Sequence[RefinedLattice], boards: Sequence[Board], camera: C
 
 
 def _both(one: RefinedLattice, two: RefinedLattice, boards: Sequence[Board], camera: Camera) -> RefinedLattice | None:
-    """Return the larger part `one` with `two` in its place; None where they are not of one board."""
+    """Return the larger part `one` joined with `two`; None if they are not parts of one board."""
     if one.lattice.count < MIN_REJOINED_CORNERS:
         return None
     for side_mm in {board.square_x_mm for board in boards}:
@@ -78,7 +78,7 @@ def _both(one: RefinedLattice, two: RefinedLattice, boards: Sequence[Board], cam
 
 
 def _poses(lattice: Lattice, side_mm: float, camera: Camera) -> list[Rigid3]:
-    """Return the poses that the grid may have, squares of `side_mm` assumed: the better first."""
+    """Return the possible poses of the grid with squares of `side_mm`, the better first."""
     row, column = np.nonzero(lattice.known)
     pixels = lattice.pixels[row, column]
     rays, seen = camera.unproject(pixels)
@@ -93,7 +93,7 @@ def _poses(lattice: Lattice, side_mm: float, camera: Camera) -> list[Rigid3]:
 
 
 def _on_plane(lattice: Lattice, cam_from_grid: Rigid3, camera: Camera) -> FloatArray:
-    """Return where the rays of the corners meet the plane of the grid, (R, C, 2) mm; NaN where they do not."""
+    """Return the intersections (R, C, 2), mm, of the corners' rays with the plane of the grid; NaN without one."""
     rays, seen = camera.unproject(np.nan_to_num(lattice.pixels))
     grid_from_cam = cam_from_grid.inverse()
     direction, eye = rays @ grid_from_cam.rotation.T, grid_from_cam.translation_mm
@@ -104,7 +104,7 @@ def _on_plane(lattice: Lattice, cam_from_grid: Rigid3, camera: Camera) -> FloatA
 
 
 def _shift(lattice: Lattice, on_grid: FloatArray) -> IntArray | None:
-    """Return by how many (columns, rows) the part lies off its place in the grid; None where it is on no grid."""
+    """Return the shift (columns, rows) of the part on the grid; None if its corners are not on the grid."""
     rows, columns = lattice.known.shape
     cells = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
     off = (on_grid - cells)[np.isfinite(on_grid[..., 0])]
@@ -118,10 +118,10 @@ def _shift(lattice: Lattice, on_grid: FloatArray) -> IntArray | None:
 def _united(
     one: RefinedLattice, two: RefinedLattice, shift: IntArray, sizes: set[tuple[int, int]]
 ) -> RefinedLattice | None:
-    """Return `two`, moved by `shift`, put into `one`; None if that is larger than any of the `sizes` (columns, rows),
-    its colours do not go on, or two corners want one place."""
+    """Return `one` joined with `two` shifted by `shift`; None if the result is larger than all `sizes` (columns, rows),
+    the colours do not continue, or corners with the same index differ."""
     around = margins(one.lattice.size, two.lattice.size, shift)
-    # Before anything of that size is made: two planes that nearly miss each other put it anywhere.
+    # Check the size before allocating: almost parallel rays give arbitrary shifts.
     (above, below), (left, right) = around[0]
     columns, rows = one.lattice.size[0] + left + right, one.lattice.size[1] + above + below
     if not any(columns <= c and rows <= r for c, r in sizes):
@@ -138,7 +138,7 @@ def _united(
 
 
 def _flat(both: RefinedLattice, two: RefinedLattice, shift: IntArray, side_mm: float, camera: Camera) -> bool:
-    """Return whether one pose explains both parts, the smaller one too."""
+    """Return whether a common pose fits the smaller part too."""
     row, column = np.nonzero(two.lattice.known)
     place = np.stack([column, row], axis=-1) + np.maximum(shift, 0)
     pixels = two.lattice.pixels[row, column]

@@ -1,4 +1,4 @@
-"""The last look at a board: corners beside a shadow's edge are fitted in even light, and those missed are added."""
+"""Corners near shadow edges: they are fitted again in corrected light, and missed ones are added."""
 
 from __future__ import annotations
 
@@ -20,51 +20,52 @@ from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.shadows import beside_shadows, in_even_light, light_steps
 
 MIN_EVEN, MAX_EVEN = 9, 32
-"""Corners in even light that say what is usual on the board: medians of more would tell hardly more."""
+"""Smallest and largest number of evenly lit corners that give the typical values of the board."""
 
 MIN_SHADED = 3
-"""The edge of a shadow that crosses a board passes by several corners; one or two are dirt, or where the board ends."""
+"""Smallest number of corners near a shadow edge that crosses a board; one or two are due to dirt or the board's
+border."""
 
 TYPICAL_WITHIN_CELLS = 3
-"""Corners so near, in cells, say what is usual there."""
+"""Largest distance, in cells, of evenly lit corners that give typical values."""
 
 MAX_RELIT_GAIN = 3.0
-"""Corners are foretold up to this standard deviation, for corners of standard deviation 1."""
+"""Largest standard deviation of a prediction from corners of standard deviation 1."""
 
 PREDICTION_FIT: dict[str, Any] = {"degree": 3, "ridge": (1e-3, 1e-2)}
-"""Polynomials that foretell corners, as without a camera in `board_guide`."""
+"""Parameters of the predictions, as without a camera in `board_guide`."""
 
 MIN_PREDICTORS = 6
-"""Corners by which one is foretold."""
+"""Smallest number of corners of a prediction."""
 
 MIN_SHADED_CELL_PX = 10.0
-"""In smaller cells there are too few pixels to tell a step of the light from a corner."""
+"""Smallest cell with enough pixels to distinguish a step of the light from a corner."""
 
 START_BLUR_PX = 1.0
-"""s that fits in the image of a ChArUco board start from, px."""
+"""Initial s of fits in the image of a ChArUco board, px."""
 
 MAX_SIGMA_CELLS = 0.03
-"""Largest standard deviation, in sides of the cell."""
+"""Largest standard deviation of a corner, in sides of the cell."""
 
 MOVED_SIGMAS = 5.0
-"""A corner lies within so many standard deviations of where those in even light have it."""
+"""Largest distance of a corner from its prediction by evenly lit corners, in standard deviations."""
 
 TIMES_BETTER, MAX_RELIT_RESIDUAL = 1.5, 2.0
-"""In even light a corner leaves so many times less, relative to its contrast, than before, if it was a shadow; and at
-most so many times what is usual on the board. One that left not so many times what is usual was beside none."""
+"""Smallest ratio of the residual over contrast before the correction of the light to that after it, and to the typical
+one; and largest ratio of the residual after the correction to the typical one."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Typical:
-    """What corners in even light are like.
+    """Typical values of evenly lit corners.
 
     Attributes
     ----------
     signs : (R, C)
-    blur : px.
+    blur : s, px.
     relative : residual over contrast.
-    factor : by which the detector, which saw the board as a whole, multiplied the sigmas of their fits.
-    off_px : how far they lie off where the others have them, for predictions of gain 1.
+    factor : factor of the sigmas of the fits by the detector.
+    off_px : distance from predictions by the others, for predictions of gain 1.
     """
 
     signs: FloatArray
@@ -77,10 +78,9 @@ class _Typical:
 def relit(
     image: GreyImage, found: BoardDetection, refined: RefinedLattice, board: Board | None = None
 ) -> BoardDetection:
-    """Return `found` with its corners beside the edge of a shadow placed as if that were not there, and with those that
-    were missed for it.
+    """Return `found` with corners near shadow edges fitted in corrected light, and with those missed for it added.
 
-    `refined` : the fits of the corners, on the same grid. `board` : which it is, if it is a ChArUco board.
+    `refined` : the fits of the corners, on the same grid. `board` : the board, if it is a ChArUco board.
     """
     as_sure = TIMES_BETTER * upper_median(found.sigma_px)
     if found.complete and np.count_nonzero(found.sigma_px >= as_sure) < MIN_SHADED:
@@ -89,7 +89,7 @@ def relit(
     known = np.isfinite(pixels[..., 0])
     own = np.full(known.shape, np.nan)
     own[found.grid[:, 1], found.grid[:, 0]] = found.sigma_px
-    # What a shadow's edge leaves in the fit sigmas count: corners as sure as usual, or fitted as well, are beside none.
+    # A shadow edge increases sigma and residual: corners with typical values of either are not affected.
     plain = own < as_sure
     plain |= relative < TIMES_BETTER * upper_median(relative[np.isfinite(relative)])
     doubtful = ~plain & ((cv2.dilate(known.astype(np.uint8), CROSS) > 0) | known)
@@ -123,8 +123,8 @@ def relit(
 def _left(
     image: GreyImage, board: Board, cells: BoolArray, shape: LocalFit, relative: FloatArray, typical: _Typical
 ) -> FloatArray:
-    """Return what fits of the corners at `cells` leave (M,), in parts of their contrast: `relative` (R, C) where that
-    is known, else of corners where `shape` has them."""
+    """Return the residuals over contrast (M,) of the corners at `cells`: `relative` (R, C) where known, else those of
+    fits at the predictions `shape`."""
     left, missed = relative[cells], cells & ~np.isfinite(relative)
     unknown = missed[cells]
     if unknown.any():
@@ -137,9 +137,9 @@ def _left(
 def _in_even_light(
     image: GreyImage, board: Board, cells: BoolArray, shape: LocalFit, was: FloatArray, typical: _Typical
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return pixels (M, 2) and sigmas (M,) of the corners at `cells` of `shape` in even light, and which are good.
+    """Return pixels (M, 2) and sigmas (M,) of the corners at `cells` of `shape` in corrected light, and which are good.
 
-    `was` (M,) is the residual in the light as it is, relative to the contrast.
+    `was` (M,) is the residual over contrast before the correction.
     """
     side, signs = np.linalg.norm(shape.sides, axis=2).min(axis=1), typical.signs[cells]
     lateral = _plain_distance(board, shape.sides)
@@ -168,14 +168,14 @@ def _suspect(image: GreyImage, board: Board | None, pixels: FloatArray, cells: B
 
 
 def _plain_distance(board: Board | None, sides: FloatArray) -> FloatArray:
-    """Return how far from the lines of a board its squares are sure to be plain (N,), px."""
+    """Return the distance from the lines of a board within which its squares are uniform (N,), px."""
     if board is None or not isinstance(board.pattern, Charuco):
         return np.full(len(sides), RADIUS_PX)
     return 0.5 * gap_to_markers(board, sides)
 
 
 def _near(even: BoolArray, suspect: BoolArray) -> BoolArray:
-    """Return those of the cells `even` (R, C) that are near the `suspect` ones, all of them where few are."""
+    """Return those of the cells `even` (R, C) that are near the `suspect` ones, or all if there are few."""
     reach = np.ones((2 * TYPICAL_WITHIN_CELLS + 1, 2 * TYPICAL_WITHIN_CELLS + 1), np.uint8)
     near = even & (cv2.dilate(suspect.astype(np.uint8), reach) > 0)
     return near if np.count_nonzero(near) >= MIN_EVEN else even
@@ -184,9 +184,9 @@ def _near(even: BoolArray, suspect: BoolArray) -> BoolArray:
 def _as_it_is(
     image: GreyImage, board: Board, found: BoardDetection, refined: RefinedLattice, cells: BoolArray
 ) -> RefinedLattice:
-    """Return `refined` with fits in the image as it is, of about MAX_EVEN of the `cells` (R, C) and of no others.
+    """Return `refined` with fits of about MAX_EVEN of the `cells` (R, C) in the image with markers, and of no others.
 
-    What was fitted after markers were wiped out says little of windows that see them.
+    Residuals of fits in an image with erased markers are not comparable with those of windows that show markers.
     """
     row, column = np.nonzero(cells)
     every = max(1, len(row) // MAX_EVEN)
@@ -195,7 +195,7 @@ def _as_it_is(
     chosen[row, column] = True
     pixels, signs = found.lattice(), refined.lattice.signs()
     shape, blur = fit_cells(pixels, chosen), START_BLUR_PX
-    # How wide windows are goes by the blur that a fit starts from.
+    # The width of the windows depends on the initial blur.
     for _ in range(2):
         fit = fit_corners(image, board, chosen, shape, pixels[chosen], signs[chosen], blur)
         blur = upper_median(fit.blur)
@@ -212,7 +212,7 @@ def _as_it_is(
 
 
 def _typical(pixels: FloatArray, refined: RefinedLattice, even: BoolArray) -> _Typical:
-    """Return what the corners `even` (R, C) of `pixels` (R, C, 2) are like."""
+    """Return the typical values of the corners `even` (R, C) of `pixels` (R, C, 2)."""
     blur, relative = upper_median(refined.blur_px[even]), upper_median(refined.relative_residual[even])
     ahead = fit_cells(pixels, even, **PREDICTION_FIT, leave_out=True)
     off = np.linalg.norm(pixels[even] - ahead.pixels, axis=1) / np.hypot(1.0, ahead.gain)
