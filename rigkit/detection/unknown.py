@@ -1,4 +1,4 @@
-"""What board images show, when nobody has said it: everything but the scale."""
+"""Determination of the board that images show, up to scale."""
 
 from __future__ import annotations
 
@@ -35,14 +35,18 @@ from rigkit.detection.whole_grids import (
 )
 
 LOOKING = "looking which board it is"
-"""What progress is told of."""
+"""Name of the step for progress."""
 
 WITHIN_SQUARES = np.linspace(0.2, 0.8, 9)
-"""Where in a square its levels are looked at, along either side."""
+"""Sample positions within a square, along either side."""
 
 MAX_LEVEL_DIFFERENCE = 0.35
-"""Levels within an empty square differ by less, of black to white: shade and noise; a marker's by all of it, or by half
-where it is blurred."""
+"""Largest range of the levels within an empty square, over the contrast, due to shading and noise; with a marker it is
+1, or half of it when blurred."""
+
+
+SAME_PRINTED_RATIO = 0.05
+"""Largest difference between ratios measured in images and those of the print."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -53,14 +57,15 @@ class BoardGuess:
     ----------
     board : with squares, or tags, of 1 mm.
     images : indices of the images that show it.
-    beside : other boards that images show; chessboards as far as they are seen.
-    sizes : empty where the images tell how large the board is. Otherwise it has so many columns and rows, or more; or
-        one of several sizes, between which images do not decide.
-    rough : light or ink has moved the edges of tags in all images: the spacing is known to some hundredths.
-    either : it may as well be this board: edges of tags have moved so far that either border may be meant.
-    either_pattern : nothing tells whether a ChArUco board is of the pattern of today or the one before OpenCV 4.6: the
-        images do not show the column in which the two differ.
-    marked : no image shows that the squares of this chessboard are empty: there may be marks that were not read.
+    beside : other boards in the images; of chessboards the visible part.
+    sizes : empty if the size of the board is known. Otherwise a lower bound of its columns and rows, or several
+        possible sizes.
+    rough : light or ink has shifted the edges of tags in all images, so that the spacing is known to some hundredths
+    only. either : another possible board, if the edges of tags are shifted so much that the width of their border is
+    ambiguous. either_pattern : the images do not show the column in which the current pattern of a ChArUco board
+    differs from that
+        before OpenCV 4.6.
+    marked : no image shows that the squares of this chessboard are empty: there may be markers that were not read.
     """
 
     board: Board
@@ -78,14 +83,14 @@ class BoardGuess:
 
 
 def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> BoardGuess | None:
-    """Return the board that most of the images (grey levels 0..255) show; None where none is seen.
+    """Return the board that most of the images (grey levels 0..255) show; None if there is none.
 
-    Boards with marks are told by these: AprilGrids, ChArUco boards (also of the pattern before OpenCV 4.6, and
-    inverted). Otherwise it is the largest chessboard that is seen often, or a grid of circles that more images show.
-    Of a chessboard that no image shows whole, other images may show where one and the other side ends.
-    `progress` is told after every image.
+    AprilGrids and ChArUco boards (also inverted, and of the pattern before OpenCV 4.6) are determined by their markers.
+    Otherwise it is the largest chessboard that is in enough images, or a grid of circles in more images. The size of a
+    chessboard that is whole in no image may follow from several images that show its sides. `progress` is called for
+    every image.
     """
-    # The pixels of a mosaic look like marks in every square.
+    # The pixels of a mosaic look like markers in every square.
     images = [without_mosaic(image) for image in images]
     tags, markers = TagObservations(), MarkerObservations()
     plain: list[list[GridSeen]] = []
@@ -99,7 +104,7 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
     for k in (k for k in range(len(images)) if k not in sure):
         if not tags.look(k, images[k]):
             markers.look(k, images[k])
-    # A tiled floor is a chessboard without marks in every image, but hardly of one size in most.
+    # A tiled floor is a chessboard without markers in every image, but seldom of one size in most.
     if tags.seen or markers.images or not _in_most(plain):
         for k in sure:
             if not tags.look(k, images[k]):
@@ -133,28 +138,25 @@ def _guess_of(
         return BoardGuess(board=board, images=tuple(markers.images), sizes=sizes, either_pattern=not sure)
     guess = _plain_guess(images, plain)
     determined = guess is not None and guess.determined
-    # A chessboard may hang on the wall, and an unread mark be taken for ink in its squares.
+    # There may be a chessboard in the background, or markers that were not read.
     unexplained = [k for k in range(len(images)) if guess is None or k not in guess.images]
-    if (
-        determined
-        and not unexplained
-        and not (marked and guess is not None and guess.board.pattern.type == Chessboard.type)
-    ):
+    possibly_marked = marked and guess is not None and guess.board.pattern.type == Chessboard.type
+    if determined and not unexplained and not possibly_marked:
         return guess
     grids = _rarer_grids(images, unexplained or range(len(images)), determined=determined)
     return _of_grids(grids) if grids else guess
 
 
 def _rarer_grids(images: Sequence[GreyImage], some: Sequence[int], *, determined: bool) -> list[GuessedGrid]:
-    """Return the grids of tags that are white on black, if `some` of the images show tags, or, where no other board is
-    `determined`, of ArUco markers."""
+    """Return the grids of tags that are white on black, if `some` of the images show tags; without any, and if no other
+    board is `determined`, those of ArUco markers."""
     white = TagObservations(inverted=True)
     for k in some:
         white.look(k, images[k])
     for k in (k for k in range(len(images)) if white.seen and k not in some):
         white.look(k, images[k])
     grids = guessed_grids(white)
-    # Last, as the markers of ChArUco boards stand in rows, too.
+    # ArUco markers last, as those of ChArUco boards are in rows too.
     for inverted in (False, True) if not grids and not determined else ():
         aruco = TagObservations(ARUCO_TAGS, inverted=inverted)
         for k, image in enumerate(images):
@@ -175,7 +177,7 @@ def _of_grids(grids: Sequence[GuessedGrid]) -> BoardGuess:
 
 
 def _without_marks(image: GreyImage, found: BoardDetection) -> bool:
-    """Say whether a lattice is a chessboard beyond doubt: large, and with nothing in its squares."""
+    """Return whether a lattice is certainly a chessboard: large, with empty squares."""
     if len(found.grid) < MIN_SURE_CORNERS:
         return False
     pixels = found.lattice()
@@ -193,13 +195,13 @@ def _without_marks(image: GreyImage, found: BoardDetection) -> bool:
 
 
 def _in_most(plain: Sequence[Sequence[GridSeen]]) -> bool:
-    """Say whether at least half of the images, and more than one, show whole grids of one size."""
+    """Return whether at least half of the images, and at least MIN_IMAGES_OF_GUESS, show whole grids of one size."""
     counts = Counter(size for found in plain for size in whole_sizes(found))
     return max(counts.values(), default=0) >= max(0.5 * len(plain), MIN_IMAGES_OF_GUESS)
 
 
 def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[GridSeen]]) -> BoardGuess | None:
-    """Return the chessboard, or grid of circles, that most of the images show; None where none is seen."""
+    """Return the chessboard, or grid of circles, that most of the images show; None if there is none."""
     circles, settled = CircleObservations(), _in_most(plain)
     for k, (image, found) in enumerate(zip(images, plain, strict=True)):
         if not (found and settled):
@@ -221,7 +223,7 @@ def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[GridSeen]
 
 
 def difference(guess: Board, declared: Board) -> str | None:
-    """Return in words what is to be changed in a declared board so that it is the one seen; None for nothing."""
+    """Return in words how a declared board differs from the one in the images; None if it does not."""
     seen, declared_pattern = guess.pattern, declared.pattern
     size = f"{guess.columns // seen.points_per_count} x {guess.rows // seen.points_per_count} {seen.count_word}"
     if type(seen) is not type(declared_pattern):
@@ -249,7 +251,7 @@ def difference(guess: Board, declared: Board) -> str | None:
         per = declared_pattern.points_per_count
         return f"{size} are seen, {declared.columns // per} x {declared.rows // per} are declared"
     if seen.identified:
-        # Lengths are for a ruler to say.
+        # Lengths cannot be determined from images.
         own, other = seen.key_values(), declared_pattern.key_values()
         for name in own:
             if not name.endswith("_mm") and name != "dictionary" and _differs(own[name], other[name]):
@@ -265,7 +267,3 @@ def _differs(one: object, two: object) -> bool:
 
 def _article(kind: str) -> str:
     return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
-
-
-SAME_PRINTED_RATIO = 0.05
-"""Ratios read from images differ from those of the print by less."""

@@ -1,4 +1,4 @@
-"""How large a chessboard is, from grids of which the frame may cut every one."""
+"""The size of a chessboard from grids that the image border may cut in every image."""
 
 from __future__ import annotations
 
@@ -13,52 +13,53 @@ from rigkit.core.detections import BoardDetection
 from rigkit.detection.saddles.response import GreyImage, sample
 
 MIN_SHARE_OF_LINE = 0.5
-"""A grid ends where this part of its next line would be seen, but is not: the frame may hide the rest."""
+"""Smallest share of the next line within the image, without corners, for a grid to end there."""
 
 MIN_SHARE_OF_GRID = 0.8
-"""A grid has this part of its corners, or may be two boards in one: marks in squares hide few."""
+"""Smallest share of known corners of a grid; others may be two boards in one. Markers in squares hide few corners."""
 
 MIN_SURE_CORNERS = 20
-"""Lattices of as many corners are no chance."""
+"""Smallest number of corners of a lattice that does not occur by chance."""
 
 UNSEEN_BORDER_PX = 5.0
-"""Corners nearer to the image's border may be missed (sharp ones are found from 3 px on): a grid may go on there."""
+"""Distance from the image border within which corners may be missed (sharp ones are found from 3 px on)."""
 
 IN_SQUARE = 0.4
-"""Where in a square it is looked at, from the line on: the next line may be foretold a little too near."""
+"""Sample position in a square, from its inner line: the next line may be predicted slightly too near."""
 
 MIN_SQUARES_BEYOND, MIN_CONTRAST_BEYOND, SURE_BEYOND = 5, 0.1, 3.0
-"""Beyond the last line of a grid, so many squares beside others that are as those two rows before, with this part of
-their contrast and by so many standard deviations, are squares. At the rim of a fisheye these are 0.1 to 0.4 and 3.4 to
-12 where a board goes on, and -0.1 to 0.12 and -3 to 2.4 where it ends (REAL)."""
+"""A board continues beyond the last line of a grid if at least so many pairs of squares there have the contrast of
+those two rows before, by this share in the median and by so many standard deviations. At the rim of a fisheye these are
+0.1 to 0.4 and 3.4 to 12 if a board continues, and -0.1 to 0.12 and -3 to 2.4 if it ends (REAL)."""
 
 MIN_IMAGES_OF_GUESS = 2
-"""A size of chessboards is told from so many images, or from the only one."""
+"""Smallest number of images that determine a size, unless there is only one image."""
 
 MAX_SHARE_ALIKE_PARTS = 0.5
-"""Parts of a board that the frame cuts are of one size in fewer of the images."""
+"""Largest share of images in which parts of a board cut by the image border have the same size."""
 
 MIN_SHARE_OF_OTHERS = 0.5
-"""Of the images that show a board, those with another beside it, at least: what clutter shows changes."""
+"""Smallest share of the images of a board that show another board too: clutter varies between images."""
 
 FEW, MANY = 0.25, 0.5
-"""Images that show more of a board than others, in those that show the others' size: so few may see a row beside it
-that is none of it (of 1100 REAL images, sharp and made worse, none does), and so many are believed: rows where blur,
-the rim of a lens or poor light hide corners are missed in any number of images. Between the two nothing decides."""
+"""Bounds of the ratio of images that show more rows of a board to those that show a smaller size. Below FEW the
+additional rows are considered wrong (none of 1100 REAL images, sharp and degraded, shows such a row); above MANY they
+are accepted, as blur, the rim of a lens or poor light may hide rows in any number of images. In between the size is
+ambiguous."""
 
 Size = tuple[int, int]
-"""Corners along the longer side of a grid, and along the other."""
+"""Corners along the longer and the shorter side of a grid."""
 
 
 @dataclass(frozen=True, slots=True)
 class GridSeen:
-    """How far a grid goes, along its columns and rows.
+    """The extent of a grid along its columns and rows.
 
     Attributes
     ----------
     lengths : corners.
-    ends : whether it is seen to end there: else the frame cuts it, or few corners of the last line are seen.
-    cut : the frame cuts it somewhere.
+    ends : whether both ends are visible; otherwise the image border cuts it, or the board continues.
+    cut : the image border cuts it somewhere.
     """
 
     lengths: tuple[int, int]
@@ -74,7 +75,7 @@ class GridSeen:
         return all(self.ends)
 
     def may_be_of(self, size: Size) -> bool:
-        """Say whether a board of this size looks like that where the frame cuts it."""
+        """Return whether the grid may be the visible part of a board of this size."""
         return any(
             all(
                 length == side if ends else length <= side
@@ -85,7 +86,7 @@ class GridSeen:
 
 
 def grid_seen(found: BoardDetection, image: GreyImage) -> GridSeen | None:
-    """Return how far a grid goes in an image; None where it is no more than a patch."""
+    """Return the extent of a grid in an image; None if too few of its corners are known."""
     if not found.complete and len(found.grid) < max(MIN_SURE_CORNERS, MIN_SHARE_OF_GRID * found.columns * found.rows):
         return None
     lattice = found.lattice()
@@ -104,28 +105,28 @@ def grid_seen(found: BoardDetection, image: GreyImage) -> GridSeen | None:
 
 
 def _beyond(lines: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the two lines before the first of a grid (lines, corners of each, 2), as far as it foretells them."""
+    """Return the extrapolated two lines before the first of a grid (lines, corners of each, 2); NaN where unknown."""
     first, second, third = (lines[k] if k < len(lines) else np.full_like(lines[0], np.nan) for k in range(3))
-    # Lenses bend lines; where the third corner is missing they are taken for straight.
+    # Quadratic, for distortion; linear where the third corner is missing.
     bend = np.nan_to_num(first - 2.0 * second + third)
     return 2.0 * first - second + bend, 3.0 * first - 2.0 * second + 3.0 * bend
 
 
 def _goes_on(image: GreyImage, lines: FloatArray) -> bool:
-    """Say whether squares are seen beyond the next line before the first of a grid (lines, corners of each, 2): at the
-    rim of a lens, in poor light or blur a board goes on where its corners are not found."""
+    """Return whether there are squares beyond the next line before the first of a grid (lines, corners of each, 2): at
+    the rim of a lens, in poor light or blur corners of a board may be missed."""
     first, (near, far) = lines[0], _beyond(lines)
     places = np.stack([first + IN_SQUARE * (lines[1] - first), near + IN_SQUARE * (far - near)])
     places = 0.5 * (places[:, 1:] + places[:, :-1])
     last = np.array(image.shape[::-1]) - 1.0
     seen = (np.isfinite(places) & (places >= 0.0) & (places <= last)).all(axis=(0, 2))
-    # Squares beside each other.
+    # Pairs of adjacent squares.
     pairs = seen[1:] & seen[:-1]
     count = int(np.count_nonzero(pairs))
     if count < MIN_SQUARES_BEYOND:
         return False
     within, beyond = np.diff(sample(image, np.where(seen[:, None], places, 0.0)), axis=1)[:, pairs].astype(np.float64)
-    # Every second row has the same colours; what lies beyond a board does not change with its squares.
+    # Rows two apart have the same colours; the background is not correlated with the squares.
     alike = beyond * np.sign(within)
     scatter = float(alike.std()) / np.sqrt(count)
     return bool(
@@ -134,8 +135,8 @@ def _goes_on(image: GreyImage, lines: FloatArray) -> bool:
 
 
 def _next_line(lines: FloatArray, borders: FloatArray) -> tuple[int, int]:
-    """Return how many corners before the first line of a grid (lines, corners of each, 2), NaN where there is none,
-    would be in the image, and were not found there, and how many would not, as far as the first line foretells it."""
+    """Return how many corners of the line before the first of a grid (lines, corners of each, 2; NaN where unknown)
+    would be inside the image, and how many outside."""
     beyond, _ = _beyond(lines)
     # Corners that are missing are NaN, and not inside.
     inside = ((beyond >= UNSEEN_BORDER_PX) & (beyond <= borders - UNSEEN_BORDER_PX)).all(axis=1)
@@ -143,23 +144,24 @@ def _next_line(lines: FloatArray, borders: FloatArray) -> tuple[int, int]:
 
 
 def whole_sizes(seen: Sequence[GridSeen]) -> set[Size]:
-    """Return the sizes of an image's grids that the frame does not cut."""
+    """Return the sizes of an image's whole grids."""
     return {grid.size for grid in seen if grid.whole}
 
 
 def board_size_in(plain: Sequence[Sequence[GridSeen]]) -> tuple[tuple[Size, ...], tuple[int, ...]] | None:
-    """Return the size of the chessboard that images show, and the images that show it; several sizes where they do not
-    decide, None where they tell nothing.
+    """Return the size of the chessboard that images show, and the images that show it.
+
+    Several sizes are returned if they are ambiguous, None if there is no evidence.
 
     plain : the grids of each image.
 
-    Corners seen are there, corners not seen may have been missed. So a size is not told where other images show more
-    of the board, and a larger one is where not too many whole grids are smaller (`FEW`, `MANY`).
+    Detected corners exist, while others may have been missed. A size is therefore rejected if enough other images show
+    more of the board, and a larger one accepted if not too many whole grids are smaller (`FEW`, `MANY`).
     """
     wholes = Counter(size for grids in plain for size in whole_sizes(grids))
-    # Of its last lines blur may hide most.
+    # Blur may hide most of the last lines.
     hidden = Counter(size for grids in plain for size in {g.size for g in grids if any(g.ends) and not g.cut})
-    # A part of a board that the frame cuts, or a tiled floor, comes in many sizes; the whole board in one.
+    # Parts of a board cut by the image border, or of a tiled floor, have many sizes; the whole board has one.
     often = [size for seen in (wholes, hidden) for size in _by_count(seen) if seen[size] >= MIN_IMAGES_OF_GUESS]
     options = [(size, _showing(plain, size)) for size in often]
     parts = _size_of_parts(plain)
@@ -175,8 +177,7 @@ def board_size_in(plain: Sequence[Sequence[GridSeen]]) -> tuple[tuple[Size, ...]
 
 
 def other_sizes(plain: Sequence[Sequence[GridSeen]], size: Size, shown: Sequence[int]) -> tuple[Size, ...]:
-    """Return the sizes of grids that most of the images that show a board of this size show beside it, as far as they
-    are seen."""
+    """Return the (visible) sizes of other grids in at least MIN_SHARE_OF_OTHERS of the images `shown` of a board."""
     counts = Counter(other for k in shown for other in {grid.size for grid in plain[k]} - {size})
     return tuple(
         other
@@ -186,7 +187,7 @@ def other_sizes(plain: Sequence[Sequence[GridSeen]], size: Size, shown: Sequence
 
 
 def _weighed(plain: Sequence[Sequence[GridSeen]], size: Size, shown: Sequence[int]) -> tuple[Size, ...]:
-    """Return `size`, `shown` by these images, and with it another one where images do not decide between the two."""
+    """Return `size`, `shown` by these images, with another one if the two are ambiguous."""
     more = _more(plain, size)
     if more and (more.total() > len(shown) or max(more.values()) > FEW * len(shown)):
         return size, _by_count(more)[0]
@@ -196,7 +197,7 @@ def _weighed(plain: Sequence[Sequence[GridSeen]], size: Size, shown: Sequence[in
 
 
 def _by_count(counts: Counter[Size]) -> list[Size]:
-    """Return sizes, those of most images first, of these the larger ones."""
+    """Return sizes by decreasing number of images, then by decreasing area."""
     return sorted(counts, key=lambda size: (-counts[size], -size[0] * size[1]))
 
 
@@ -210,19 +211,18 @@ def _showing(plain: Sequence[Sequence[GridSeen]], size: Size) -> tuple[int, ...]
 
 
 def _more(plain: Sequence[Sequence[GridSeen]], size: Size) -> Counter[Size]:
-    """Return in how many images grids of which sizes have a row or column more than a board of this size, where they do
-    not show it; what other images show beside it is another board."""
+    """Return the numbers of images without a grid of this size by the sizes of their larger grids, except those of
+    other boards, which occur together with it."""
     beside = {grid.size for k in _showing(plain, size) for grid in plain[k]}
     seen = ({grid.size for grid in grids} for grids in plain)
     return Counter(other for sizes in seen if size not in sizes for other in sizes - beside if not _within(other, size))
 
 
 def _size_of_parts(plain: Sequence[Sequence[GridSeen]]) -> tuple[Size, tuple[int, ...]] | None:
-    """Return the size of the board of which images show parts, and the images that show where one of its sides ends;
-    None where they do not show both.
+    """Return the size of a board from images of its parts, and the images that show one of its sides completely.
 
-    plain : the grids of each image. Each side of the board is seen from end to end in `MIN_IMAGES_OF_GUESS` or more,
-    and no size explains more images. Parts of a board as long as wide do not tell which of its sides they show.
+    plain : the grids of each image. None unless each side is complete in at least `MIN_IMAGES_OF_GUESS` images. The
+    size that explains most images is chosen. Square boards are excluded: their sides are not distinguishable.
     """
     lengths = sorted({n for grids in plain for g in grids for n, ends in zip(g.lengths, g.ends, strict=True) if ends})
     best: tuple[int, Size, tuple[int, ...]] | None = None
@@ -237,6 +237,6 @@ def _size_of_parts(plain: Sequence[Sequence[GridSeen]]) -> tuple[Size, tuple[int
 
 
 def _complete_sides(grids: Sequence[GridSeen], size: Size) -> set[int]:
-    """Return which sides (0 : the longer, 1) of a board of this size an image's grids show from end to end."""
+    """Return which sides (0: the longer, 1) of a board of this size are complete in an image's grids."""
     whole = {n for g in grids for n, ends in zip(g.lengths, g.ends, strict=True) if ends}
     return {k for k, side in enumerate(size) if side in whole}
