@@ -1,1 +1,1 @@
-"""Foreign conventions, each tool in a leaf of its own."""
+"""File formats and conventions of other programs, one module each."""

@@ -1,6 +1,6 @@
-"""The camera formats of other programs: what tells a file of each, its reader and its writer.
+"""Registry of other programs' camera formats, with their signs, readers and writers.
 
-Adding one is a module, a line here and, for what is written, its ending in `rigkit.workflows.inputs.formats`.
+A new format needs a module, a line here and, if it is written, its ending in `rigkit.workflows.inputs.formats`.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class CameraFormat(NamedTuple):
 
     Attributes
     ----------
-    sign : what its files have, and those of the formats after it in `FOREIGN_FORMATS` have not.
-    read : the camera of a text, of the file of that name; the images' size is for formats that do not say it.
-    write : the file of a camera, held against it inside the outline of what was seen (None: everywhere); None where
-        the format is read only.
+    sign : pattern in its files that files of later formats in `FOREIGN_FORMATS` lack.
+    read : function of text, file name and image size (for formats without one) that returns the camera.
+    write : function of a camera and the outline of the pixels that corners covered (None: the whole image, see
+        `best_accepted`) that returns the file; None for formats that are only read.
     """
 
     sign: re.Pattern[str]
@@ -99,4 +99,4 @@ FOREIGN_FORMATS: dict[str, CameraFormat] = {
         _write_colmap,
     ),
 }
-"""By name, in the order in which a file is asked."""
+"""Formats by name, in the order in which their signs are searched."""

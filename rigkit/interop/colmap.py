@@ -1,7 +1,7 @@
-"""COLMAP through pycolmap: the only module that imports it, and only when a function is called.
+"""COLMAP through pycolmap, which only this module imports, inside its functions.
 
-COLMAP's pixel origin is the corner of the top-left pixel: (0.5, 0.5) is its centre. That half pixel is added and taken
-off here and nowhere else. Rays at 90 degrees and beyond do not exist for COLMAP: they must be left out before.
+COLMAP's pixel origin is the corner of the top-left pixel, so that (0.5, 0.5) is its centre. COLMAP cannot represent
+rays at 90 degrees and beyond: they are left out.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from rigkit.geometry.rigid3 import Rigid3
 
 HALF_PIXEL = 0.5
 NATIVE = {"pinhole": "PINHOLE", "brown": "FULL_OPENCV", "kannala_brandt": "OPENCV_FISHEYE"}
-"""Our model -> COLMAP's with the same equations and order of parameters."""
+"""rigkit's model -> COLMAP's with the same equations and order of parameters."""
 NATIVE_LENGTH = {"PINHOLE": 4, "FULL_OPENCV": 12, "OPENCV_FISHEYE": 8}
 STAND_IN = "SIMPLE_FISHEYE"
-"""For models that COLMAP lacks: the same rays in the pixels of an equidistant lens of the same focal length."""
+"""For models that COLMAP lacks: rays are projected by an equidistant lens of the same focal length."""
 MAX_ANGLE_RAD = np.deg2rad(88.0)
-"""COLMAP divides by z: rays further from the axis than this are left out, and counted."""
+"""COLMAP divides by z: rays at larger angles from the axis are left out."""
 MAX_ERROR_PX = 4.0
-"""COLMAP's own: matches that miss their epipolar lines by more take no part."""
+"""COLMAP's default threshold for inliers: distance from the epipolar line."""
 GRADIENT_TOLERANCE = 1e-10
-"""COLMAP stops at 1e-4 by default, which leaves the pose 1e-5 rad short of the optimum."""
+"""COLMAP's default of 1e-4 stops 1e-5 rad before the optimum."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ColmapPair:
-    """A pair as COLMAP takes it.
+    """A pair in COLMAP's conventions.
 
     Attributes
     ----------
     cameras : two `pycolmap.Camera`.
-    pixels1, pixels2 : (N, 2) in COLMAP's convention, of those matches that it can represent.
-    used : (M,) mask of the matches that it can.
+    pixels1, pixels2 : (N, 2) pixels of the matches that COLMAP can represent.
+    used : (M,) mask of these matches.
     """
 
     cameras: tuple[Any, Any]
@@ -50,17 +50,17 @@ class ColmapPair:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ColmapResult:
-    """What COLMAP makes of a pair; translations have length one.
+    """COLMAP's solution of a pair; translations have unit length.
 
     Attributes
     ----------
     two_view : relative pose of `estimate_calibrated_two_view_geometry`.
     adjusted : relative pose after two-view bundle adjustment with fixed intrinsics.
     adjusted_covariance : (6, 6) of (left rotation perturbation rad, translation in baselines) for corners of 1 px
-        standard deviation per axis; nothing along the translation, whose length is fixed. NaN where COLMAP has none.
-    points : (N, 3) adjusted points in the frame of camera 1, in baselines; NaN where COLMAP dropped the match.
+        standard deviation per axis; zero along the translation, whose length is fixed. NaN if COLMAP has none.
+    points : (N, 3) adjusted points in the frame of camera 1, in baselines; NaN for dropped matches.
     rms_px : root mean square reprojection error, 2-D per observation, px.
-    inliers : how many matches it kept.
+    inliers : number of inliers.
     """
 
     two_view: Rigid3
@@ -72,7 +72,7 @@ class ColmapResult:
 
 
 def colmap_pair(camera1: Camera, camera2: Camera, pixels1: Pixels, pixels2: Pixels) -> ColmapPair:
-    """Return cameras and corners as COLMAP takes them; matches beyond its field of view are left out (`used`)."""
+    """Return cameras and corners in COLMAP's conventions, without matches beyond MAX_ANGLE_RAD."""
     rays1, valid1 = camera1.unproject(pixels1)
     rays2, valid2 = camera2.unproject(pixels2)
     limit = np.cos(MAX_ANGLE_RAD)
@@ -83,9 +83,9 @@ def colmap_pair(camera1: Camera, camera2: Camera, pixels1: Pixels, pixels2: Pixe
 
 
 def solve_pair(pair: ColmapPair, *, seed: int = 0) -> ColmapResult:
-    """Return COLMAP's two-view geometry, triangulation and bundle adjustment of the pair; the same for one seed.
+    """Return COLMAP's two-view geometry, triangulation and bundle adjustment of the pair; reproducible for a `seed`.
 
-    Raises DegenerateError where COLMAP finds no relative pose.
+    Raises DegenerateError if COLMAP finds no relative pose.
     """
     import pycolmap
 
@@ -110,7 +110,7 @@ def solve_pair(pair: ColmapPair, *, seed: int = 0) -> ColmapResult:
     points = np.full((count, 3), np.nan)
     in_world = np.array([model.point3D(i).xyz for i in point_ids])
     points[kept[triangulated]] = _pose(model, 1).apply(in_world) / length
-    # The length of the translation is a convention here: no uncertainty along it.
+    # The length of the translation is fixed: no uncertainty along it.
     across = np.eye(3) - np.outer(found.translation_mm, found.translation_mm) / length**2
     scale = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), across / length]])
     return ColmapResult(
@@ -200,7 +200,7 @@ def _adjust(model: Any) -> FloatArray:
     if cross is None or any(part is None for part in parts):
         return np.full((6, 6), np.nan)
     joint = np.block([[parts[0], cross], [np.asarray(cross).T, parts[1]]])
-    # Ceres turns a quaternion by half the rotation vector. COLMAP's own relative covariance does not undo that.
+    # Ceres' quaternion tangent is half the rotation vector. COLMAP's relative covariance does not correct for that.
     unhalved = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0] * 2)
     return relative_pose_covariance(_pose(model, 1), _pose(model, 2), unhalved @ joint @ unhalved)
 

@@ -1,7 +1,7 @@
 """COLMAP's cameras.txt and cameras.bin, without COLMAP.
 
-Pixel (0.5, 0.5) is the centre of its first pixel: cx and cy move by that. Models that are not here are read as the
-camera of ours that follows best; how far it is off goes to the log.
+COLMAP's pixel (0.5, 0.5) is the centre of the first pixel: cx and cy differ by that. Models that rigkit lacks are
+refitted by the model that fits best; the largest error goes to the log.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAX_COLMAP_DIGITS = 9
 CORE = ("fx", "fy", "cx", "cy")
 BEHIND = "COLMAP projects no point at or beyond 90 degrees"
 
-# COLMAP's model -> our model, and where its parameters go in ours; f1 stands for one focal length used twice.
+# COLMAP's model -> rigkit's model, and the names of its parameters there; f is used as fx and fy.
 LAYOUTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "SIMPLE_PINHOLE": ("pinhole", ("f", "cx", "cy")),
     "PINHOLE": ("pinhole", ("fx", "fy", "cx", "cy")),
@@ -53,24 +53,23 @@ FURTHER = {
         "fx", "fy", "cx", "cy", "k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3",
     ),
 }  # fmt: skip
-"""Parameters of COLMAP's models that no model of ours is by the same parameters."""
+"""Parameters of COLMAP's models that rigkit lacks."""
 
 COUNT, HEAD = struct.Struct("<Q"), struct.Struct("<iiQQ")
-MODEL_IDS = (
-    ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", 16), ("SIMPLE_DIVISION", 4), ("DIVISION", 5), ("SIMPLE_FISHEYE", 3), ("FISHEYE", 4),
-    ("EUCM", 6),
+MODELS_BY_ID = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION",
+    "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM",
 )  # fmt: skip
-"""COLMAP's models by number, and how many numbers each has (src/colmap/sensor/models.h)."""
+"""COLMAP's models by id (src/colmap/sensor/models.h)."""
 
 
 def write_colmap_cameras(
     cameras: Mapping[int, Camera], outlines: Mapping[int, Pixels] | None = None
 ) -> tuple[str, dict[int, Written]]:
-    """Return cameras.txt of cameras by COLMAP's id (from 1), and per camera what was lost (`text` is its line).
+    """Return cameras.txt of cameras by COLMAP's id (from 1), and each camera as `Written`, whose `text` is its line.
 
-    `outlines`: by id, as for `best_accepted`.
+    `outlines` by id are as for `best_accepted`.
     """
     written: dict[int, Written] = {}
     for camera_id, camera in cameras.items():
@@ -97,7 +96,7 @@ def write_colmap_cameras(
 
 
 def read_colmap_cameras(text: str, name: str = "cameras.txt") -> dict[int, Camera]:
-    """Return the cameras of cameras.txt by id; raises InputError for models that are not here and damaged lines."""
+    """Return the cameras of cameras.txt by id; raises InputError for unknown models and damaged lines."""
     cameras: dict[int, Camera] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
@@ -107,7 +106,7 @@ def read_colmap_cameras(text: str, name: str = "cameras.txt") -> dict[int, Camer
         if len(words) < 5 or words[1] not in (*LAYOUTS, *FURTHER):
             model = words[1] if len(words) > 1 else ""
             raise InputError(f"{where}: camera model '{model}' is unknown; known: {', '.join((*LAYOUTS, *FURTHER))}")
-        keys = LAYOUTS[words[1]][1] if words[1] in LAYOUTS else FURTHER[words[1]]
+        keys = parameters_of(words[1])
         try:
             camera_id, *size, values = (*(_whole(words[i]) for i in (0, 2, 3)), [float(w) for w in words[4:]])
         except ValueError as error:
@@ -124,10 +123,10 @@ def read_colmap_cameras(text: str, name: str = "cameras.txt") -> dict[int, Camer
 
 
 def colmap_cameras_text(data: bytes) -> str | None:
-    """Return the cameras.txt of a cameras.bin; None for bytes that are none.
+    """Return the cameras.txt of a cameras.bin; None for other data.
 
-    It has a count, then of each camera id and model (int32), width and height (uint64) and the model's numbers, all
-    little-endian; so much is wrong of any text that no text is taken for one.
+    The file has a count, then for each camera id and model (int32), width and height (uint64) and the parameters, all
+    little-endian. No text passes these checks.
     """
     lines, at = [], COUNT.size
     if len(data) < at or not 0 < COUNT.unpack_from(data)[0] <= len(data) // HEAD.size:
@@ -137,15 +136,21 @@ def colmap_cameras_text(data: bytes) -> str | None:
             return None
         camera_id, model, width, height = HEAD.unpack_from(data, at)
         at += HEAD.size
-        if not 0 <= model < len(MODEL_IDS):
+        if not 0 <= model < len(MODELS_BY_ID):
             return None
-        name, count = MODEL_IDS[model]
+        name = MODELS_BY_ID[model]
+        count = len(parameters_of(name))
         if len(data) < at + 8 * count:
             return None
         values = struct.unpack_from(f"<{count}d", data, at)
         at += 8 * count
         lines.append(f"{camera_id} {name} {width} {height} {' '.join(map(repr, values))}\n")
     return "".join(lines) if at == len(data) else None
+
+
+def parameters_of(model: str) -> tuple[str, ...]:
+    """Return the names of the parameters of one of COLMAP's models."""
+    return LAYOUTS[model][1] if model in LAYOUTS else FURTHER[model]
 
 
 def _whole(word: str) -> int:
@@ -155,7 +160,7 @@ def _whole(word: str) -> int:
 
 
 def _camera(kind: str, size_px: tuple[int, int], theirs: dict[str, float], name: str) -> Camera:
-    """Return the camera of one of COLMAP's models: ours, or the nearest, how far it is off goes to the log."""
+    """Return the camera of one of COLMAP's models; a refit is logged with its largest error."""
     if "f" in theirs:
         theirs = {"fx": theirs["f"], "fy": theirs["f"], **theirs}
     theirs = {**theirs, "cx": theirs["cx"] - HALF_PIXEL, "cy": theirs["cy"] - HALF_PIXEL}
@@ -198,7 +203,7 @@ def _parameters(model: str, theirs: dict[str, float]) -> FloatArray:
 
 
 def _sees_behind(camera: Camera) -> bool:
-    """Say whether a corner of the image looks 90 degrees or more off the axis."""
+    """Return whether a corner of the image is 90 degrees or more from the axis, or not seen."""
     width, height = camera.size_px
     corners = np.array([[0.0, 0.0], [width - 1.0, 0.0], [0.0, height - 1.0], [width - 1.0, height - 1.0]])
     rays, valid = camera.unproject(corners)

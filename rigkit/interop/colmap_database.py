@@ -1,4 +1,4 @@
-"""Matches of two images from COLMAP's database (SQLite): verified ones where there are any, with features' frames."""
+"""Matches of two images from COLMAP's database (SQLite), verified ones if there are any, with frames of features."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from rigkit.interop.colmap import HALF_PIXEL
 
 SQLITE = b"SQLite format 3\x00"
 MAX_IMAGES = 2147483647
-"""COLMAP's pair_id is this times the smaller image_id, and the larger one."""
+"""COLMAP's pair_id is this times the smaller image_id, plus the larger one."""
 POSITION, SIMILARITY, AFFINITY = 2, 4, 6
-"""Columns of COLMAP's keypoints: x, y; scale, orientation; or the four entries of the frame."""
+"""Number of columns of COLMAP's keypoints: x, y; also scale, orientation; or also the four entries of the frame."""
 
 
 class DatabaseMatches(NamedTuple):
-    """N matches: pixels (N, 2) of both images and, where features have frames, their affinities (N, 2, 2)."""
+    """N matches: pixels (N, 2) of both images and, if features have frames, affinities (N, 2, 2)."""
 
     pixels1: Pixels
     pixels2: Pixels
@@ -29,14 +29,14 @@ class DatabaseMatches(NamedTuple):
 
 
 def is_colmap_database(payload: bytes) -> bool:
-    """Say whether a file's content is an SQLite database."""
+    """Return whether the content of a file is an SQLite database."""
     return payload.startswith(SQLITE)
 
 
 def read_colmap_matches(path: Path, images: Sequence[str]) -> DatabaseMatches:
-    """Return the matches of two images, which are told by the names of their files.
+    """Return the matches of two images, given by their file names.
 
-    Raises InputError where it is no database of COLMAP's, an image is not in it, or the two have no matches.
+    Raises InputError for other files, an image that is not in the database, or two images without matches.
     """
     try:
         with sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True) as database:
@@ -53,11 +53,16 @@ def read_colmap_matches(path: Path, images: Sequence[str]) -> DatabaseMatches:
     A21 = None
     if first.shape[1] > POSITION and second.shape[1] > POSITION:
         with np.errstate(all="ignore"):
-            one, other = (_frame(values) for values in (first, second))
-            flat = np.abs(np.linalg.det(one)) > 0.0
-            A21 = np.full((len(pairs), 2, 2), np.nan)
-            A21[flat] = other[flat] @ np.linalg.inv(one[flat])
+            A21 = affinities_of_frames(_frame(first), _frame(second))
     return DatabaseMatches(first[:, :2] - HALF_PIXEL, second[:, :2] - HALF_PIXEL, A21)
+
+
+def affinities_of_frames(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the affinities (N, 2, 2) between frames (N, 2, 2) of matched features; NaN for singular first frames."""
+    regular = np.abs(np.linalg.det(first)) > 0.0
+    A21 = np.full(first.shape, np.nan)
+    A21[regular] = second[regular] @ np.linalg.inv(first[regular])
+    return A21
 
 
 def _image_ids(database: sqlite3.Connection, path: Path, images: Sequence[str]) -> tuple[int, int]:
@@ -75,7 +80,7 @@ def _image_ids(database: sqlite3.Connection, path: Path, images: Sequence[str]) 
 
 
 def _index_pairs(database: sqlite3.Connection, ids: tuple[int, int]) -> IntArray:
-    """Return indices (N, 2) of the keypoints of both images."""
+    """Return the indices (N, 2) of matched keypoints."""
     key = MAX_IMAGES * min(ids) + max(ids)
     for table in ("two_view_geometries", "matches"):
         row = database.execute(f"SELECT rows, data FROM {table} WHERE pair_id = ?", (key,)).fetchone()

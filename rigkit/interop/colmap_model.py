@@ -1,4 +1,4 @@
-"""A pair and its cloud as COLMAP's text model: cameras.txt, images.txt, points3D.txt."""
+"""A pair and its cloud as a text model of COLMAP: cameras.txt, images.txt, points3D.txt."""
 
 from __future__ import annotations
 
@@ -24,21 +24,17 @@ def colmap_model(
     *,
     error_px: float,
 ) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Return the files by name, and what was lost on the way in words.
+    """Return the files by name, and notes; a lens that COLMAP has no model for is refitted, with a note on the error.
 
     Parameters
     ----------
-    cameras : of the two images; one camera object in both places becomes one camera of the model.
-    cam2_from_cam1 : in mm; the world is camera 1.
-    pixels : (N, 2) of either image, where the points of the cloud were observed.
-    cloud : the N points.
-    images : files of the two images. The model names them by their paths within the folder that both are in, which is
+    cameras : cameras of the two images; the same object twice becomes one camera of the model.
+    cam2_from_cam1 : in mm; the world frame is that of camera 1.
+    pixels : (N, 2) pixels of the points in each image.
+    cloud : N points.
+    images : the two image files. The model names them by their paths relative to their common folder, which is
         COLMAP's image folder.
-    error_px : the error that every point is stated with.
-
-    Notes
-    -----
-    A lens that COLMAP has no model for is refitted, and its largest error stated.
+    error_px : error that is stated for every point.
     """
     one = cameras[0] is cameras[1]
     text, written = write_colmap_cameras({1: cameras[0]} if one else {1: cameras[0], 2: cameras[1]})
@@ -58,7 +54,7 @@ def colmap_model(
 
 
 def _names(images: tuple[Path, Path]) -> tuple[list[str], tuple[str, ...]]:
-    """Return what COLMAP may call the images, different names without blanks, and what a user has to do for it."""
+    """Return different names of the images without blanks, and notes on files to rename."""
     whole = [Path(os.path.abspath(path)) for path in images]
     folder = os.path.commonpath([path.parent for path in whole])
     names = [path.relative_to(folder).as_posix() for path in whole]
@@ -74,7 +70,7 @@ def _observations(pixels: Pixels) -> str:
 
 
 def quaternion_wxyz(rotation: Mat3) -> FloatArray:
-    """Return (w, x, y, z) of a rotation, COLMAP's order."""
+    """Return the quaternion (w, x, y, z) of a rotation, in COLMAP's order."""
     from scipy.spatial.transform import Rotation
 
     return np.roll(Rotation.from_matrix(np.array(rotation)).as_quat(), 1)

@@ -1,4 +1,4 @@
-"""What the camera formats of other programs have in common: the camera as written, and what was lost on the way."""
+"""Common parts of the camera formats: the best model that a format accepts, and readers of fields and numbers."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.errors import InputError
 from rigkit.core.printing import digits
+from rigkit.geometry.rigid3 import Rigid3
 
 MM_PER_M = 1000.0
 MIN_REPORTED_PX = 0.1
-"""Where a refit is off by more, what would lose nothing is said."""
+"""For refits with larger errors, the note names a model of the session without loss."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Accepted:
-    """A model that a format can hold: of Brown's model `order` terms."""
+    """A model that a format accepts; `order` is the number of terms of Brown's model, or a polynomial's degree."""
 
     model: str
     order: int | None = None
 
     def holds(self, camera: Camera) -> bool:
-        """Say whether the camera goes in as it is."""
+        """Return whether the format accepts the camera without a refit."""
         of_order = self.order is None or camera.model != "brown" or camera.parameters.size - 4 == self.order
         return camera.model == self.model and of_order
 
 
 PERSPECTIVE = (Accepted("pinhole"), Accepted("brown", 4), Accepted("brown", 5), Accepted("brown", 8))
-"""Models of OpenCV's calib3d, which most formats can hold."""
+"""Models of OpenCV's calib3d, which most formats accept."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,12 +45,12 @@ class Written:
 
     Attributes
     ----------
-    camera : the camera as the file describes it.
-    max_error_px : its projection against the camera given, over the part of the image it covers, inside the outline of
-        what was seen where that is known; 0 where the format has the model.
-    covered : that part, as a share of the image.
-    note : in words, what a user of the file should know; empty where nothing was lost.
-    text : the file; empty until it is written.
+    camera : the camera in the file.
+    max_error_px : largest difference of projections from the original camera, over the covered part of the image and
+        inside the outline of the corners, if known; 0 if the format has the model.
+    covered : fraction of the image that the camera covers.
+    note : note for users of the file; empty if nothing was lost.
+    text : content of the file; empty until it is written.
     """
 
     camera: Camera
@@ -62,12 +63,11 @@ class Written:
 def best_accepted(
     camera: Camera, accepted: Sequence[Accepted], format_name: str, outline: Pixels | None = None
 ) -> Written:
-    """Return the camera itself where the format has its model, else the nearest of those that it has.
+    """Return the camera itself if the format accepts its model, else the best refit by an accepted model.
 
-    Nearest: the one that covers most of the image, then the one with the smallest largest error inside the `outline`
-    (N, 2) of what was seen, convex; None: over all of it. Outside, where the camera given is but extrapolated, errors
-    count by OUTSIDE_WEIGHT.
-    Raises InputError where none can follow the lens.
+    The best refit covers most of the image, then has the smallest maximum error inside the convex `outline` (N, 2) of
+    the corners; None: in the whole image. Outside of it, where the original camera is extrapolated, errors are weighted
+    by OUTSIDE_WEIGHT. Raises InputError if no model fits.
     """
     for same in (camera, *_without_zero_terms(camera)):
         for kind in accepted:
@@ -101,7 +101,7 @@ def best_accepted(
 
 
 def _without_zero_terms(camera: Camera) -> list[Camera]:
-    """Return the same Brown camera with fewer terms, as far as those left out are zero."""
+    """Return the Brown camera with fewer terms, for all counts whose omitted terms are zero."""
     if camera.model != "brown":
         return []
     p = camera.parameters
@@ -110,14 +110,14 @@ def _without_zero_terms(camera: Camera) -> list[Camera]:
 
 
 def field(data: dict[str, Any], key: str, name: str) -> Any:
-    """Return data[key]; raises InputError that names file and key."""
+    """Return data[key]; raises InputError with the file and the key."""
     if not isinstance(data, dict) or key not in data:
         raise InputError(f"'{name}': '{key}' is missing; is it the calibration file of another program?")
     return data[key]
 
 
 def numbers(value: Any, name: str, key: str, count: int | None = None) -> FloatArray:
-    """Return `value` as finite numbers (N,); raises InputError that names file and key."""
+    """Return `value` as finite numbers (N,); raises InputError with the file and the key."""
     try:
         raw = np.asarray(value)
         words = isinstance(value, list) and any(isinstance(one, bool) for one in value)
@@ -132,8 +132,16 @@ def numbers(value: Any, name: str, key: str, count: int | None = None) -> FloatA
     return array
 
 
+def numbers_of_words(words: Sequence[str], name: str, key: str, count: int | None = None) -> FloatArray:
+    """Return words as finite numbers (N,); raises InputError with the file and the key."""
+    try:
+        return numbers([float(word) for word in words], name, key, count)
+    except ValueError as error:
+        raise InputError(f"'{name}': '{key}' is not a list of numbers; is the file whole?") from error
+
+
 def image_size(value: Any, name: str, key: str) -> tuple[int, int]:
-    """Return (width, height); raises InputError that names file and key for what is no pair of whole numbers."""
+    """Return (width, height); raises InputError with the file and the key for anything but a pair of integers."""
     width, height = numbers(value, name, key, 2).tolist()
     for side in (width, height):
         if side != np.floor(side) or not 1.0 <= side <= MAX_SIDE_PX:
@@ -142,13 +150,13 @@ def image_size(value: Any, name: str, key: str) -> tuple[int, int]:
 
 
 def written_size(data: dict[str, Any], name: str) -> tuple[int, int]:
-    """Return (width, height) under the keys of OpenCV and ROS; raises InputError as `field` and `image_size` do."""
+    """Return (width, height) by the keys of OpenCV and ROS; raises InputError as `field` and `image_size`."""
     keys = ("image_width", "image_height")
     return image_size([field(data, key, name) for key in keys], name, ", ".join(keys))
 
 
 def camera_of(model: str, size_px: tuple[int, int], parameters: FloatArray, name: str) -> Camera:
-    """Return the camera; raises InputError that names the file where the values make none."""
+    """Return the camera; raises InputError with the file for invalid or implausible parameters."""
     try:
         camera = camera_model(model)(size_px, parameters)
     except InputError as error:
@@ -158,8 +166,16 @@ def camera_of(model: str, size_px: tuple[int, int], parameters: FloatArray, name
     return camera
 
 
+def pose_of(rotation: FloatArray, translation_mm: FloatArray, name: str) -> Rigid3:
+    """Return the pose of R (3, 3) and t (3,); raises InputError with the file for a matrix that is no rotation."""
+    try:
+        return Rigid3(rotation, translation_mm)
+    except InputError as error:
+        raise InputError(f"'{name}': {error}; is the file whole?") from error
+
+
 def unified_with_xi(camera: Camera) -> tuple[float, FloatArray]:
-    """Return xi and gamma_x, gamma_y, cx, cy of a unified camera as Mei writes it: gamma = f (1 + xi).
+    """Return xi and gamma_x, gamma_y, cx, cy of a unified camera in Mei's notation: gamma = f (1 + xi).
 
     Raises InputError at alpha = 1, where xi is infinite.
     """
@@ -173,7 +189,7 @@ def unified_with_xi(camera: Camera) -> tuple[float, FloatArray]:
 def unified_from_xi(size_px: tuple[int, int], xi: float, core: FloatArray, name: str) -> Camera:
     """Return the unified camera of xi and gamma_x, gamma_y, cx, cy; the reverse of `unified_with_xi`.
 
-    Raises InputError that names the file for a negative xi: its sphere would be seen from behind.
+    Raises InputError with the file for a negative xi.
     """
     if not xi >= 0.0:
         raise InputError(f"'{name}': xi = {xi:g}, which is never negative; calibrate again")

@@ -1,4 +1,4 @@
-"""Projections of other programs' lens models that are no model here: what `nearest_camera_of` holds ours against."""
+"""Projections of other programs' lens models that rigkit lacks, for refits by `nearest_camera_of`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Rays
 from rigkit.interop.nearest import Lens
 
 NEAR_AXIS = 1e-9
-"""Tangent or angle below which a ray is on the axis."""
+"""Tangent or angle below which a ray counts as the axis."""
 
 
 def fov_lens(core: FloatArray, w: float) -> Lens:
@@ -34,7 +34,7 @@ def unified_brown_lens(core: FloatArray, xi: float, d: FloatArray) -> Lens:
 
     def project(rays: Rays) -> tuple[Pixels, BoolArray]:
         depth = rays[:, 2:] + xi
-        # Of a sphere seen from outside, only the near half is seen.
+        # For xi > 1 only the near side of the sphere is visible.
         seen = depth[:, 0] > max(NEAR_AXIS, xi - 1.0 / xi if xi > 1.0 else 0.0)
         place = rays[:, :2] / np.where(seen[:, None], depth, 1.0)
         return _pixels(core, _brown(place, d)), seen
@@ -83,11 +83,12 @@ def thin_prism_fisheye_lens(core: FloatArray, d: FloatArray) -> Lens:
 
 
 def cahvor_lens(core: FloatArray, angles: FloatArray, r: FloatArray) -> Lens:
-    """Return mrcal's CAHVOR of `angles` alpha and beta. The ray p is moved away from the axis o = (sin alpha cos beta,
-    sin beta, cos alpha cos beta) by mu = r0 + r1 tau + r2 tau^2, where tau is the squared tangent of its angle to o.
+    """Return mrcal's CAHVOR of `angles` alpha and beta. A ray is shifted perpendicular to the axis o = (sin alpha cos
+    beta, sin beta, cos alpha cos beta) by mu = r0 + r1 tau + r2 tau^2 times its distance from it, where tau is the
+    squared tangent of its angle to o.
 
     Reference: Y. Yakimovsky and R. Cunningham, "A system for extracting three-dimensional measurements from a stereo
-    pair of TV cameras", 1978; D. Gennery, 2001; the axis as mrcal's documentation has it.
+    pair of TV cameras", 1978; D. Gennery, 2001; the axis by mrcal's documentation.
     """
     alpha, beta = angles.tolist()
     axis = np.array([np.sin(alpha) * np.cos(beta), np.sin(beta), np.cos(alpha) * np.cos(beta)])
@@ -111,7 +112,7 @@ def _perspective(rays: Rays) -> tuple[FloatArray, BoolArray]:
 
 
 def _equidistant(rays: Rays) -> tuple[FloatArray, BoolArray]:
-    """Return theta (x, y) / r; COLMAP sees nothing at or behind 90 degrees, but the lens does."""
+    """Return theta (x, y) / r of all rays; only COLMAP itself excludes angles of 90 degrees and more."""
     r = np.hypot(rays[:, 0], rays[:, 1])
     theta = np.arctan2(r, rays[:, 2])
     ratio = np.where(r > NEAR_AXIS, theta / np.where(r > NEAR_AXIS, r, 1.0), 1.0)
@@ -119,7 +120,7 @@ def _equidistant(rays: Rays) -> tuple[FloatArray, BoolArray]:
 
 
 def _brown(place: FloatArray, d: FloatArray) -> FloatArray:
-    """Return distorted places; d has k1, k2, p1, p2, and as far as they are there k3 ... k6, s1 ... s4."""
+    """Return the distorted points; d has k1, k2, p1, p2, and optionally k3 ... k6, s1 ... s4."""
     k1, k2, p1, p2, k3, k4, k5, k6, *prism = np.concatenate([d, np.zeros(12 - d.size)]).tolist()
     t = np.sum(place**2, axis=-1)
     radial = (1.0 + t * (k1 + t * (k2 + t * k3))) / (1.0 + t * (k4 + t * (k5 + t * k6)))

@@ -1,4 +1,7 @@
-"""Kalibr's camchain YAML: one camera or a rig. Pixels as ours, lengths in metres, T_cn_cnm1 = cam_n from cam_(n-1)."""
+"""Kalibr's camchain YAML of one camera or a rig.
+
+Pixel (0, 0) is the centre of the first pixel, as in rigkit; lengths are in metres, T_cn_cnm1 is cam_n from cam_(n-1).
+"""
 
 from __future__ import annotations
 
@@ -24,6 +27,7 @@ from rigkit.interop.exchange import (
     field,
     image_size,
     numbers,
+    pose_of,
     unified_from_xi,
     unified_with_xi,
 )
@@ -39,7 +43,7 @@ CAMERA = re.compile(r"cam[0-9]{1,3}")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class KalibrChain:
-    """A camchain file: `text`, and per camera what was lost (`cameras[i].text` is its own part)."""
+    """A camchain file: its `text`, and each camera as `Written`, whose `text` is its part of the file."""
 
     text: str
     cameras: tuple[Written, ...]
@@ -54,10 +58,10 @@ def write_kalibr(
 
     Parameters
     ----------
-    cam_from_rig : one pose a camera, in mm; needed for more than one camera.
-    outlines : one a camera, as for `best_accepted`; None: not known.
+    cam_from_rig : pose of each camera, in mm; needed for several cameras.
+    outlines : outline of each camera, as for `best_accepted`; None: unknown.
 
-    Raises InputError where poses are missing, or Kalibr has no model that follows a lens.
+    Raises InputError for missing poses, or a lens that no model of Kalibr fits.
     """
     if not cameras or (len(cameras) > 1 and cam_from_rig is None):
         raise InputError("camchain: give at least one camera, and for several the pose of each (cam_from_rig)")
@@ -87,8 +91,8 @@ def write_kalibr(
 def read_kalibr(text: str, name: str = "camchain") -> tuple[tuple[Camera, ...], tuple[Rigid3, ...]]:
     """Return the cameras of a camchain and cam_from_rig of each; the rig's frame is that of cam0.
 
-    A camera without T_cn_cnm1 behind cam0 is an error. A pinhole with "fov" and "omni" with "radtan" are refitted: the
-    log says so. Raises InputError for other models that are not here and for damaged files.
+    "pinhole" with "fov" and "omni" with "radtan" are refitted, which is logged. Raises InputError for a camera after
+    cam0 without T_cn_cnm1, unknown models, and damaged files.
     """
     data = parse_yaml(text, name)
     keys = sorted((k for k in data if CAMERA.fullmatch(k)), key=lambda k: int(k[3:]))
@@ -100,10 +104,7 @@ def read_kalibr(text: str, name: str = "camchain") -> tuple[tuple[Camera, ...], 
         cameras.append(_camera(block, f"{name}, {key}"))
         if len(cameras) > 1:
             matrix = numbers(field(block, "T_cn_cnm1", f"{name}, {key}"), name, f"{key}: T_cn_cnm1", 16).reshape(4, 4)
-            try:
-                step = Rigid3(matrix[:3, :3], matrix[:3, 3] * MM_PER_M)
-            except InputError as error:
-                raise InputError(f"'{name}', {key}: T_cn_cnm1: {error}; is the file whole?") from error
+            step = pose_of(matrix[:3, :3], matrix[:3, 3] * MM_PER_M, f"{name}, {key}: T_cn_cnm1")
             poses.append(step @ poses[-1])
     return tuple(cameras), tuple(poses)
 
@@ -161,7 +162,7 @@ def _camera(block: Any, name: str) -> Camera:
 
 
 def _foreign_lens(model: str, distortion_model: str, intrinsics: FloatArray, distortion: FloatArray) -> Lens | None:
-    """Return the lens of a model that is not here; None for others, and for values that no lens has."""
+    """Return the lens of a model that rigkit lacks; None for other models, and for invalid parameters."""
     if model == "pinhole" and distortion_model == "fov" and distortion.size == 1 and 0.0 < distortion[0] < np.pi:
         return fov_lens(intrinsics, float(distortion[0]))
     if model == "omni" and distortion_model == "radtan" and distortion.size == 4 and distortion.any():

@@ -1,4 +1,4 @@
-"""Clouds as LAS 1.4, which surveyors' programs and CloudCompare read, by laspy (`pip install "rigkit[las]"`)."""
+"""Clouds as LAS 1.4 for surveying programs and CloudCompare, by laspy (`pip install "rigkit[las]"`)."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError, InstallationError
 
 POINT_FORMAT = 7
-"""With colours."""
+"""Format with colours."""
 LAS_STEPS = 2.0**30
-"""Of a coordinate from one end of the cloud to the other: LAS has whole numbers of 32 bits."""
+"""Integer steps of a coordinate over the cloud's extent: LAS stores 32-bit integers."""
 LEVELS_OF_16_BITS = 257
-"""Of one level of 8 bits."""
+"""16-bit levels for one 8-bit level."""
 NORMALS = ("NormalX", "NormalY", "NormalZ")
-"""As CloudCompare calls them."""
+"""CloudCompare's names."""
 
 
 def las_bytes(cloud: OrientedCloud) -> bytes:
-    """Return the file's content, lengths as in the cloud, with the normals and `sigma_mm` as further columns.
+    """Return the content of the LAS file, with normals and `sigma_mm` as extra columns; lengths are those of the cloud.
 
-    Raises InputError: an empty cloud; InstallationError: laspy is not installed.
+    Raises InputError for an empty cloud, InstallationError if laspy is not installed.
     """
     try:
         import laspy

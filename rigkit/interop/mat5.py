@@ -1,6 +1,6 @@
-"""Small arrays of numbers in MATLAB's MAT-files of version 5 (save -v6 and -v7), as assignments of a script.
+"""Small numeric arrays of MATLAB's MAT-files of version 5 (save -v6 and -v7), as assignments of a script.
 
-Read here, as SciPy's reader ends the process on damaged files. Reference: MathWorks, "MAT-File Format", 2024: elements
+SciPy's reader is not used, because it crashes on damaged files. Reference: MathWorks, "MAT-File Format", 2024: elements
 of a tag (type, bytes) and data, padded to eight bytes; matrices hold elements; compressed elements hold matrices.
 """
 
@@ -20,17 +20,17 @@ NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8
 MATRIX, COMPRESSED = 14, 15
 CELL, STRUCT, OBJECT, NUMERIC, OPAQUE = 1, 2, 3, range(6, 16), 17
 MAX_NUMBERS = 100
-"""Of an array: a camera's are smaller; corners and covariances are left out."""
+"""Size of an array: those of cameras are smaller; corners and covariances are skipped."""
 MAX_STRUCTURES = 6
-"""In each other; the toolbox's cameras have three."""
+"""Nesting of structures: the toolbox's cameras have three levels."""
 MAX_INFLATED = 64_000_000
-"""Bytes of a compressed variable."""
+"""Bytes of a decompressed variable."""
 OBJECTS = "% MATLAB objects:"
-"""Begins the lines of what only MATLAB reads."""
+"""Start of the lines for objects, which only MATLAB reads."""
 
 
 def assignments_of(data: bytes, name: str) -> str:
-    """Return `a.b = [ 1 2 ; 3 4 ];` of every small array; raises InputError, which names the file, if damaged."""
+    """Return `a.b = [ 1 2 ; 3 4 ];` for every small array; raises InputError with the file if it is damaged."""
     try:
         order = {b"IM": "<", b"MI": ">"}[data[126:128]]
         lines = [line for kind, body in _elements(data[HEADER_BYTES:], order) for line in _variable(kind, body, order)]
@@ -62,7 +62,7 @@ def _variable(kind: int, body: bytes, order: str) -> list[str]:
 
 
 def _matrix(body: bytes, order: str, of: str, depth: int) -> list[str]:
-    """Return the lines of an array, a structure's field by field; `of` is the name it has in a structure."""
+    """Return the lines of an array, or of the fields of a structure; `of` is its name in an outer structure."""
     if not body or depth > MAX_STRUCTURES:
         return []
     parts = _elements(body, order)
@@ -71,7 +71,7 @@ def _matrix(body: bytes, order: str, of: str, depth: int) -> list[str]:
         return [f"{OBJECTS} {of or _word(next(parts)[1])}"]
     shape = np.frombuffer(next(parts)[1], f"{order}i4")
     own = next(parts)[1]
-    if not of and not own:  # what objects and functions leave behind
+    if not of and not own:  # internal data of objects and functions
         return []
     key = of or _word(own)
     count = int(np.prod(shape.astype(np.float64)))
@@ -92,7 +92,7 @@ def _matrix(body: bytes, order: str, of: str, depth: int) -> list[str]:
 
 
 def _word(raw: bytes) -> str:
-    """Return a name; raises ValueError for what is none in MATLAB."""
+    """Return a name; raises ValueError for an invalid one."""
     word = raw.split(b"\0")[0].decode("ascii", "replace")
     if not word.isidentifier():
         raise ValueError("no name")

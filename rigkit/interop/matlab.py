@@ -1,8 +1,8 @@
 """MATLAB's calibrations: Bouguet's Calib_Results (.mat, .m), and structures that toStruct makes of Computer Vision
 Toolbox's cameraParameters, cameraIntrinsics, fisheyeParameters, fisheyeIntrinsics and stereoParameters.
 
-A .mat file becomes the assignments of a script, which are read as Calib_Results.m is. Bouguet's pixels are ours; the
-toolbox counts them from 1. Lengths in mm. `Calib_Results_stereo` and stereoParameters are pairs.
+A .mat file is converted to the assignments of a script and read as Calib_Results.m. Bouguet's first pixel is (0, 0), as
+in rigkit, the toolbox's is (1, 1). Lengths in mm. `Calib_Results_stereo` and stereoParameters are stereo pairs.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.interop.exchange import field, image_size, numbers
+from rigkit.interop.exchange import field, image_size, numbers, pose_of
 from rigkit.interop.mat5 import OBJECTS, assignments_of
 from rigkit.interop.ocamcalib import camera_of_taylor
 from rigkit.interop.opencv import camera_from_arrays
@@ -25,18 +25,18 @@ SizePx = tuple[int, int]
 Values = Mapping[str, FloatArray]
 
 MAT5, MAT73 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
-"""How files begin that save -v6 and -v7, and that save -v7.3 writes."""
+"""Start of files written by save -v6 and -v7, and by save -v7.3."""
 MAT_SIGN = re.compile(
     r"^\s*(?:\w+\.)*(?:fc|fc_left|FocalLength|MappingCoefficients|IntrinsicMatrix|K)\s*=\s*\[|^% MATLAB\b", re.MULTILINE
 )
-"""What files of cameras have, and what a .mat file becomes."""
+"""Pattern in scripts of cameras and in converted .mat files."""
 ASSIGNMENT = re.compile(r"^\s*([A-Za-z][\w.]*)\s*=\s*(\[[^\]]*\]|[-+.\w]+)\s*;?", re.MULTILINE)
 BOUGUET = ("fc", "cc", "kc", "alpha_c")
-"""What a pair has of each side, with _left and _right behind."""
+"""Variables of each camera of a pair, where _left and _right are appended."""
 
 
 def matlab_text(data: bytes, name: str) -> str | None:
-    """Return the assignments of a .mat file, None for bytes that are none.
+    """Return the assignments of a .mat file; None for other data.
 
     Raises InputError for a damaged file, and for HDF5 (-v7.3).
     """
@@ -50,7 +50,7 @@ def matlab_text(data: bytes, name: str) -> str | None:
 def read_matlab(text: str, name: str = "camera.mat", size_px: SizePx | None = None) -> Camera:
     """Return the camera of a .mat file's assignments (`matlab_text`) or of a Calib_Results.m.
 
-    `size_px` is the images' size, where the file does not say it. Raises InputError for skew, files of pairs, objects
+    `size_px` is the image size, for files that do not state it. Raises InputError for skew, stereo pairs, objects
     instead of structures, and damaged files.
     """
     values = _values(text, name)
@@ -63,7 +63,7 @@ def read_matlab(text: str, name: str = "camera.mat", size_px: SizePx | None = No
 
 
 def is_matlab_pair(text: str) -> bool:
-    """Say whether a text that `MAT_SIGN` tells is one of two cameras and their pose."""
+    """Return whether a text with `MAT_SIGN` describes a stereo pair."""
     return re.search(r"^\s*(?:\w+\.)*(?:fc_right|CameraParameters2\.\w+)\s*=", text, re.MULTILINE) is not None
 
 
@@ -77,7 +77,7 @@ def read_matlab_pair(
         size: dict[str, FloatArray] = {k: values[k] for k in ("nx", "ny") if k in values}
         left, right = (_camera(side | size, name, size_px) for side in sides)
         R, t = (numbers(field(dict(values), key, name), name, key, n) for key, n in (("R", 9), ("T", 3)))
-        return (left, right), _pose(R.reshape(3, 3), t, name)
+        return (left, right), pose_of(R.reshape(3, 3), t, name)
     found = _cameras(values)
     first = next((key for key in found if "CameraParameters1" in key), None)
     second = None if first is None else first.replace("CameraParameters1", "CameraParameters2")
@@ -93,34 +93,35 @@ def read_matlab_pair(
         R, t = (numbers(field(dict(values), key, name), name, key) for key in keys)
         # Older ones: points are rows, x2 = x1 R + t.
         R = R.reshape(3, 3).T if R.size == 9 else R
-    return (left, right), _pose(numbers(R, name, "rotation", 9).reshape(3, 3), numbers(t, name, "translation", 3), name)
+    R, t = numbers(R, name, "rotation", 9).reshape(3, 3), numbers(t, name, "translation", 3)
+    return (left, right), pose_of(R, t, name)
 
 
 def _values(text: str, name: str) -> dict[str, FloatArray]:
-    """Return the numbers by their names, of an array (N,) row by row; the last one counts, as in MATLAB."""
+    """Return the assigned numbers (N,) by name, row by row; the last assignment counts, as in MATLAB."""
     found = {}
     for key, words in ASSIGNMENT.findall(re.sub(r"%[^\n]*", "", text)):
         plain = re.sub(r"[\[\];,]|\.\.\.", " ", words).split()
         try:
             found[key] = numbers([float(word) for word in plain], name, key)
         except ValueError:
-            continue  # an expression or a word, which no camera needs
+            continue  # an expression or a word
     return found
 
 
 def _cameras(values: Values) -> dict[str, dict[str, FloatArray]]:
-    """Return by the structure's name the numbers of each camera in it."""
+    """Return the numbers of each camera by the name of its structure."""
     found: dict[str, dict[str, FloatArray]] = {}
     for key in values:
         of, _, last = key.rpartition(".")
         if last in ("fc", "FocalLength", "MappingCoefficients", "IntrinsicMatrix", "K"):
             found.setdefault(of, {k.rpartition(".")[2]: v for k, v in values.items() if k.rpartition(".")[0] == of})
-    # A camera's structure may say the same once more in one of its intrinsics (newer cameraParameters).
+    # Newer cameraParameters repeat the numbers in their field Intrinsics.
     return {of: v for of, v in found.items() if not (of.endswith(".Intrinsics") and of.rpartition(".")[0] in found)}
 
 
 def _camera(of: Values, name: str, size_px: SizePx | None) -> Camera:
-    """Return the camera of Bouguet's or the toolbox's numbers."""
+    """Return the camera from Bouguet's or the toolbox's numbers."""
     data = dict(of)
     if "ImageSize" in data and data["ImageSize"].size == 2:
         size = image_size(data["ImageSize"][::-1], name, "ImageSize")
@@ -150,7 +151,7 @@ def _bouguet(data: dict[str, FloatArray], size: SizePx, name: str) -> Camera:
     skew = float(data.get("alpha_c", np.zeros(1))[0])
     d = numbers(data.get("kc", np.zeros(5)), name, "kc")
     if d.size != 5:
-        # The toolbox's fisheye (calib_fisheye) has four, and no word that it is one.
+        # The toolbox's fisheye (calib_fisheye) has four, and nothing else that identifies it.
         raise InputError(
             f"'{name}': kc has {d.size} numbers, not 5; of a perspective lens add zeros; a fisheye's kc is OpenCV's: "
             "write it into OpenCV's file with fisheye_model: 1"
@@ -160,11 +161,11 @@ def _bouguet(data: dict[str, FloatArray], size: SizePx, name: str) -> Camera:
 
 
 def _toolbox_matrix(data: dict[str, FloatArray], name: str) -> FloatArray:
-    """Return K (9), its principal point counted from 0."""
+    """Return K (9), with the principal point counted from 0."""
     if "K" in data or "IntrinsicMatrix" in data:
         key = "K" if "K" in data else "IntrinsicMatrix"
         K = numbers(data[key], name, key, 9).reshape(3, 3)
-        # Older versions have it for row vectors.
+        # Older versions state it for row vectors.
         K = K.T.copy() if K[0, 2] == 0.0 and K[2, 0] != 0.0 else K.copy()
     else:
         focal = numbers(field(data, "FocalLength", name), name, "FocalLength", 2)
@@ -173,13 +174,6 @@ def _toolbox_matrix(data: dict[str, FloatArray], name: str) -> FloatArray:
         K = np.array([[focal[0], skew, centre[0]], [0.0, focal[1], centre[1]], [0.0, 0.0, 1.0]])
     K[:2, 2] -= 1.0
     return K.reshape(9)
-
-
-def _pose(R: FloatArray, t: FloatArray, name: str) -> Rigid3:
-    try:
-        return Rigid3(R, t)
-    except InputError as error:
-        raise InputError(f"'{name}': {error}; is the file whole?") from error
 
 
 def _nothing(text: str, name: str) -> InputError:

@@ -1,8 +1,8 @@
 """mrcal's .cameramodel: pinhole, OpenCV models of 4, 5, 8 and 12 terms, stereographic, CAHVOR, and its splines.
 
-Pixels as ours; lengths in metres; the pose is rt_cam_ref, a rotation vector and a translation. The splined model is a
-table of control points of a bicubic B-spline: it is written for fisheye lenses, of which mrcal has no other model that
-fits, and reproduces any smooth lens. Splines, CAHVOR and thin prisms are read as the camera of ours that follows best.
+Pixel (0, 0) is the centre of the first pixel, as in rigkit; lengths are in metres; the pose is rt_cam_ref, a rotation
+vector and a translation. The splined model, a grid of control points of a bicubic B-spline, fits any smooth lens. It is
+written for fisheye lenses, which no other model of mrcal fits. Splines, CAHVOR and thin prisms are refitted when read.
 """
 
 from __future__ import annotations
@@ -28,24 +28,26 @@ SPLINED = re.compile(
 )
 KNOTS_X = 40
 MAX_FOV_DEG = 350
-"""Of the image: the stereographic plane has no end at 360."""
+"""Field of view: the stereographic plane is infinite at 360."""
 MAX_KNOTS_Y = 160
-"""An image that is four times as high as wide, in angle: damage rather than a lens, and 330 MB of equations."""
+"""An image four times as high as wide, in angle, is damage rather than a lens, and takes 330 MB."""
 SMOOTHING = 1e-6
-"""Weight of the second differences of the control points: it carries the surface smoothly over the image's border."""
+"""Weight of the second differences of the control points, which extrapolates the surface over the image border."""
 SPLINE_GRID = (161, 121)
-"""Pixels at which the spline is fitted and read."""
+"""Grid of pixels at which the spline is fitted."""
 CHECK_GRID = (233, 187)
-"""Pixels at which its error is measured: others."""
+"""Another grid, at which its error is measured."""
 CLOSE_ENOUGH_PX = 0.1
-"""A parametric model that is off by less is preferred to the spline: other programs can read it."""
+"""A parametric model with a smaller error is preferred to the spline: more programs read it."""
 INTRINSICS = {"PINHOLE": 4, "STEREOGRAPHIC": 4, "OPENCV4": 8, "OPENCV5": 9, "OPENCV8": 12, "OPENCV12": 16, "CAHVOR": 9}
-"""Lens models that are read, besides splines, and how many numbers each has."""
+"""Numbers of parameters of the lens models that are read, besides splines."""
 
 
 def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None, *, outline: Pixels | None = None) -> Written:
-    """Return the camera as a .cameramodel file; `cam_from_ref` is its pose, by default the identity; `outline` (N, 2)
-    of what was seen is its valid-intrinsics region."""
+    """Return the camera as a .cameramodel file.
+
+    `cam_from_ref` is its pose, by default the identity; `outline` (N, 2) of the corners is its valid-intrinsics region.
+    """
     pose = Rigid3.identity() if cam_from_ref is None else cam_from_ref
     try:
         chosen = best_accepted(camera, PERSPECTIVE, "mrcal")
@@ -65,10 +67,10 @@ def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None, *, out
 
 
 def read_cameramodel(text: str, name: str = "cameramodel") -> tuple[Camera, Rigid3, float]:
-    """Return the camera, cam_from_ref and the largest error, px: 0 unless the lens was refitted, as the model that
-    follows it best: a lens that was written as a spline comes back as what it was.
+    """Return the camera, cam_from_ref, and the largest error of a refit, px (0 without refit).
 
-    Raises InputError for damaged files and for lens models that are not here (CAHVORE, panoramas).
+    A lens that rigkit wrote as a spline comes back as its original model. Raises InputError for damaged files and for
+    unknown lens models (CAHVORE, panoramas).
     """
     try:
         data = ast.literal_eval(text[text.index("{") :])
@@ -87,7 +89,7 @@ def read_cameramodel(text: str, name: str = "cameramodel") -> tuple[Camera, Rigi
 
 
 def _lens(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], name: str) -> tuple[Camera, float]:
-    """Return the camera of a lens model and its intrinsics, and its largest error, px: 0 for a model that is here."""
+    """Return the camera of a lens model and its intrinsics, and the largest error of a refit, px (0 without refit)."""
     kind = lens.removeprefix("LENSMODEL_")
     if SPLINED.match(lens) is not None:
         return _from_spline(lens, intrinsics, size_px, name)
@@ -142,7 +144,7 @@ def _stereographic(rays: Rays) -> FloatArray:
 
 
 def _spline_of(camera: Camera) -> tuple[str, FloatArray]:
-    """Return lens model and intrinsics of the spline through the camera's own rays, by linear least squares."""
+    """Return lens model and intrinsics of the spline that fits the camera, by linear least squares."""
     pixels, rays = _samples(camera, SPLINE_GRID)
     if not len(rays):
         raise InputError("mrcal: this camera sees nothing on its image; calibrate again")
@@ -151,7 +153,7 @@ def _spline_of(camera: Camera) -> tuple[str, FloatArray]:
             f"mrcal: this camera sees beyond {MAX_FOV_DEG} degrees, where its splines end; choose another format"
         )
     u = _stereographic(rays)
-    # The spline covers fov_x_deg on the horizontal, and as much as its knots reach on the vertical.
+    # The spline covers fov_x_deg horizontally, and vertically as much as its knots.
     half_x, half_y = 2.0 * np.arctan(np.abs(u).max(axis=0) / 2.0)
     fov_x = int(np.ceil(np.degrees(2.0 * half_x))) + 2
     reach = 2.0 * np.tan(np.radians(fov_x) / 4.0)
@@ -172,13 +174,13 @@ def _spline_of(camera: Camera) -> tuple[str, FloatArray]:
 
 
 def _roughness(nx: int, ny: int) -> FloatArray:
-    """Return the matrix of the sum of squared second differences of control points along both directions."""
+    """Return the matrix of the quadratic form: sum of squared second differences of control points in x and y."""
     dx, dy = (np.diff(np.eye(n), 2, axis=0) for n in (nx, ny))
     return np.asarray(np.kron(np.eye(ny), dx.T @ dx) + np.kron(dy.T @ dy, np.eye(nx)))
 
 
 def _spline_project(rays: Rays, lens: str, intrinsics: FloatArray) -> tuple[Pixels, BoolArray]:
-    """Return pixels = f (u + surface(u)) + centre, and where the spline's knots reach."""
+    """Return pixels = f (u + surface(u)) + centre, and a mask of the rays inside the spline's knots."""
     u = _stereographic(rays)
     basis, inside = _basis(u, lens)
     surface = basis @ intrinsics[4:].reshape(-1, 2)
@@ -186,7 +188,7 @@ def _spline_project(rays: Rays, lens: str, intrinsics: FloatArray) -> tuple[Pixe
 
 
 def _basis(u: FloatArray, lens: str) -> tuple[Any, BoolArray]:
-    """Return the sparse matrix (N, Ny Nx) of the bicubic B-spline at u, and where all its 4x4 knots exist."""
+    """Return the sparse matrix (N, Ny Nx) of the bicubic B-spline at u, and a mask of points with all 4x4 knots."""
     from scipy import sparse
 
     match = SPLINED.match(lens)
@@ -216,7 +218,7 @@ def _basis(u: FloatArray, lens: str) -> tuple[Any, BoolArray]:
 
 
 def _from_spline(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], name: str) -> tuple[Camera, float]:
-    """Return the camera nearest to the spline over the image, and its largest error, px."""
+    """Return the camera that fits the spline best over the image, and its largest error, px."""
     match = SPLINED.match(lens)
     assert match is not None
     if intrinsics.size != 4 + 2 * int(match["nx"]) * int(match["ny"]):

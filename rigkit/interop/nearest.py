@@ -1,4 +1,4 @@
-"""Lenses of other programs that no model here is: the nearest camera of ours, and how far it is off."""
+"""Refit of other programs' lenses that rigkit lacks: the best camera, and its largest error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rigkit.core.arrays import BoolArray, Pixels, Rays
 from rigkit.core.errors import InputError
 
 Lens = Callable[[Rays], tuple[Pixels, BoolArray]]
-"""Pixels (N, 2) of unit rays (N, 3), and which of them the lens sees."""
+"""Function of unit rays (N, 3) that returns pixels (N, 2) and a mask of the rays that the lens sees."""
 
 NEAREST = (
     ("scaramuzza", 10),
@@ -24,30 +24,30 @@ NEAREST = (
     ("brown", 5),
     ("brown", 8),
 )
-"""Tried in this order, with their terms: of a polynomial the highest degree, there is no noise to follow. The last ones
-have few terms, and are what some other program's lens was."""
+"""Models in the order in which they are tried, with their orders. Polynomials have the highest degree, because there is
+no noise to overfit; the last models have few terms, and are the original models of some lenses."""
 EXACT_PX = 0.01
-"""A camera that is off by less is taken at once: corners are found to about as much."""
+"""A camera with a smaller error is accepted at once: corners are no more accurate."""
 MIN_SEEN = 0.99
-"""Of the lens's rays a camera must see: what it does not see it does not follow."""
+"""Fraction of the lens's rays that a camera must see."""
 DIRECTIONS, ANGLES = 144, 120
-"""Rays at which a camera is fitted: around the axis and away from it."""
+"""Rays at which a camera is fitted: number of azimuths and of angles from the axis."""
 CHECKED = (251, 211)
-"""Rays at which its error is measured: others."""
+"""Other rays, at which its error is measured."""
 FIRST_LOOK = np.geomspace(1e-4, 1.0, 500)
-"""Shares of the largest angle at which the edge of the image is looked for: it may be a lens of a degree, or of 300."""
+"""Fractions of the largest angle for a coarse search of the image border: fields of view may be 1 or 300 degrees."""
 MIN_RAYS = 100
 SPREAD = 0.75
-"""Between even over the angle (1), which counts the middle too much, and over the area (1/2), which leaves it out."""
+"""Exponent of the spacing of angles, between equal angles (1), which overweight the centre, and equal areas (1/2)."""
 
 
 def nearest_camera_of(
     lens: Lens, size_px: tuple[int, int], name: str, reach_rad: float, worst_px: float = FOLLOWS_PX
 ) -> tuple[Camera, float]:
-    """Return the camera nearest to a lens over its image, in the same frame, and its largest error, px.
+    """Return the camera that fits a lens best over its image, in the same frame, and its largest error, px.
 
-    `reach_rad` is an angle beyond which the lens sees nothing. Raises InputError, which calls the file `name`, for a
-    lens that shows next to nothing on the image, and where no model is off by less than `worst_px`.
+    `reach_rad` is an upper bound of the lens's angles. Raises InputError, with the file `name`, for a lens that sees
+    almost nothing, and if no model has an error below `worst_px`.
     """
     rays, pixels = rays_of_image(lens, size_px, reach_rad, (DIRECTIONS, ANGLES))
     if len(rays) < MIN_RAYS:
@@ -79,7 +79,7 @@ def nearest_camera_of(
 def rays_of_image(
     lens: Lens, size_px: tuple[int, int], reach_rad: float, count: tuple[int, int]
 ) -> tuple[Rays, Pixels]:
-    """Return unit rays (N, 3) whose pixels (N, 2) fill the image, `count` around the axis and away from it."""
+    """Return unit rays (N, 3) and pixels (N, 2) that fill the image, at `count` azimuths and angles from the axis."""
     shares = FIRST_LOOK
     for _ in range(2):
         theta = reach_rad * shares
@@ -91,7 +91,7 @@ def rays_of_image(
         pixels, seen = lens(ray.reshape(-1, 3))
         pixels, seen = pixels.reshape(*ray.shape[:2], 2), seen.reshape(ray.shape[:2])
         on = seen & ((pixels >= -0.5) & (pixels <= np.array(size_px) - 0.5)).all(axis=-1)
-        # Beyond the angle at which a polynomial turns back, pixels of the image are met a second time.
+        # Beyond the angle at which a polynomial folds back, pixels of the image recur.
         centre = lens(np.array([[0.0, 0.0, 1.0]]))[0][0]
         radius = np.linalg.norm(pixels - centre, axis=-1)
         on[:, 1:] &= np.diff(radius, axis=1) > 0.0

@@ -1,8 +1,8 @@
 """OCamCalib's calib_results.txt (also written by ImprovedOcamCalib), and the JSON of py-OCamCalib.
 
-Their conventions end here. Pixels are (row, column) from 0; the frame is x down, y right, z backwards, so that the
-polynomial is negative on the axis: (x, y, z) of theirs = (y, x, -z) of ours. Their affine part [[c, d], [e, 1]] maps
-(down, right) to (row, column) and has one freedom too many: it is turned about the axis into ours, which has e = 0.
+OCamCalib's pixels are (row, column) from 0; its frame is x down, y right, z backwards, so that the polynomial is
+negative on the axis: its (x, y, z) is (y, x, -z) in rigkit. Its affine matrix [[c, d], [e, 1]] maps (down, right) to
+(row, column) and has a redundant degree of freedom, a rotation about the axis: rigkit's has e = 0.
 """
 
 from __future__ import annotations
@@ -17,13 +17,21 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.scaramuzza import DEGREES, Scaramuzza
 from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
-from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, image_size, numbers
+from rigkit.interop.exchange import (
+    Accepted,
+    Written,
+    best_accepted,
+    camera_of,
+    image_size,
+    numbers,
+    numbers_of_words,
+)
 
 ENOUGH_PX = 0.02
-"""A polynomial of a higher degree is taken only where the lower one is off by more."""
+"""A polynomial of a higher degree is only used if the lower one has a larger error."""
 INVERSE_ENOUGH_PX = 1e-3
 INVERSE_DEGREES = range(4, 23, 2)
-"""OCamCalib raises the degree of the inverse polynomial until it fits, in the same way."""
+"""Degrees of the inverse polynomial, increased until it fits, as in OCamCalib."""
 TITLES = (
     "#polynomial coefficients for the DIRECT mapping function (ocam_model.ss in MATLAB). These are used by cam2world",
     "#polynomial coefficients for the inverse mapping function (ocam_model.invpol in MATLAB). "
@@ -35,15 +43,15 @@ TITLES = (
 
 
 def write_ocamcalib(camera: Camera, outline: Pixels | None = None) -> Written:
-    """Return the camera as calib_results.txt; `outline`: as for `best_accepted`.
+    """Return the camera as calib_results.txt; `outline` is as for `best_accepted`.
 
-    The note says how well their inverse polynomial follows, which only their world2cam uses.
+    The note states the error of the inverse polynomial, which only OCamCalib's world2cam uses.
     """
     chosen = _scaramuzza(camera, outline)
     c = chosen.camera
     polynomial = np.insert(c.parameters[:-4], 1, 0.0)
     cx, cy, stretch, shear = c.parameters[-4:]
-    # (row, col) = [[1/c, 0], [d/c, 1]] (down, right) of theirs, which is ours times c.
+    # (row, column) = [[1/c, 0], [d/c, 1]] (down, right), with lengths scaled by c.
     ss = -polynomial * stretch ** (1.0 - np.arange(polynomial.size))
     inverse, error_px = _inverse_polynomial(ss, c, stretch)
     values = (
@@ -62,37 +70,30 @@ def write_ocamcalib(camera: Camera, outline: Pixels | None = None) -> Written:
 
 
 def read_ocamcalib(text: str, name: str = "calib_results.txt") -> tuple[Scaramuzza, Mat3]:
-    """Return the camera and cam_from_ocam: x_in_cam = cam_from_ocam @ x_in_ocam, poses of the file need it.
+    """Return the camera, and the rotation cam_from_ocam that converts poses of the file.
 
-    Raises InputError for a damaged file, or a polynomial that looks backwards or has a linear term.
+    Raises InputError for a damaged file, or a polynomial of the wrong sign or with a linear term.
     """
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if len(rows) < 5:
         raise InputError(f"'{name}': {len(rows)} lines of numbers, expected 5; is it OCamCalib's calib_results.txt?")
-    ss_row = _line(rows[0], name, "polynomial")
+    ss_row = numbers_of_words(rows[0], name, "polynomial")
     if ss_row[0] != ss_row.size - 1:
         raise InputError(
             f"'{name}': {ss_row[0]:g} terms of the polynomial announced, {ss_row.size - 1} given; is the file whole?"
         )
-    row, column = _line(rows[2], name, "center", 2)
-    c, d, e = _line(rows[3], name, "affine parameters", 3)
-    height, width = image_size(_line(rows[4], name, "image size", 2), name, "image size")
+    row, column = numbers_of_words(rows[2], name, "center", 2)
+    c, d, e = numbers_of_words(rows[3], name, "affine parameters", 3)
+    height, width = image_size(numbers_of_words(rows[4], name, "image size", 2), name, "image size")
     affine = np.array([[c, d], [e, 1.0]])
     return _from_ocam((width, height), -ss_row[1:], np.array([column, row]), affine[::-1, ::-1], name)
 
 
-def _line(words: list[str], name: str, key: str, count: int | None = None) -> FloatArray:
-    """Return the numbers of a line."""
-    try:
-        return numbers([float(word) for word in words], name, key, count)
-    except ValueError as error:
-        raise InputError(f"'{name}': {key}: {error}; is the file whole?") from error
-
-
 def read_py_ocamcalib(text: str, size_px: tuple[int, int], name: str = "calibration.json") -> tuple[Scaramuzza, Mat3]:
-    """Return the camera of py-OCamCalib's JSON and cam_from_file, which has no image size and looks forward.
+    """Return the camera of py-OCamCalib's JSON, and the rotation cam_from_file.
 
-    Its centre is (column, row), its stretch matrix acts on (right, down), its frame is x right, y down, z forward.
+    The file has no image size. Its centre is (column, row), its stretch matrix acts on (right, down), its frame is x
+    right, y down, z forward.
     """
     try:
         data = json.loads(text)
@@ -108,15 +109,15 @@ def read_py_ocamcalib(text: str, size_px: tuple[int, int], name: str = "calibrat
 def camera_of_taylor(
     size_px: tuple[int, int], polynomial: FloatArray, centre: FloatArray, stretch: FloatArray, name: str
 ) -> Scaramuzza:
-    """Return the camera of a polynomial (a0, 0, a2, ...) that looks forward, with `stretch` (2, 2) of (right, down), as
-    py-OCamCalib and MATLAB's toolbox have it, turned about its axis into ours; raises InputError for no lens."""
+    """Return the camera of a polynomial (a0, 0, a2, ...), positive on the axis, and a `stretch` matrix (2, 2) on
+    (right, down), as in py-OCamCalib and MATLAB's toolbox; raises InputError for invalid parameters."""
     return _from_ocam(size_px, polynomial, centre, stretch, name)[0]
 
 
 def _from_ocam(
     size_px: tuple[int, int], polynomial: FloatArray, centre: FloatArray, affine: FloatArray, name: str
 ) -> tuple[Scaramuzza, Mat3]:
-    """Build from a forward polynomial and (u, v) = affine (right, down) + centre; return also cam_from_ocam."""
+    """Return the camera of a positive polynomial and (u, v) = affine (right, down) + centre, and cam_from_ocam."""
     if polynomial.size - 1 not in DEGREES:
         degrees = f"{DEGREES[0]} to {DEGREES[-1]}"
         raise InputError(f"'{name}': a polynomial of degree {polynomial.size - 1}; it must be of {degrees}")
@@ -124,7 +125,7 @@ def _from_ocam(
         raise InputError(f"'{name}': the polynomial must look forward and have no linear term; is it OCamCalib's?")
     if not abs(np.linalg.det(affine)) > 0.0:
         raise InputError(f"'{name}': the affine parameters put all pixels on one line; is the file whole?")
-    # affine = [[c, d], [0, 1]] scale rotation: the last row of the triangle is (0, scale).
+    # affine = scale [[c, d], [0, 1]] rotation
     scale = float(np.linalg.norm(affine[1]))
     cosine, sine = affine[1, 1] / scale, -affine[1, 0] / scale
     rotation = np.array([[cosine, sine], [-sine, cosine]])
@@ -138,7 +139,7 @@ def _from_ocam(
 
 
 def _scaramuzza(camera: Camera, outline: Pixels | None) -> Written:
-    """Return the camera itself, or the refit of the lowest degree that follows it."""
+    """Return the camera itself, or the refit of the lowest degree that fits."""
     best: Written | None = None
     for degree in (4, 6, 8, 10):
         chosen = best_accepted(camera, (Accepted("scaramuzza", degree),), "OCamCalib", outline)
@@ -151,7 +152,7 @@ def _scaramuzza(camera: Camera, outline: Pixels | None) -> Written:
 
 
 def _inverse_polynomial(ss: FloatArray, camera: Camera, stretch: float) -> tuple[FloatArray, float]:
-    """Return rho as a polynomial of atan(z / r), z backwards, over the image, and its largest error in px."""
+    """Return rho as a polynomial of atan(z / r), with z backwards, over the image, and its largest error, px."""
     width, height = camera.size_px
     edge = np.linspace(0.0, 1.0, 50)
     border = np.concatenate(
@@ -163,7 +164,7 @@ def _inverse_polynomial(ss: FloatArray, camera: Camera, stretch: float) -> tuple
     rho = np.linspace(0.0, farthest, 300)
     z = np.polynomial.polynomial.polyval(rho, ss)
     angle = np.arctan2(z, rho)
-    # Beyond the fold the angle turns back: no polynomial of it can be a function there.
+    # Beyond the fold rho is no function of the angle.
     rising = np.append(True, np.diff(np.maximum.accumulate(angle)) > 0.0)
     rho, angle = rho[rising], angle[rising]
     best: tuple[FloatArray, float] = (np.zeros(1), np.inf)

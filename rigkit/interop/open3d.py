@@ -1,4 +1,4 @@
-"""Open3D: the only module that imports it, and only when a function is called."""
+"""Open3D, which only this module imports, inside its functions."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def mean_and_covariance(points: Points) -> tuple[FloatArray, Mat3]:
 
 
 def plane_inliers(points: Points, distance_mm: float, *, iterations: int = 1000) -> BoolArray:
-    """Return the mask of the points (N, 3) within `distance_mm` of the plane that most of them share (RANSAC).
+    """Return the mask of the points (N, 3) within `distance_mm` of the dominant plane (RANSAC with a fixed seed).
 
-    Always the same ones. Raises DegenerateError for fewer than three points.
+    Raises DegenerateError for fewer than three points.
     """
     import open3d
 
@@ -54,12 +54,12 @@ def plane_inliers(points: Points, distance_mm: float, *, iterations: int = 1000)
 def _point_cloud(points: Points) -> Any:
     import open3d
 
-    # Open3D takes a view of the memory and refuses one that is read-only.
+    # Open3D refuses read-only arrays.
     return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(np.array(points, dtype=np.float64)))
 
 
 MAX_MESH_MM = 1e30
-"""Of a coordinate: single precision ends at 3e38, and the surface goes some way beyond the points."""
+"""Maximum coordinate: single precision ends at 3e38, and the surface extends beyond the points."""
 
 
 class Mesh(NamedTuple):
@@ -74,20 +74,20 @@ class Mesh(NamedTuple):
 def poisson_mesh(cloud: OrientedCloud, *, depth: int, cut: float) -> Mesh:
     """Return the screened Poisson surface of an oriented cloud (Kazhdan and Hoppe, TOG 2013).
 
-    Raises DegenerateError: the points with a normal are fewer than three, in one place, or beyond the single precision
-    of meshes; or nothing is left of the surface.
+    Raises DegenerateError: fewer than three points with a normal, points that coincide or overflow in single precision,
+    or no surface left.
 
     Parameters
     ----------
-    cloud : its normals say which side is outside.
-    depth : of the octree: 2^depth cells along the longest side.
-    cut : share of the vertices, those with the fewest points near, that is cut off: Poisson closes every surface.
+    cloud : oriented cloud; normals point outwards.
+    depth : depth of the octree: 2^depth cells along the longest side.
+    cut : fraction of the vertices with the lowest point density to remove: Poisson closes every surface.
     """
     import open3d
 
     used = cloud.normals.any(axis=1)
     middle, half = _middle_and_half_extent(cloud.points_mm[used])
-    # Open3D computes in single precision, and dies of an octree without extent: it gets the cloud in a unit cube.
+    # Open3D computes in single precision and crashes on an octree without extent: the cloud is scaled to a unit cube.
     within = _point_cloud((cloud.points_mm[used] - middle) / half)
     within.normals = open3d.utility.Vector3dVector(np.array(cloud.normals[used]))
     within.colors = open3d.utility.Vector3dVector(cloud.colours[used] / 255.0)
@@ -106,9 +106,9 @@ def poisson_mesh(cloud: OrientedCloud, *, depth: int, cut: float) -> Mesh:
 
 
 def _middle_and_half_extent(points: Points) -> tuple[FloatArray, float]:
-    """Return the middle (3,) of the box around points (N, 3) and half its longest side.
+    """Return the centre (3,) of the bounding box of points (N, 3), and half its longest side.
 
-    Raises DegenerateError for fewer than three points, and where single precision keeps no extent of them.
+    Raises DegenerateError for fewer than three points, and for points that coincide in single precision.
     """
     if len(points) < 3:
         raise DegenerateError(f"mesh: {len(points)} points have a normal; at least 3 are needed")

@@ -1,8 +1,8 @@
-"""OpenCV's calibration files: pinhole and Brown (calib3d), Kannala-Brandt (fisheye), unified (omnidir); and pairs,
-rectified by OpenCV.
+"""OpenCV's calibration files: pinhole and Brown (calib3d), Kannala-Brandt (fisheye), unified (omnidir), and rectified
+stereo pairs.
 
-The keys are those that OpenCV's own samples write: calibration, and stereo_calib (M1, D1, M2, D2, R, T, R1, R2, P1, P2,
-Q) with E, F and the image's size. Pixels as ours, lengths in mm.
+The keys are those of OpenCV's samples calibration and stereo_calib (M1, D1, M2, D2, R, T, R1, R2, P1, P2, Q), with E, F
+and the image size. Pixel (0, 0) is the centre of the first pixel, as in rigkit; lengths are in mm.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from rigkit.interop.exchange import (
     camera_of,
     field,
     numbers,
+    pose_of,
     unified_from_xi,
     unified_with_xi,
     written_size,
@@ -36,15 +37,15 @@ from rigkit.interop.opencv_storage import parse_storage
 
 OPENCV_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"), Accepted("ucm"))
 FAMILIES = (PERSPECTIVE, (Accepted("kannala_brandt"),))
-"""The models that one call of OpenCV takes together: of calib3d, and of fisheye."""
+"""Models that OpenCV rectifies together: those of calib3d, and of fisheye."""
 MATRIX = ("camera_matrix", "cameraMatrix", "mtx")
 DISTORTION = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D", "dist")
-"""How OpenCV's samples, its functions and its tutorials call both. K is cv2.fisheye's, whose four terms are others."""
+"""Keys in OpenCV's samples, functions and tutorials. K is not among them: it is cv2.fisheye's, with other terms."""
 KEYS = ("M1", "D1", "M2", "D2", "R", "T")
 
 
 def write_opencv(camera: Camera, outline: Pixels | None = None) -> Written:
-    """Return the camera as OpenCV's YAML; `cv2.FileStorage` reads it. `outline`: as for `best_accepted`."""
+    """Return the camera as YAML for `cv2.FileStorage`; `outline` is as for `best_accepted`."""
     chosen = best_accepted(camera, OPENCV_ACCEPTS, "OpenCV", outline)
     c = chosen.camera
     extra = "fisheye_model: 1\n" if c.model == "kannala_brandt" else ""
@@ -62,11 +63,10 @@ def write_opencv(camera: Camera, outline: Pixels | None = None) -> Written:
 
 
 def read_opencv(text: str, name: str = "OpenCV YAML", size_px: tuple[int, int] | None = None) -> Camera:
-    """Return the camera of OpenCV's YAML, XML or JSON; `name` is how errors call the file.
+    """Return the camera of OpenCV's YAML, XML or JSON; `name` is the file name for errors.
 
-    `size_px` is that of the images where the file does not say it: only OpenCV's own samples write it.
-    Raises InputError for a file without the keys, or terms that no model here has (thin prism, tilt, skew, distortion
-    on top of omnidir's sphere).
+    `size_px` is the image size, for files that do not state it: only OpenCV's samples do. Raises InputError for missing
+    keys, or terms that rigkit lacks (thin prism, tilt, skew, distortion with omnidir).
     """
     data = parse_storage(text, name)
     if "image_width" in data:
@@ -88,9 +88,9 @@ def read_opencv(text: str, name: str = "OpenCV YAML", size_px: tuple[int, int] |
 
 
 def camera_from_arrays(size: tuple[int, int], K: FloatArray, d: FloatArray, *, fisheye: bool, name: str) -> Camera:
-    """Return the camera of K (9) and distortion (N), as OpenCV has them: the reverse of `opencv_arrays`.
+    """Return the camera of OpenCV's K (9) and distortion (N): the inverse of `opencv_arrays`.
 
-    Raises InputError for skew, and terms that no model here has.
+    Raises InputError for skew, and terms that rigkit lacks.
     """
     core = _core(K, name)
     if fisheye:
@@ -113,14 +113,14 @@ def opencv_arrays(camera: Camera) -> tuple[Mat3, FloatArray]:
 
 
 def opencv_matrix(array: FloatArray) -> str:
-    """Return the array (R, C) as OpenCV's storage writes a matrix of doubles."""
+    """Return the array (R, C) as a matrix of doubles in OpenCV's YAML."""
     rows, columns = array.shape
     values = ", ".join(repr(float(v)) for v in array.reshape(-1))
     return f"!!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {values} ]\n"
 
 
 def read_opencv_matrix(data: dict[str, Any], key: str, name: str) -> FloatArray:
-    """Return data[key] as numbers (N,), written as OpenCV's matrix or as a list."""
+    """Return data[key], an OpenCV matrix or a list, as numbers (N,)."""
     value = field(data, key, name)
     return numbers(value["data"] if _is_matrix(value) else value, name, key)
 
@@ -130,7 +130,7 @@ def _core(K: FloatArray, name: str) -> FloatArray:
     if K.size != 9 or K[1] != 0.0:
         raise InputError(f"'{name}': camera_matrix must be 3x3 without skew, which no model has; calibrate without it")
     if K[3] != 0.0 or K[6:].tolist() != [0.0, 0.0, 1.0]:
-        # Of MATLAB's older matrices, for row vectors, the principal point would be read as (0, 0).
+        # MATLAB's older matrices are transposed: their principal point would be read as (0, 0).
         raise InputError(f"'{name}': camera_matrix must be fx 0 cx, 0 fy cy, 0 0 1, row by row; transpose it")
     return K[[0, 4, 2, 5]]
 
@@ -141,13 +141,13 @@ def _is_matrix(value: Any) -> bool:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class OpenCVStereo:
-    """A pair as OpenCV describes it.
+    """A stereo pair in OpenCV's models.
 
     Attributes
     ----------
-    cameras : the two as OpenCV has them, with what was lost.
-    R1, R2, P1, P2 : OpenCV's rectification; columns of P that are lengths are in mm.
-    text : the file.
+    cameras : the two cameras as written.
+    R1, R2, P1, P2 : OpenCV's rectification, with lengths in mm.
+    text : content of the file.
     """
 
     cameras: tuple[Written, Written]
@@ -163,9 +163,8 @@ def opencv_stereo(
 ) -> OpenCVStereo:
     """Return the pair with OpenCV's own rectification (cv2.stereoRectify, cv2.fisheye.stereoRectify).
 
-    `outlines`: one a camera, as for `best_accepted`.
-    Raises InputError where the images differ in size, which OpenCV's rectification does not take, or no family of
-    OpenCV's models follows both lenses.
+    `outlines` of both cameras are as for `best_accepted`. Raises InputError for images of different sizes, which OpenCV
+    does not rectify, or if no family of OpenCV's models fits both lenses.
     """
     if camera1.size_px != camera2.size_px:
         sizes = " and ".join(f"{width}x{height}" for width, height in (camera1.size_px, camera2.size_px))
@@ -187,7 +186,7 @@ def opencv_stereo(
 
 
 def read_opencv_stereo(text: str, name: str = "OpenCV stereo") -> tuple[tuple[Camera, Camera], Rigid3]:
-    """Return both cameras and cam2_from_cam1 (mm) of a pair's file; raises InputError for one without the keys."""
+    """Return both cameras and cam2_from_cam1 (mm) of a stereo file; raises InputError for missing keys."""
     data = parse_storage(text, name)
     size = written_size(data, name)
     found = {key: read_opencv_matrix(data, key, name) for key in KEYS}
@@ -198,16 +197,13 @@ def read_opencv_stereo(text: str, name: str = "OpenCV stereo") -> tuple[tuple[Ca
     camera1, camera2 = (
         camera_from_arrays(size, found[f"M{k}"], found[f"D{k}"], fisheye=fisheye, name=name) for k in (1, 2)
     )
-    try:
-        return (camera1, camera2), Rigid3(found["R"].reshape(3, 3), found["T"])
-    except InputError as error:
-        raise InputError(f"'{name}': R is no rotation; is the file whole?") from error
+    return (camera1, camera2), pose_of(found["R"].reshape(3, 3), found["T"], name)
 
 
 def _family(
     camera1: Camera, camera2: Camera, outlines: Sequence[Pixels | None]
 ) -> tuple[tuple[Written, Written], bool]:
-    """Return both cameras in that family of models that covers more of them, then follows them better."""
+    """Return both cameras in the family of models that covers more of the images, then has the smaller error."""
     found = []
     for fisheye, accepted in enumerate(FAMILIES):
         try:
@@ -233,7 +229,7 @@ def _rectified(
     *,
     fisheye: bool,
 ) -> tuple[FloatArray, ...]:
-    """Return R1, R2, P1, P2, Q of OpenCV, where all pixels of the rectified images are seen (alpha or balance 0)."""
+    """Return OpenCV's R1, R2, P1, P2, Q for rectified images without empty pixels (alpha or balance 0)."""
     found: Sequence[Any]
     if fisheye:
         found = cv2.fisheye.stereoRectify(*intrinsics, size_px, R, T, cv2.CALIB_ZERO_DISPARITY, balance=0.0)

@@ -1,7 +1,7 @@
-"""Files of cv2.FileStorage, whichever of its three forms they have: YAML, XML or JSON.
+"""Files of cv2.FileStorage in YAML, XML or JSON.
 
-OpenCV's own calibration sample writes XML unless told otherwise, and until OpenCV 4 called its keys Camera_Matrix,
-Distortion_Coefficients, image_Width and image_Height.
+OpenCV's calibration sample writes XML by default, with the keys Camera_Matrix, Distortion_Coefficients, image_Width and
+image_Height before OpenCV 4.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 STORAGE = re.compile(r'!!opencv-matrix|<opencv_storage>|"type_id"\s*:\s*"opencv-matrix"|\A%YAML')
-"""What such files have."""
+"""Pattern in such files."""
 XML_START = re.compile(r"\A\s*<")
 ENTITY = re.compile(r"<!(?:DOCTYPE|ENTITY)", re.IGNORECASE)
 XML_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.(?:inf|nan)", re.IGNORECASE)
 
 
 def parse_storage(text: str, name: str) -> dict[str, Any]:
-    """Return what the file holds, each key also in small letters; `name` is how errors call the file.
+    """Return the content of a file, with each key also in lower case; `name` is the file name for errors.
 
-    Matrices are mappings with `rows`, `cols` and `data`. Raises InputError where the text is no such file.
+    Matrices are mappings with `rows`, `cols` and `data`. Raises InputError for any other text.
     """
     data = _parse_xml(text, name) if XML_START.match(text) else parse_yaml(text, name)
     return {**{key.lower(): value for key, value in data.items()}, **data}
@@ -39,7 +39,7 @@ def _parse_xml(text: str, name: str) -> dict[str, Any]:
     if ENTITY.search(text):
         raise InputError(f"'{name}': XML with entities, which OpenCV does not write; is it a calibration file?")
     try:
-        # Text that is decoded already is not to be decoded once more, as its first line says.
+        # The text is decoded already: the encoding in its first line must be ignored.
         root = ElementTree.fromstring(re.sub(r"\A\s*<\?[^>]*\?>", "", text))
     except (ElementTree.ParseError, ValueError) as error:
         raise InputError(f"'{name}': not readable as XML ({error}); is the file whole?") from error
@@ -50,7 +50,7 @@ def _parse_xml(text: str, name: str) -> dict[str, Any]:
 
 
 def _value(element: Element, name: str, depth: int) -> Any:
-    """Return an element as YAML's reader would have it: a mapping, a list, a number or words."""
+    """Return an element as the YAML reader does: a mapping, a list, a number or words."""
     if depth > MAX_DEPTH:
         raise InputError(f"'{name}': nested more than {MAX_DEPTH} deep; is it a calibration file?")
     inside = list(element)

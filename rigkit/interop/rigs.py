@@ -1,4 +1,4 @@
-"""Rigs in other tools' formats: which files one becomes, and what is lost."""
+"""Writers of rigs in other tools' formats."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rigkit.interop.ros import write_camera_info
 Rig = Mapping[str, tuple[Camera, Rigid3]]
 """Camera and cam_from_rig (mm) by name."""
 Outlines = Mapping[str, Pixels]
-"""Of what cameras saw, by name: see `best_accepted`."""
+"""Outlines of the corners by camera: see `best_accepted`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -31,9 +31,9 @@ class ForeignRig:
 
     Attributes
     ----------
-    files : content by camera; "" stands for all of them in one file.
-    max_error_px : largest error of a camera's projection against the one given.
-    notes : in words, what a user of the files should know.
+    files : content by camera; "" is the key of one file for all cameras.
+    max_error_px : largest difference of a camera's projection from the original.
+    notes : notes for users of the files.
     """
 
     files: Mapping[str, str]
@@ -43,22 +43,22 @@ class ForeignRig:
 
 @dataclass(frozen=True, slots=True)
 class RigFormat:
-    """How a format is written, whether it has a file a camera, and whether it has two cameras only."""
+    """The writer of a format, whether it has one file for each camera, and whether it needs exactly two cameras."""
 
     write: Callable[[Rig, Outlines], ForeignRig]
     per_camera: bool = False
     stereo_only: bool = False
 
     def keys(self, names: Sequence[str]) -> list[str]:
-        """Return the keys that `ForeignRig.files` will have for cameras of these names."""
+        """Return the keys of `ForeignRig.files` for cameras of these names."""
         return list(names) if self.per_camera else [""]
 
 
 def write_rig(rig: Rig, kind: str, outlines: Outlines | None = None) -> ForeignRig:
-    """Return the rig in the format `kind`, one of RIG_FORMATS; `outlines` of what each camera saw, where it is known.
+    """Return the rig in the format `kind`, one of RIG_FORMATS.
 
-    Raises InputError for another format, a rig of other than two cameras where the format has stereo pairs only, and
-    lenses that no model of the format follows.
+    Raises InputError for another format, more or fewer than two cameras in a format of stereo pairs, and lenses that no
+    model of the format fits.
     """
     if kind not in RIG_FORMATS:
         raise InputError(
@@ -103,7 +103,7 @@ def _ros(rig: Rig, outlines: Outlines) -> ForeignRig:
 
 
 def _colmap(rig: Rig, outlines: Outlines) -> ForeignRig:
-    """Return COLMAP's rig_config.json; the first camera is the rig's reference, images lie in a folder a camera."""
+    """Return COLMAP's rig_config.json, for images in one folder for each camera; the first camera is the reference."""
     ids = {name: k for k, name in enumerate(rig, start=1)}
     seen = {ids[name]: outline for name, outline in outlines.items() if name in ids}
     _, written = write_colmap_cameras({ids[name]: camera for name, (camera, _) in rig.items()}, seen)
@@ -125,7 +125,7 @@ def _colmap(rig: Rig, outlines: Outlines) -> ForeignRig:
 
 
 def _stereo(rig: Rig, outlines: Outlines, format_name: str) -> tuple[str, str, OpenCVStereo]:
-    """Return the names of the rig's two cameras, and both as OpenCV has them."""
+    """Return the names of the rig's two cameras, and the pair in OpenCV's models."""
     if len(rig) != 2:
         raise InputError(f"{format_name} has files of stereo pairs, this rig has {len(rig)} cameras; name two of them")
     (one, (camera1, pose1)), (two, (camera2, pose2)) = rig.items()
@@ -134,7 +134,7 @@ def _stereo(rig: Rig, outlines: Outlines, format_name: str) -> tuple[str, str, O
 
 
 def _foreign(rig: Rig, files: Mapping[str, str], cameras: Iterable[Written], *about: str) -> ForeignRig:
-    """Return the rig in these files, which hold these cameras; `about` it, and of each of them, there are notes."""
+    """Return the rig of these files and written cameras; its notes are `about` and those of the cameras."""
     written = list(cameras)
     notes = [f"'{name}': {one.note}" for name, one in zip(rig, written, strict=True) if one.note]
     return ForeignRig(files, max(one.max_error_px for one in written), (*about, *notes))
@@ -147,4 +147,4 @@ RIG_FORMATS = {
     "mrcal": RigFormat(_mrcal, per_camera=True),
     "colmap": RigFormat(_colmap),
 }
-"""By name; adding one is a function and a line."""
+"""Formats by name."""

@@ -1,7 +1,7 @@
-"""ROS camera_info YAML, as camera_calibration_parsers reads it: plumb_bob, rational_polynomial, equidistant; ost.txt.
+"""ROS camera_info YAML for camera_calibration_parsers: plumb_bob, rational_polynomial, equidistant; and ost.txt.
 
-Pixels as ours, lengths in metres. For a camera alone the rectification matrix is the identity and the projection
-matrix the camera matrix.
+Pixel (0, 0) is the centre of the first pixel, as in rigkit; lengths are in metres. For a single camera, the
+rectification matrix is the identity and the projection matrix the camera matrix.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from rigkit.interop.exchange import (
     field,
     image_size,
     numbers,
+    numbers_of_words,
     written_size,
 )
 from rigkit.interop.opencv import camera_from_arrays
@@ -34,9 +35,9 @@ Rectification = tuple[Mat3, FloatArray]
 last column is in pixels times metres."""
 
 COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
-"""How many numbers each distortion model has."""
+"""Number of coefficients of each distortion model."""
 OST = re.compile(r"^\[image\]\s*$", re.MULTILINE)
-"""What tells the ost.txt that camera_calibration puts beside the YAML file."""
+"""Pattern in ost.txt, which camera_calibration writes beside the YAML file."""
 ROS_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"))
 
 
@@ -49,8 +50,8 @@ def write_camera_info(
 ) -> Written:
     """Return the camera as a camera_info YAML file called `camera_name` inside.
 
-    `rectification` is that of a camera of a stereo pair; by default the camera stands alone. `outline`: as for
-    `best_accepted`. Raises InputError for a name that ROS does not take.
+    `rectification` is for cameras of a stereo pair; `outline` is as for `best_accepted`. Raises InputError for a name
+    that ROS does not accept.
     """
     if not camera_name or not camera_name.replace("_", "").isalnum():
         raise InputError(f"camera_info: name '{camera_name}'; ROS takes letters, digits and underscores")
@@ -76,10 +77,10 @@ def write_camera_info(
 
 
 def read_camera_info(text: str, name: str = "camera_info") -> Camera:
-    """Return the camera of a camera_info file, of a message as `ros2 topic echo` and `rostopic echo` print it, or of
+    """Return the camera of a camera_info file, of a message printed by `ros2 topic echo` or `rostopic echo`, or of
     camera_calibration's ost.txt.
 
-    Raises InputError for other distortion models and damaged files.
+    Raises InputError for unknown distortion models and damaged files.
     """
     if OST.search(text):
         return _read_ost(text, name)
@@ -98,8 +99,10 @@ def read_camera_info(text: str, name: str = "camera_info") -> Camera:
 
 
 def _read_ost(text: str, name: str) -> Camera:
-    """Return the camera of an ost.txt: sections in brackets, under each key its numbers. No model is named there, only
-    the number of its terms differs."""
+    """Return the camera of an ost.txt: sections in brackets, and numbers under each key.
+
+    The distortion model is not named; the number of its terms identifies it.
+    """
     section, key = "", ""
     values: dict[str, dict[str, list[str]]] = {}
     for line in text.splitlines():
@@ -114,11 +117,8 @@ def _read_ost(text: str, name: str) -> Camera:
     if len(values) != 1:
         raise InputError(f"'{name}' holds {len(values)} cameras; leave [image] and the one that you want in it")
 
-    def read(of: dict[str, list[str]], key: str, count: int | None = None) -> FloatArray:
-        try:
-            return numbers([float(word) for word in field(of, key, name)], name, key, count)
-        except ValueError as error:
-            raise InputError(f"'{name}': '{key}' is not a list of numbers; is the file whole?") from error
+    def read(section: dict[str, list[str]], key: str, count: int | None = None) -> FloatArray:
+        return numbers_of_words(field(section, key, name), name, key, count)
 
     (camera,) = values.values()
     size = image_size([read(image, key, 1)[0] for key in ("width", "height")], name, "width, height")
@@ -131,12 +131,12 @@ def _read_ost(text: str, name: str) -> Camera:
 
 
 def _first_message(text: str) -> str:
-    """Return the text up to the line that ends a message; more of one camera's say the same."""
+    """Return the first of several messages; those of one camera are all the same."""
     return next((part for part in re.split(r"^---\s*$", text, flags=re.MULTILINE) if part.strip()), text)
 
 
 def _as_stored(data: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return a message's K and D (of ROS 2 k and d), width and height under the names that files have for them."""
+    """Return a message with K and D (in ROS 2 k and d), width and height under their names in files."""
     if "camera_matrix" in data:
         return data
     K, D = (next((data[key] for key in (big, big.lower()) if key in data), None) for big in "KD")

@@ -1,7 +1,7 @@
-"""YAML as calibration files use it: mappings, lists, numbers and words, read by PyYAML within limits.
+"""YAML of calibration files: mappings, lists, numbers and words, read by PyYAML within limits.
 
-Nothing but plain data is built: a tag other than OpenCV's, an alias, a key given twice and nesting without end are
-refused. Numbers are those of YAML 1.2 (1e-5 is one, 1:30 is not).
+Tags other than OpenCV's, aliases, duplicate keys and deep nesting are refused. Numbers are those of YAML 1.2 (1e-5 is
+one, 1:30 is not).
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import Any
 from rigkit.core.errors import InputError
 
 MAX_CHARACTERS = 1_000_000
-"""A camchain has two thousand; OpenCV's own samples write all corners of all views into the file."""
+"""A camchain has two thousand; OpenCV's samples write all corners of all views."""
 MAX_DEPTH = 20
 MAX_YAML_DIGITS = 40
-"""Of a whole number; longer ones are damage."""
+"""Digits of an integer."""
 
 NULL, BOOL, INT, FLOAT = (f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float"))
 RESOLVED = (
@@ -32,19 +32,19 @@ RESOLVED = (
         list("-+.0123456789"),
     ),
 )
-"""Tag, what it looks like, and the characters it may start with: the core schema of YAML 1.2."""
+"""Tag, pattern, and first characters: the core schema of YAML 1.2."""
 
 
 def parse_yaml(text: str, name: str) -> dict[str, Any]:
-    """Return the mapping in `text`; `name` is how errors call the file.
+    """Return the mapping in `text`; `name` is the file name for errors.
 
-    Raises InputError where the text is not such a mapping, or beyond the limits above.
+    Raises InputError for any other text, or one beyond the limits above.
     """
     import yaml
 
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"'{name}': {len(text)} characters, more than {MAX_CHARACTERS}; leave the data of images out")
-    # OpenCV's first line is no directive of YAML, which would be "%YAML 1.0".
+    # OpenCV's first line is no valid directive: that would be "%YAML 1.0".
     body = re.sub(r"\A\s*%YAML[^\n]*", "", text)
     try:
         value = yaml.load(body, _loader())
@@ -61,8 +61,8 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
 
 
 def flow(values: Any) -> str:
-    """Return numbers (possibly nested) as a YAML flow sequence that reads back to the same doubles, in YAML 1.1 too,
-    where 1e-9 is a word and 1.0e-9 a number (PyYAML, and with it Kalibr and ROS)."""
+    """Return numbers (possibly nested) as a YAML flow sequence that reads back to the same doubles, also in YAML 1.1
+    (PyYAML, Kalibr, ROS), where 1e-9 is a string and 1.0e-9 a number."""
     if hasattr(values, "tolist"):
         values = values.tolist()
     if isinstance(values, list | tuple):
@@ -81,7 +81,7 @@ def _float(text: str) -> float:
 
 @functools.cache
 def _loader() -> Any:
-    """Return PyYAML's safe loader within our limits; the class is made when first needed, as is PyYAML imported."""
+    """Return PyYAML's safe loader with the limits above; PyYAML is imported at the first call."""
     import yaml
 
     class Loader(yaml.SafeLoader):
@@ -111,7 +111,7 @@ def _loader() -> Any:
             return out
 
     def untagged(loader: Any, suffix: str, node: Any) -> Any:
-        """Read what OpenCV marks as its own, such as !!opencv-matrix, as what it is."""
+        """Read a node with OpenCV's tag, such as !!opencv-matrix, as if it had none."""
         return loader.construct_mapping(node) if isinstance(node, yaml.MappingNode) else loader.construct_sequence(node)
 
     Loader.yaml_implicit_resolvers = {}

@@ -1,2 +1,3 @@
-"""Files: what a person writes (`manifests`, `boards`), what cameras write (`media`), what the program writes
-(`calibrations`, `corners`, `ply`), each with its schema (`schema`). All through `disk`: whole or not at all."""
+"""Reading and writing files: those that people write (`manifests`, `boards`), that cameras write (`media`), and that
+rigkit writes (`calibrations`, `corners`, `ply`), with their schemas (`schema`) and the common readers and writers
+(`disk`)."""

@@ -1,7 +1,7 @@
-"""Oriented clouds and triangle meshes as PLY files that Open3D, CloudCompare and MeshLab read as they are.
+"""Oriented clouds and triangle meshes as PLY files (binary, little endian) for Open3D, CloudCompare and MeshLab.
 
-Binary, little endian. Names of the properties are those that these programs know (x y z nx ny nz red green blue); what
-they do not know (sigma_mm, normal_sigma_deg; of clouds with boards also board, column, row) they show as scalar fields.
+Points have the properties x y z nx ny nz red green blue, which these programs know, and sigma_mm, normal_sigma_deg and,
+if there are boards, board, column, row, which they show as scalar fields.
 """
 
 from __future__ import annotations
@@ -19,24 +19,12 @@ from rigkit.core.errors import InputError
 from rigkit.io.disk.reading import read_bytes
 from rigkit.io.disk.writing import write_atomic
 
-PLY_TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "<i2",
-    "int16": "<i2",
-    "ushort": "<u2",
-    "uint16": "<u2",
-    "int": "<i4",
-    "int32": "<i4",
-    "uint": "<u4",
-    "uint32": "<u4",
-    "float": "<f4",
-    "float32": "<f4",
-    "double": "<f8",
-    "float64": "<f8",
-}
+PLY_TYPES = (
+    {"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}
+    | {"int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4"}
+    | {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
+)
+"""Names of the types in headers -> numpy's."""
 POINT = ("x", "y", "z")
 NORMAL_COLUMNS = ("nx", "ny", "nz")
 COLOUR = ("red", "green", "blue")
@@ -46,9 +34,9 @@ SIGMAS_COMMENT = {
     True: f"{SIGMA_COMMENT}, and the covariance of the calibrations",
     False: f"{SIGMA_COMMENT}; the calibrations count as exact",
 }
-"""What the sigmas include, by `OrientedCloud.calibration_in_sigmas`."""
+"""Comment about the sigmas, by `OrientedCloud.calibration_in_sigmas`."""
 FROM_ORIGIN_COMMENT = "all points were seen from the origin"
-"""Of clouds that are `OrientedCloud.from_origin`."""
+"""Comment of clouds with `OrientedCloud.from_origin`."""
 
 
 def write_ply(
@@ -59,16 +47,16 @@ def write_ply(
     single_precision: bool = False,
     comments: Iterable[str] = (),
 ) -> None:
-    """Write `cloud` to `path`: lengths in mm, the frame of camera 1.
+    """Write a cloud as PLY, in mm and the frame of camera 1.
 
-    Raises InputError: nothing to write, the file exists, or it cannot be written.
+    Raises InputError: the cloud is empty, the file exists, or it cannot be written.
 
     Parameters
     ----------
     path : file; an existing one is refused unless `force`.
-    cloud : oriented cloud; an empty one is refused.
-    single_precision : 32-bit coordinates, for programs that know no other.
-    comments : lines for the header, such as where the cloud comes from.
+    cloud : oriented cloud with one point or more.
+    single_precision : 32-bit coordinates, for programs that cannot read 64-bit ones.
+    comments : lines for the header.
     """
     write_atomic(path, ply_bytes(cloud, single_precision=single_precision, comments=comments), force=force)
 
@@ -81,10 +69,9 @@ def ply_bytes(
     comments: Iterable[str] = (),
     unit: str = "mm",
 ) -> bytes:
-    """Return the file's content; raises InputError for an empty cloud.
+    """Return the content of the PLY file of a cloud; raises InputError for an empty one.
 
-    With `confidence` the length of a normal says how sure it is, one for the median: what PoissonRecon's --confidence
-    weights points by.
+    With `confidence`, normals are scaled by median sigma / sigma: PoissonRecon's --confidence weights points by them.
     """
     if len(cloud) == 0:
         raise InputError("point cloud: it has no points, so there is nothing to write; see what was dropped, and why")
@@ -95,7 +82,6 @@ def ply_bytes(
         known = np.isfinite(sigma) & (sigma > 0.0)
         typical = float(np.median(sigma[known])) if known.any() else 1.0
         normals = normals * (typical / np.where(known, sigma, typical))[:, None]
-    # A scene without boards has no places on them.
     on_boards = (("board", cloud.board_index), *zip(("column", "row"), cloud.grid.T, strict=True))
     columns: list[tuple[str, str, NDArray[np.generic]]] = [
         *((name, real, cloud.points_mm[:, i]) for i, name in enumerate(POINT)),
@@ -136,16 +122,16 @@ def mesh_bytes(points: Points, normals: Normals, colours: NDArray[np.uint8], tri
 
 
 def _one_line(text: str) -> str:
-    """Return the text as a header can have it: blanks for what would end the line, '?' for other control characters."""
+    """Return the text for a header line: whitespace as blanks, other control characters as '?'."""
     return "".join(c if c.isprintable() else "?" for c in " ".join(str(text).split()))
 
 
 def read_ply(path: str | Path) -> OrientedCloud:
     """Return the cloud of a binary little-endian PLY file with normals.
 
-    Properties beyond the coordinates and normals may be missing: then no board, grey, and NaN sigmas.
+    Other properties may be missing: points are then grey, without boards, and have NaN sigmas.
 
-    Raises InputError: no such file, not such a PLY, no normals, or cut off.
+    Raises InputError: no such file, not such a PLY, no normals, or truncated.
     """
     source = Path(path)
     data = read_bytes(source, "point cloud")
@@ -181,7 +167,7 @@ def read_ply(path: str | Path) -> OrientedCloud:
 
 
 def ply_unit(path: str | Path) -> str:
-    """Return the unit of a file's lengths as its header says it, mm where it says none; raises as `read_ply`."""
+    """Return the unit of length in a file's header, by default mm; raises as `read_ply`."""
     data = read_bytes(path, "point cloud")
     start = _header(data, Path(path))[-1]
     described = re.search(rb"^comment units (\S+)$", data[:start], re.MULTILINE)
@@ -189,20 +175,20 @@ def ply_unit(path: str | Path) -> str:
 
 
 def _unit_normals(normals: FloatArray) -> FloatArray:
-    """Return normals (N, 3) of length one: some files' lengths say how sure they are. Zero ones stay."""
+    """Return normals (N, 3) scaled to unit length: some files store confidences in them. Zero normals are kept."""
     largest = np.abs(normals).max(axis=1, keepdims=True, initial=0.0)
-    # What is no number is refused with the cloud.
+    # NaN is refused with the cloud.
     with np.errstate(over="ignore", invalid="ignore"):
-        # Squares of these would overflow, or vanish.
+        # Squares of these would overflow or underflow.
         normals = normals / np.where((largest > 0.0) & ((largest < 1e-100) | (largest > 1e100)), largest, 1.0)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-    # Those that are of length one but for rounding are as they were written.
+    # Unit normals up to rounding are kept as written.
     whole = (np.abs(length - 1.0) < 1e-6) | ~(length > 0.0)
     return np.asarray(normals / np.where(whole, 1.0, length))
 
 
 def _header(data: bytes, source: Path) -> tuple[int, list[tuple[str, str]], tuple[str, ...], int]:
-    """Return the number of points, their fields, the board names, and where the points start."""
+    """Return the number of points, their fields, the board names, and the offset of the points."""
     end = data.find(b"\nend_header\n") + 1
     if not data.startswith(b"ply") or end <= 0:
         raise InputError(f"'{source}' is not a PLY file, or its header is cut off; give a file written by rigkit")
@@ -219,7 +205,7 @@ def _header(data: bytes, source: Path) -> tuple[int, list[tuple[str, str]], tupl
 
 
 def _declared(lines: list[str], source: Path) -> tuple[int, list[tuple[str, str]], dict[int, str]]:
-    """Return the number of points (-1 where none are declared), their fields, and the boards named in comments."""
+    """Return the number of points (-1 if undeclared), their fields, and the boards named in comments."""
     count = -1
     fields: list[tuple[str, str]] = []
     boards: dict[int, str] = {}

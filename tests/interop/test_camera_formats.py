@@ -17,7 +17,12 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.interop.camera_formats import FOREIGN_FORMATS
-from rigkit.interop.colmap_cameras import MODEL_IDS, read_colmap_cameras, write_colmap_cameras
+from rigkit.interop.colmap_cameras import (
+    MODELS_BY_ID,
+    parameters_of,
+    read_colmap_cameras,
+    write_colmap_cameras,
+)
 from rigkit.interop.kalibr import read_kalibr, write_kalibr
 from rigkit.interop.opencv import read_opencv, write_opencv
 from rigkit.interop.ros import read_camera_info
@@ -354,9 +359,9 @@ def test_we_read_binary_cameras_of_colmap(tmp_path: Path) -> None:
     ours = import_camera(tmp_path / "cameras.bin")
     assert (ours.model, ours.size_px) == ("brown", (640, 480))
     assert ours.parameters.tolist() == [500.0, 501.0, 320.0, 240.0, -0.2, 0.05, 0.001, -0.002]
-    for number, (name, count) in enumerate(MODEL_IDS):
+    for number, name in enumerate(MODELS_BY_ID):
         theirs = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
-        assert (int(theirs.model), len(theirs.params)) == (number, count)
+        assert (int(theirs.model), len(theirs.params)) == (number, len(parameters_of(name)))
     (tmp_path / "cameras.bin").write_bytes((tmp_path / "cameras.bin").read_bytes()[:-3])
     with pytest.raises(InputError, match=r"not UTF-8|none of the known"):
         import_camera(tmp_path / "cameras.bin")

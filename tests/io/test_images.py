@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -213,3 +214,19 @@ def test_a_folder_without_images_says_what_it_holds_instead(tmp_path: Path) -> N
     assert f'images = "{tmp_path}/**/*.PNG"' in words
     (tmp_path / "a.jp2").touch()
     assert "formats that are not read, 'a.jp2' the first" in no_images(tmp_path)
+
+
+def test_an_unreadable_subfolder_does_not_end_the_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in /proc, whose folders of processes vanish while they are read."""
+    (tmp_path / "gone").mkdir()
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "1.png"), np.zeros((2, 2), np.uint8))
+    scandir = os.scandir
+
+    def refuse(path: str) -> object:
+        if Path(path).name == "gone":
+            raise OSError(22, "Invalid argument", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    assert "images' has some; give that" in no_images(tmp_path)

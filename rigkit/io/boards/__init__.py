@@ -1,1 +1,1 @@
-"""Files of boards: as a person measured one, in a word, and those of other tools."""
+"""Boards from rigkit's board files, from words such as 9x6x25, and from other tools' target files."""

@@ -41,14 +41,14 @@ from rigkit.io.disk.toml_reader import TomlTable, read_toml, toml_text
 
 BOARD_SCHEMA = "rigkit.board/1"
 MAX_CORNERS = 1000
-"""Along one side: no image resolves more."""
+"""Corners along one side: no image resolves more."""
 PRINTED = ("printed_x_mm", "printed_y_mm")
 SQUARES_MM = (0.1, 5000.0)
-"""Sizes outside are slips of the unit, 0.03 for 0.03 m."""
+"""Sizes outside of this range have the wrong unit, such as 0.03 for 0.03 m."""
 
 
 def _pattern_keys() -> dict[str, Schema]:
-    """Return the keys of all patterns, each with the hint that its pattern gives."""
+    """Return the keys of all patterns with their hints."""
     out: dict[str, Schema] = {}
     for name, pattern in PATTERNS.items():
         for key in pattern.keys:
@@ -90,19 +90,18 @@ DECLARED_BOARD = obj(BOARD_KEYS, "the board as declared, by the keys of board fi
 
 
 def load_board(path: str | Path) -> Board:
-    """Return the board that the file describes; its id is the file's name unless it says otherwise.
+    """Return the board of a board file, or of another tool's target file (see `rigkit.io.boards.foreign_boards`).
 
-    Target files of other tools will do: see `rigkit.io.boards.foreign_boards`.
-
-    Raises InputError for a missing file, an unknown or missing key, or a value that makes no board.
+    Its id is the file's name unless the file states one. Raises InputError for a missing file, an unknown or missing
+    key, or an invalid value.
     """
     return measured_board(_table_of(path), Path(path).stem)
 
 
 def load_layout(path: str | Path) -> Board:
-    """Return the board of the file as it was laid out for printing: as it is, unless its print was measured since.
+    """Return the board of a file with the square size of its printing layout, before the print was measured.
 
-    Raises InputError like `load_board`.
+    Raises InputError as `load_board`.
     """
     table = _table_of(path)
     board = measured_board(table, Path(path).stem)
@@ -115,9 +114,9 @@ def _table_of(path: str | Path) -> TomlTable:
 
 
 def measured_board(table: TomlTable, default_id: str) -> Board:
-    """Return the board that a person described by the keys above in a table of any file, as `board_from_table`.
+    """Return the board of a table that a person wrote, as `board_from_table`.
 
-    Raises InputError also for sizes that nobody prints, and a pattern that cannot be printed.
+    Raises InputError also for implausible sizes, and a pattern that cannot be printed.
     """
     board = board_from_table(table, default_id)
     word, per = board.pattern.size_word, board.pattern.points_per_count
@@ -134,7 +133,7 @@ def measured_board(table: TomlTable, default_id: str) -> Board:
 
 
 def board_from_table(table: TomlTable, default_id: str) -> Board:
-    """Return the board of a table with the keys above, such as `board_values` writes them."""
+    """Return the board of a table with BOARD_KEYS, such as `board_values` writes."""
     kind = _type_of(table)
     word = kind.size_word
     sizes = [f"{word}{end}_mm" for end in ("", "_x", "_y", "_sigma")]
@@ -165,7 +164,7 @@ def _type_of(table: TomlTable) -> type[Pattern]:
 
 
 def board_values(board: Board) -> dict[str, Value]:
-    """Return the keys of a board's file, without its name, as another file holds them: exactly, and all of them."""
+    """Return the keys of a board, without its name, at full precision, for storing it in another file."""
     pattern, word = board.pattern, board.pattern.size_word
     per = pattern.points_per_count
     values: dict[str, Value] = {"type": pattern.type, "columns": board.columns // per, "rows": board.rows // per}
@@ -181,7 +180,7 @@ def board_of_values(values: Mapping[str, Any], board_id: str) -> Board:
 
 
 def board_text(board: Board, comment: str, path: Path, *, layout: Board | None = None) -> str:
-    """Return the board's file for `path`; with the `layout` that was printed where the squares are measured ones."""
+    """Return the content of the board's file `path`; `layout` is the board as printed, if the squares are measured."""
     pattern = board.pattern
     word, per = pattern.size_word, pattern.points_per_count
     lines = [f"# {comment}", f'schema = "{BOARD_SCHEMA}"']

@@ -1,4 +1,4 @@
-"""Boards in a word, as a command line has them: "9x6x25", "aprilgrid:6x6x88,spacing=0.3", or a file."""
+"""Boards in words, as on the command line: "9x6x25", "aprilgrid:6x6x88,spacing=0.3", or a file."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ BOARD_WORDS = re.compile(
     r"(?:[xX]|, ?)(?P<mm>\d{1,4}(?:\.\d{1,4})?)(?: ?mm)?(?P<keys>(?:,\w+=[\w.+-]+)*)$"
 )
 COUNTS = re.compile(r"\d{1,4}[xX]\d{1,4}")
-"""A board but for its scale."""
+"""A board without its scale."""
 WORDS_HELP = "9x6x25 (inner corners along and across, mm a square), aprilgrid:6x6x88,spacing=0.3 (tags, mm a tag)"
 
 
 def board_in_words(words: str) -> Board | None:
-    """Return the board that `words` say, with a name made of them; None where they are a file's name instead.
+    """Return the board described by `words`, named after them; None if they are a file name.
 
-    TYPE:COLUMNSxROWSxMM,KEY=VALUE,...: the types and keys are those of board files; without TYPE a chessboard, which
-    may also be written as people say it: "9x6, 30 mm".
+    The form is TYPE:COLUMNSxROWSxMM,KEY=VALUE,... with the types and keys of board files. Without TYPE it is a
+    chessboard, which may also be written "9x6, 30 mm".
 
-    Raises InputError for words that make no board.
+    Raises InputError for invalid words.
     """
     match = BOARD_WORDS.match(words)
     if match is None:
@@ -54,7 +54,7 @@ def board_in_words(words: str) -> Board | None:
 
 
 def board_of_words(words: str) -> Board:
-    """Return the board that `words` tell, as `board_in_words`, or a file; raises InputError for anything else."""
+    """Return the board in words (see `board_in_words`) or in a file; raises InputError for anything else."""
     board = board_in_words(words)
     if board is not None:
         return board
@@ -66,12 +66,12 @@ def board_of_words(words: str) -> Board:
 
 
 def board_files(words: Iterable[str]) -> list[Path]:
-    """Return the files among what tells boards: they are read, so nothing is written over them."""
+    """Return the board files among the arguments of --board."""
     return [Path(one) for one in words if board_in_words(one) is None]
 
 
 def words_of_board(board: Board) -> str:
-    """Return a board whose scale is not known in words, with MM for the length that is to be put in."""
+    """Return the words for a board of unknown scale, with MM in place of the length."""
     pattern, per = board.pattern, board.pattern.points_per_count
     typical = {f.name: f.default for f in fields(pattern)}
     keys = [
@@ -85,7 +85,7 @@ def words_of_board(board: Board) -> str:
 
 
 def with_length(words: str, length_mm: float) -> str:
-    """Return the words of `words_of_board` with the length that was to be put in.
+    """Return the words of `words_of_board` with a length in place of MM.
 
     >>> with_length("circles:10x8xMM,diameter_mm=(0.6 MM)", 25.0)
     'circles:10x8x25,diameter_mm=15'

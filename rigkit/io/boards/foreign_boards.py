@@ -14,18 +14,18 @@ from rigkit.interop.yaml_text import parse_yaml
 from rigkit.io.disk.reading import read_text
 
 FOREIGN_SUFFIXES = (".yaml", ".yml", ".xml")
-"""Of files that are no board files of rigkit's."""
+"""Endings of other tools' target files."""
 
 Values = dict[str, Any]
 INCH_MM = 25.4
 
 
 def foreign_board(path: str | Path) -> Values | None:
-    """Return what a target file says, as the keys of a board file; None for a TOML file that is a board file.
+    """Return another tool's target as the keys of a board file; None for a board file of rigkit's.
 
-    BoofCV's and OpenCV's files have no unit: their lengths are taken for mm.
+    Lengths in files of BoofCV and OpenCV have no unit and count as mm.
 
-    Raises InputError for a missing file, or one that describes no target.
+    Raises InputError for a missing file, or one without a target.
     """
     source = Path(path)
     if source.suffix.lower() == ".toml":
@@ -58,7 +58,7 @@ def _kalibr(values: Mapping[str, Any]) -> Values:
         )
         size, spacing = _either(values, "tagSize", "tag_size"), _either(values, "tagSpacing", "tag_spacing")
         return {"type": "aprilgrid", "columns": columns, "rows": rows, "tag_mm": _mm(size), "spacing": float(spacing)}
-    # Kalibr counts corners of checkerboards as we do.
+    # Kalibr counts the inner corners of checkerboards, as rigkit does.
     size = {"columns": values["targetCols"], "rows": values["targetRows"]}
     if kind == "checkerboard":
         sides = {
@@ -91,7 +91,7 @@ def _boofcv(values: Mapping[str, Any]) -> Values:
         return {"type": "circles", "columns": columns, "rows": rows, **lengths}
     if columns % 2:
         raise ValueError(f"{columns} columns, whose rows have {columns // 2 + 1} and {columns // 2} circles in turn")
-    # BoofCV counts half steps along a row; of its printed pages every second row begins further left.
+    # BoofCV counts half steps along a row; on its pages every second row is shifted to the left.
     staggered = {"layout": "hexagonal", "stagger": "left"}
     return {"type": "circles", **staggered, "columns": columns // 2, "rows": rows, **lengths}
 
@@ -101,7 +101,7 @@ def _opencv(values: Mapping[str, Any]) -> Values:
     kind, square = values.get("Calibrate_Pattern", "CHESSBOARD"), float(values["Square_Size"])
     size = {"columns": int(values["BoardSize_Width"]), "rows": int(values["BoardSize_Height"])}
     if kind == "CHARUCOBOARD":
-        # The one board of which OpenCV counts squares.
+        # The only board whose squares OpenCV counts.
         inner = {"columns": size["columns"] - 1, "rows": size["rows"] - 1}
         marker = {"dictionary": values["ArUco_Dict_Name"], "marker_mm": float(values["Marker_Size"])}
         return {"type": "charuco", **inner, "square_mm": square, **marker}
@@ -116,7 +116,7 @@ def _caliscope(source: Path) -> Values | None:
     try:
         values = tomllib.loads(read_text(source))
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
-        # The reader of board files says what is wrong with it.
+        # The reader of board files reports the error.
         return None
     if "schema" in values or not {"columns", "rows", "dictionary", "aruco_scale"} <= set(values):
         return None
@@ -144,7 +144,7 @@ def _caliscope(source: Path) -> Values | None:
 
 
 def _opencv_xml(text: str) -> Mapping[str, Any]:
-    """Return the flat entries of an XML file of OpenCV's; entities and nesting are left alone."""
+    """Return the flat entries of an XML file of OpenCV's, without parsing entities and nesting."""
     found = re.findall(r"<(\w{1,40})>\s*\"?([^<>\"]{0,200}?)\"?\s*</\1>", text[:MAX_XML])
     return {name: value.strip() for name, value in found}
 
@@ -164,4 +164,4 @@ READERS: tuple[tuple[str, Callable[[Mapping[str, Any]], Values]], ...] = (
     (BOOFCV, _boofcv),
     ("BoardSize_Width", _opencv),
 )
-"""A key by which a file is known, and its reader."""
+"""Key that identifies a file, and the reader."""

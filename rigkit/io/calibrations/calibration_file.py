@@ -1,7 +1,7 @@
-"""Calibration files (JSON, schema "rigkit.calibration/1"): written by the program, read by everything else.
+"""Calibration files (JSON, schema "rigkit.calibration/1").
 
-A file with `schema` and `camera` alone is enough for `load_camera`: so other tools' cameras come in. Lengths are in
-mm, pixels have (0, 0) at the centre of the top-left one, residuals are measured minus projected, NaN is null.
+A file with `schema` and `camera` alone is enough for `load_camera`: cameras of other tools are stored so. Lengths are
+in mm, pixel (0, 0) is the centre of the top-left pixel, residuals are measured minus projected, NaN is null.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ CALIBRATION_SCHEMA = "rigkit.calibration/1"
 CAMERA_KEYS = keys_of(CALIBRATION_FILE, "camera")
 CALIBRATION_KEYS = keys_of(CALIBRATION_FILE)
 Made = Mapping[str, Any]
-"""By what, when and from what a file was made: see `rigkit.workflows.outputs.provenance.made`."""
+"""Provenance of a file: see `rigkit.workflows.outputs.provenance.made`."""
 LATER_KEYS = {"overdispersion", "freedom", "made", "rivals", "pupil"}
-"""Former files do not have them, and cameras that look from one point have no pupil."""
+"""Optional keys: older files lack them, and central cameras have no pupil."""
 TERMS_OF_PUPIL = ("mm_per_rad2", "mm_per_rad4")
 
 
 def save_calibration(path: str | Path, calibration: Calibration, *, force: bool = False) -> None:
-    """Write the calibration; raises InputError where the file exists and `force` is not set."""
+    """Write the calibration; raises InputError if the file exists and `force` is not set."""
     write_atomic(path, calibration_text(calibration), force=force)
 
 
 def calibration_text(calibration: Calibration, made: Made | None = None) -> str:
-    """Return the content of the calibration's file, with what is known of how it was made."""
+    """Return the content of a calibration file, with its provenance `made`."""
     c = calibration
     data = {
         "schema": CALIBRATION_SCHEMA,
@@ -86,7 +86,7 @@ def calibration_text(calibration: Calibration, made: Made | None = None) -> str:
 
 
 def save_camera(path: str | Path, camera: Camera, *, force: bool = False) -> None:
-    """Write a camera without the calibration that it came from."""
+    """Write a camera without a calibration."""
     write_atomic(path, _dumps({"schema": CALIBRATION_SCHEMA, "camera": camera_to_json(camera)}), force=force)
 
 
@@ -99,15 +99,12 @@ def load_camera(path: str | Path) -> Camera:
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """Return the whole calibration; raises InputError like `load_camera`, also where the file has the camera alone."""
+    """Return the whole calibration; raises InputError as `load_camera`, and for a file with a camera only."""
     return _calibration_in(_read(path), path)
 
 
 def load_calibration_or_camera(path: str | Path) -> Calibration | Camera:
-    """Return the whole calibration, or the camera of a file that has no more, as one that came from another tool.
-
-    Raises InputError like `load_camera`.
-    """
+    """Return the whole calibration, or the camera of a file with a camera only. Raises InputError as `load_camera`."""
     data = _read(path)
     return _calibration_in(data, path) if "covariance" in data else _camera_in(data, path)
 
@@ -152,14 +149,14 @@ def _calibration_in(data: dict[str, Any], path: str | Path) -> Calibration:
 
 @contextmanager
 def damage_named(path: str | Path) -> Iterator[None]:
-    """Turn what a damaged file leads to in the block, whatever stands in it, into an InputError that names the file."""
+    """Turn any error that a damaged file causes in the block into an InputError that names the file."""
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:
-        # What we say ends with what to do.
+        # Messages of an InputError are not truncated: they end with the remedy.
         words = " ".join(str(error).split()) if isinstance(error, InputError) else damage(error)
         if str(path) not in words:
-            # What a value's own reader says to do is said once.
+            # The remedy must not be repeated.
             damage_words = (
                 f"damaged: {words}" if words.endswith("calibrate again") else f"damaged ({words}); calibrate again"
             )
@@ -178,13 +175,13 @@ def _read(path: str | Path) -> dict[str, Any]:
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """Return the camera as it stands in files."""
+    """Return the JSON of a camera."""
     parameters = camera.named(camera.parameters)
     return {"model": camera.model, "size_px": list(camera.size_px), "parameters": parameters}
 
 
 def camera_from_json(data: Any, path: str | Path) -> Camera:
-    """Return the camera that `camera_to_json` wrote; raises InputError that names the file `path`."""
+    """Return the camera of `camera_to_json`; raises InputError that names the file `path`."""
     if not isinstance(data, dict) or set(data) != CAMERA_KEYS or not isinstance(data["parameters"], dict):
         raise InputError(f"'{path}': 'camera' must have the keys {', '.join(sorted(CAMERA_KEYS))}, and no others")
     try:
@@ -205,12 +202,12 @@ def camera_from_json(data: Any, path: str | Path) -> Camera:
 
 
 def findings_to_json(findings: Sequence[Finding]) -> list[dict[str, str]]:
-    """Return findings as they stand in files: what does not apply is left out."""
+    """Return the JSON of findings, without empty fields."""
     return [{key: str(value) for key, value in asdict(f).items() if value is not None} for f in findings]
 
 
 def findings_from_json(data: Sequence[Any]) -> tuple[Finding, ...]:
-    """Return the findings of a file; former files have them as lines that begin with the severity."""
+    """Return the findings of a file; older files have them as lines that begin with the severity."""
     out = []
     for entry in data:
         if isinstance(entry, str):
@@ -238,7 +235,7 @@ def _rival_in(data: dict[str, Any], path: str | Path) -> Rival:
 
 
 def pupil_to_json(pupil: SolvedPupil) -> dict[str, Any]:
-    """Return a pupil as it stands in files."""
+    """Return the JSON of a pupil."""
     return {
         **dict(zip(TERMS_OF_PUPIL, pupil.terms.tolist(), strict=True)),
         "covariance": pupil.covariance.tolist(),
@@ -247,7 +244,7 @@ def pupil_to_json(pupil: SolvedPupil) -> dict[str, Any]:
 
 
 def pupil_from_json(data: dict[str, Any]) -> SolvedPupil:
-    """Return the pupil that `pupil_to_json` wrote; raises KeyError, TypeError, ValueError or InputError for another."""
+    """Return the pupil of `pupil_to_json`; raises KeyError, TypeError, ValueError or InputError for anything else."""
     if set(data) != {*TERMS_OF_PUPIL, "covariance", "with_frame"}:
         raise ValueError(f"'pupil' must have the keys {', '.join(TERMS_OF_PUPIL)}, covariance, with_frame")
     terms = np.array([real(data[name]) for name in TERMS_OF_PUPIL])
@@ -255,7 +252,7 @@ def pupil_from_json(data: dict[str, Any]) -> SolvedPupil:
 
 
 def _view_in(data: dict[str, Any], sizes: Mapping[str, tuple[int, int]]) -> ViewResult:
-    """Return a view; `sizes` of the boards as (columns, rows), those that are declared."""
+    """Return a view; `sizes` are (columns, rows) of the declared boards."""
     grid, kept = as_indices(data["grid"], (None, 2), "grid"), data["kept"]
     if not all(isinstance(one, bool) for one in kept):
         raise ValueError("what 'kept' says of a corner must be true or false")
@@ -286,9 +283,9 @@ Entry = TypeVar("Entry", Outlier, Candidate, Convergence, BoardShape)
 
 
 def _entry(kind: type[Entry], values: dict[str, Any]) -> Entry:
-    """Return the dataclass of these values; raises TypeError where a text, whole number or truth value is another."""
+    """Return the dataclass of these values; raises TypeError if a str, int or bool field has another type."""
     for name, wanted in get_type_hints(kind).items():
-        # By type, not by isinstance: true is an int in Python, and no count.
+        # Not isinstance: a bool is an int in Python.
         if wanted in (str, int, bool) and type(values.get(name)) is not wanted:
             raise TypeError(f"'{name}' is {values.get(name)!r}, not {wanted.__name__}")
         if wanted is float and name in values and not math.isnan(values[name]):
@@ -297,7 +294,7 @@ def _entry(kind: type[Entry], values: dict[str, Any]) -> Entry:
 
 
 def _dumps(data: dict[str, Any]) -> str:
-    """Return JSON with null for NaN; one line a key, and one line an entry of its list of objects."""
+    """Return JSON with null for NaN, with one line for each key, and for each object of a list."""
     lines = []
     for key, value in data.items():
         if isinstance(value, list) and value and isinstance(value[0], dict):

@@ -1,5 +1,5 @@
-"""The register of a calibration over months (JSON lines, schema "rigkit.history/1"): every check, and every calibration
-anew, with the date and what each thing that may change came to. The file only grows."""
+"""The register of a calibration over months (JSON lines, schema "rigkit.history/1"): every check and recalibration with
+its date and the estimated changes. Entries are only appended."""
 
 from __future__ import annotations
 
@@ -25,22 +25,21 @@ ABSOLUTE_ZERO_C = -273.15
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class HistoryEntry:
-    """One check.
+    """One check or recalibration.
 
     Attributes
     ----------
-    date : when, UTC, ISO 8601.
-    kind : "check", or "calibration" for one made anew.
-    source : the file that was checked, as seen from the register's folder.
-    reference : of a calibration made anew the one that it is a change of; "" else.
-    digest : SHA-256 of the file of which the amounts are changes, as it was then; "" of registers that are older.
-    baseline : SHA-256 of the pictures of before that the amounts are changes since; "" where they are changes of what
-        the file held.
-    holds, chance, verdict : whether it still held, the p-value, and what was said.
-    frames : how many there were.
-    rms_px : of the fresh corners.
-    temperature_c : where somebody noted it.
-    amounts : by cause and unit, such as "focus, %", value and standard deviation, each as if it alone had changed.
+    date : UTC, ISO 8601.
+    kind : "check", or "calibration" for a new calibration.
+    source : the file that was checked, relative to the register's folder.
+    reference : for a new calibration, the old one that it is compared with; else "".
+    digest : SHA-256 of the file that the amounts refer to, at that time; "" in older registers.
+    baseline : SHA-256 of the earlier pictures that the amounts refer to; "" if they refer to the file itself.
+    holds, chance, verdict : whether the calibration holds, the p-value, and the verdict in words.
+    frames : number of frames.
+    rms_px : reprojection error of the new corners, rms.
+    temperature_c : temperature, if noted.
+    amounts : by cause and unit, such as "focus, %": value and standard deviation if this alone had changed.
     """
 
     date: str
@@ -61,18 +60,18 @@ class HistoryEntry:
 
     @property
     def moment(self) -> datetime:
-        """The date; UTC where it names no zone."""
+        """The date; UTC if it has no time zone."""
         moment = datetime.fromisoformat(self.date)
         return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
 
     @property
     def watched(self) -> str:
-        """The file of which the amounts are changes."""
+        """The file that the amounts refer to."""
         return self.reference or self.source
 
     @property
     def report_of(self) -> str:
-        """What the amounts are changes of: the file, or that as pictures of before correct it."""
+        """What the amounts refer to: the file, or the file corrected by earlier pictures."""
         return f"{self.watched} since pictures {self.baseline[:8]}" if self.baseline else self.watched
 
     @classmethod
@@ -87,12 +86,14 @@ class HistoryEntry:
         temperature_c: float | None = None,
         now: datetime | None = None,
     ) -> HistoryEntry:
-        """Return the entry of a check made `now`; with `reference`, of the calibration `source` made anew. `digest` is
-        the SHA-256 of the file of which it tells the changes."""
+        """Return the entry of a check made `now`; with `reference`, of the new calibration `source`.
+
+        `digest` is the SHA-256 of the file that the changes refer to.
+        """
         amounts: dict[str, tuple[float, float]] = {}
         for change in check.tried:
             what = change.hypothesis
-            # Of flipped pictures nothing moved.
+            # Flipped pictures show no change of the camera.
             if what.kind in ("lens", "moved") or check.flipped:
                 continue
             several = len(change.amounts) > 1
@@ -127,8 +128,15 @@ def _verdict(check: SentinelCheck) -> str:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Edition:
-    """A calibration's file `watched` for as long as it stayed the same, `digest` its SHA-256 ("" where nothing tells),
-    with the entries of its changes by date, and whether it is one of `several` under one name."""
+    """One content of a calibration's file.
+
+    Attributes
+    ----------
+    watched : the file.
+    digest : SHA-256 of its content; "" if unknown.
+    entries : the entries that refer to it, by date.
+    several : whether the file had several contents.
+    """
 
     watched: str
     digest: str
@@ -137,14 +145,16 @@ class Edition:
 
     @property
     def name(self) -> str:
-        """The file, and since when it is as it was, where it was overwritten."""
+        """The file, with the date of its first entry if it had several contents."""
         return f"{self.watched} as of {self.entries[0].date[:16].replace('T', ' ')}" if self.several else self.watched
 
 
 def editions(entries: Iterable[HistoryEntry]) -> tuple[Edition, ...]:
-    """Return the calibrations of which entries (by date) are changes: a file that was overwritten is another one, and
-    so is one corrected by pictures of before.
-    Entries that do not say what it held are taken for changes of what it held before, or first."""
+    """Return the editions of the files that entries (by date) refer to.
+
+    An overwritten file is a new edition, and so is a file corrected by earlier pictures. Entries without a digest refer
+    to the edition before them, or else to the first one.
+    """
     found: dict[tuple[str, str], list[HistoryEntry]] = {}
     latest: dict[str, str] = {}
     for entry in entries:
@@ -161,7 +171,7 @@ def editions(entries: Iterable[HistoryEntry]) -> tuple[Edition, ...]:
 
 
 def as_seen_from(register: Path, source: Path) -> Path:
-    """Return the path of `source` from the folder of a register: both may be moved together."""
+    """Return the path of `source` relative to the folder of a register, so that both can be moved together."""
     try:
         return Path(os.path.relpath(source.resolve(), register.resolve().parent))
     except ValueError:
@@ -170,10 +180,9 @@ def as_seen_from(register: Path, source: Path) -> Path:
 
 
 def ensure_register(path: Path, inputs: Iterable[Path] = (), temperature_c: float | None = None) -> None:
-    """Raise InputError where no entry could be added to the register at `path`: call it before the work.
+    """Raise InputError if no entry can be added to the register at `path`; to be called before the work.
 
-    It is refused where it is one of `inputs`, which the work reads, or a file that is none; so is a temperature that
-    there is not.
+    Refused are one of the `inputs`, a file that is no register, and an impossible temperature.
     """
     if temperature_c is not None and not ABSOLUTE_ZERO_C <= temperature_c <= MAX_NUMBER:
         raise InputError(f"temperature {temperature_c:g}: give degrees Celsius")
@@ -188,9 +197,9 @@ def ensure_register(path: Path, inputs: Iterable[Path] = (), temperature_c: floa
 
 
 def add_entry(path: Path, entry: HistoryEntry) -> None:
-    """Add an entry to the register at `path`, which is made where it is missing; what others add meanwhile stays.
+    """Append an entry to the register at `path`, which is created if missing; safe with concurrent writers.
 
-    Raises InputError where it cannot be written; the entry is there whole or not at all.
+    Raises InputError if it cannot be written; no partial entry is left.
     """
     line = json.dumps({"schema": HISTORY_SCHEMA, **asdict(entry)}, allow_nan=False).encode() + b"\n"
     try:
@@ -211,8 +220,7 @@ def add_entry(path: Path, entry: HistoryEntry) -> None:
 
 
 def load_history(path: str | Path) -> tuple[HistoryEntry, ...]:
-    """Return the entries of a register in its order; raises InputError, with the line, for another or a damaged
-    file."""
+    """Return the entries of a register; raises InputError, with the line, for another or a damaged file."""
     entries = []
     for number, line in enumerate(read_text(path, "register").splitlines(), start=1):
         if line.strip():

@@ -1,4 +1,4 @@
-"""Rig files (JSON): cameras, where they sit, and how sure that is ("rigkit.rig/1"); boards on one mount, likewise
+"""Rig files (JSON): cameras with poses and covariance ("rigkit.rig/1"), and boards on one mount likewise
 ("rigkit.board_rig/1"). Lengths in mm; covariances are of left perturbations (rad) and translations (mm)."""
 
 from __future__ import annotations
@@ -53,21 +53,21 @@ PLACED_KEYS = keys_of(BOARD_RIG_FILE, "rigs", "boards")
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class SavedRig:
-    """What a rig file says. What another tool's file does not say is None, or has the default.
+    """The content of a rig file; fields that another tool's file lacks have their defaults.
 
     Attributes
     ----------
-    cameras : cameras, exact far away, and cam_from_rig by name.
-    covariance : of all intrinsics, and of the mounts of all cameras but the first.
-    sigma_px : of the corners.
-    scale_sigma : how well all lengths are known from the boards' squares, relative; 0 where nobody stated it.
+    cameras : central camera and cam_from_rig by name.
+    covariance : of all intrinsics, and of the poses of all cameras but the first.
+    sigma_px : standard deviation of a corner's coordinate.
+    scale_sigma : relative standard deviation of all lengths, from that of the boards' squares; 0 if not stated.
     freedom : degrees of freedom of the covariance.
-    overdispersion : by how much more frames disagree than corners.
-    boards : those it was calibrated with.
-    outlines : by name, convex, (N, 2) px, around all corners that a camera saw.
-    departures : what each lens may do beyond its model.
-    pupils : those that move, by name.
-    verdicts : what was said of it.
+    overdispersion : ratio of the scatter of frames to that of independent corners.
+    boards : boards of the calibration.
+    outlines : convex hull (N, 2) of all corners that a camera saw, px, by name.
+    departures : modes of each lens beyond its model.
+    pupils : moving entrance pupils by name.
+    verdicts : verdicts on the calibration.
     """
 
     cameras: dict[str, tuple[Camera, Rigid3]]
@@ -83,7 +83,7 @@ class SavedRig:
     verdicts: tuple[Finding, ...] = ()
 
     def stated(self, path: str | Path) -> tuple[tuple[Camera, ...], FloatArray, float]:
-        """Return `with_departures` and the corners' sigma; raises InputError where the file at `path` lacks them."""
+        """Return `with_departures` and `sigma_px`; raises InputError if the file at `path` lacks them."""
         cameras, covariance = self.with_departures
         if covariance is None or self.sigma_px is None:
             raise InputError(f"'{path}': the file does not say how sure the rig is; calibrate it with rigkit")
@@ -91,7 +91,7 @@ class SavedRig:
 
     @property
     def near_cameras(self) -> dict[str, tuple[Camera, Rigid3]]:
-        """The cameras of points in mm: those whose pupil moves are `NearCamera`."""
+        """The cameras for points in mm: a `NearCamera` if the pupil moves."""
         return {
             name: (NearCamera.of(camera, self.pupils[name].terms) if name in self.pupils else camera, pose)
             for name, (camera, pose) in self.cameras.items()
@@ -99,14 +99,14 @@ class SavedRig:
 
     @property
     def with_departures(self) -> tuple[tuple[Camera, ...], FloatArray | None]:
-        """The cameras, with what their lenses may do beyond their models as further parameters, and the covariance of
-        these, camera by camera, and of the mounts; None where the file does not say it."""
+        """The cameras with the modes of their lenses as further parameters, and the covariance of all parameters, by
+        camera, and of the poses; None if the file has none."""
         return self._with_departures(self.covariance)
 
     @property
     def quoted(self) -> UncertainRig | None:
-        """The rig as sure as it is quoted to be: two standard deviations hold 95 % of errors; None where the file does
-        not say it."""
+        """The rig with its covariance widened for the degrees of freedom, so that two standard deviations contain 95 %
+        of errors; None if the file has no covariance."""
         if self.covariance is None:
             return None
         wider = widening(effective_freedom(self.freedom, self.overdispersion, len(self.covariance)))
@@ -125,7 +125,7 @@ class SavedRig:
 
 
 def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
-    """Return the content of the rig's file, with what is known of how it was made."""
+    """Return the content of a rig file, with its provenance `made`."""
     pairs = [(a, b, *rig.baseline_mm(a, b)) for a, b in combinations([c.name for c in rig.cameras], 2)]
     data = {
         "schema": RIG_SCHEMA,
@@ -158,18 +158,18 @@ def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
 
 
 def _boards_of(rig: RigCalibration) -> tuple[Board, ...]:
-    """Return the boards that its cameras have seen, each as the first of them has it."""
+    """Return the declared boards that the cameras saw, with the shape from the first of these cameras."""
     shapes = [shape for camera in rig.cameras for shape in camera.calibration.boards if shape.declared is not None]
     return tuple({shape.board_id: shape.board for shape in reversed(shapes)}.values())
 
 
 def load_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
-    """Return camera and cam_from_rig of every camera by name; raises InputError like `load_saved_rig`."""
+    """Return camera and cam_from_rig by name; raises InputError as `load_saved_rig`."""
     return load_saved_rig(path).cameras
 
 
 def load_saved_rig(path: str | Path) -> SavedRig:
-    """Return what a rig file says.
+    """Return the content of a rig file.
 
     Raises InputError for a missing or damaged file, another schema or an unknown key.
     """
@@ -230,7 +230,7 @@ def _rows_of(own: LensModes) -> dict[str, Any]:
 
 
 def _modes(entry: dict[str, Any], size: int) -> LensModes:
-    """Return what a lens may do beyond its model, from the rows of its modes and of the moves that go with them."""
+    """Return the modes of a lens beyond its model, from rows of modes and of the parameter changes with them."""
     if set(entry) != set(_NO_MODES):
         raise ValueError(f"departures have the keys {', '.join(_NO_MODES)}, no others")
     modes, moves = reals(entry["modes"]), reals(entry["moves"])
@@ -241,17 +241,17 @@ def _modes(entry: dict[str, Any], size: int) -> LensModes:
 
 
 def is_rig_file(path: str | Path) -> bool:
-    """Say whether the file is a rig's; False for anything that cannot be read."""
+    """Return whether a file is a rig file; False if it cannot be read."""
     return json_schema(path) == RIG_SCHEMA
 
 
 def is_board_rigs_file(path: str | Path) -> bool:
-    """Return whether a file is of boards on one mount."""
+    """Return whether a file holds boards on one mount."""
     return json_schema(path) == BOARDS_SCHEMA
 
 
 def board_rigs_text(rigs: Sequence[BoardRig]) -> str:
-    """Return the content of the file of boards on one mount, with their angles."""
+    """Return the content of a file of boards on one mount, with their angles."""
     data = {
         "schema": BOARDS_SCHEMA,
         "rigs": [

@@ -1,1 +1,1 @@
-"""Files of points in images: corners of boards, correspondences of any scene."""
+"""Files of image points: corners of boards, and correspondences."""

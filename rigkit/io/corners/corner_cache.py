@@ -1,9 +1,8 @@
-"""Corners found before, beside the session, so that calibrating again needs no images.
+"""Cache of detected corners beside a session, so that calibrating again needs no images.
 
-A cache changes the time that a result takes, never the result. An entry holds as long as the image (by its hash), the
-code (by its hash) and the sizes of the boards are the same. Corners placed through a lens are kept
-beside those found without one, under a key for everything that the lens was calibrated from: they hold for that lens
-alone. Where the images are gone, corners of an earlier detector are better than none.
+It never changes a result. An entry is valid while the image (by hash), rigkit's code (by hash) and the boards are the
+same. Corners detected with a known lens are stored beside those detected without, with a key of everything that the
+lens was calibrated from. If the images are gone, corners of an older version of rigkit are used.
 """
 
 from __future__ import annotations
@@ -30,20 +29,17 @@ from rigkit.io.disk.writing import write_atomic
 
 CORNERS_SCHEMA = "rigkit.corners/2"
 FILE_START = re.compile(rb'^\s*\{\s*"schema":\s*"rigkit\.corners/')
-"""How such a file begins, of any version, even if the rest of it is damaged."""
+"""Start of such a file of any version, even if the rest is damaged."""
 SOURCE_SUFFIXES = {".py", ".c", ".h"}
 
 
 @functools.cache
 def source_hash() -> str:
-    """Return a hash of rigkit's sources: kept results of other code are computed again.
-
-    They are read once: what runs is what was there then.
-    """
+    """Return a hash of rigkit's sources, read once a process: results cached by other code are computed again."""
     root = Path(rigkit.__path__[0])
     digest = hashlib.sha256()
     for path in sorted(p for p in root.rglob("*") if p.suffix in SOURCE_SUFFIXES):
-        # Files of a moment, such as an editor's lock that links nowhere, come and go beside the code.
+        # Temporary files, such as an editor's lock, may vanish.
         with suppress(FileNotFoundError):
             digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
@@ -51,30 +47,21 @@ def source_hash() -> str:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FoundCorners:
-    """What was found in one image.
-
-    Attributes
-    ----------
-    size_px : (width, height).
-    detections : the boards.
-    """
+    """The boards detected in one image of `size_px` (width, height)."""
 
     size_px: tuple[int, int]
     detections: tuple[BoardDetection, ...]
 
 
 class CornerCache:
-    """The corners of a session's images. `get` what is known, `put` what is new, `save` at the end.
-
-    Without a path nothing is known at first, and nothing is kept.
-    """
+    """The corners of a session's images: `get`, `put`, and `save` at the end. Without a path it is only in memory."""
 
     def __init__(self, path: Path | None, boards: Sequence[Board]) -> None:
         self.path = path
         targets = " ".join(_target(b) for b in boards)
         self.detector = f"{source_hash()} {targets}"
         self.current = True
-        """Whether the entries are of this detector."""
+        """Whether the entries were detected by the present code."""
         self._entries: dict[str, dict[str, Any]] = {}
         self._changed = False
         if path is None:
@@ -88,21 +75,23 @@ class CornerCache:
                     str(entry["sha256"]), _found_in(entry), _found_through(entry)
                 self._entries, self.current = data["images"], data["detector"] == self.detector
         except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError, InputError):
-            # A cache that cannot be read is as good as none: it is written anew.
+            # A damaged cache is ignored and written anew.
             return
 
     @property
     def images(self) -> list[str]:
-        """Names of the images whose corners are known."""
+        """Names of the images in the cache."""
         return sorted(self._entries)
 
     def digest(self, name: str) -> str:
-        """Return the hash that image `name` had when its corners were found."""
+        """Return the hash of image `name` at detection."""
         return str(self._entries[name]["sha256"])
 
     def get(self, name: str, digest: str | None, lens: str | None = None) -> FoundCorners | None:
-        """Return the corners of image `name` if its hash is `digest`; None as digest takes what is there (the image is
-        gone). With the key of a `lens` those placed through that lens, else those found without one."""
+        """Return the corners of image `name` if its hash is `digest`, else None; a `digest` of None accepts any hash.
+
+        With the key of a `lens`, return the corners detected with that lens, else those detected without one.
+        """
         entry = self._entries.get(name)
         if entry is None or (digest is not None and (entry["sha256"] != digest or not self.current)):
             return None
@@ -111,7 +100,7 @@ class CornerCache:
         return _found_in(entry)
 
     def put(self, name: str, digest: str, found: FoundCorners, lens: str | None = None) -> None:
-        """Remember the corners of an image; those placed through a `lens` beside those that are known without one."""
+        """Store the corners of an image; those detected with a `lens` beside those detected without one."""
         boards = [_detection_out(d) for d in found.detections]
         if not self.current:
             self._entries, self.current = {}, True
@@ -122,14 +111,13 @@ class CornerCache:
         self._changed = True
 
     def keep(self, names: Collection[str]) -> None:
-        """Forget all images but these: what a person removed from a session must not come back with the cache."""
+        """Remove all other images, so that images removed from a session do not come back with the cache."""
         kept = {name: entry for name, entry in self._entries.items() if name in names}
         self._changed |= len(kept) < len(self._entries)
         self._entries = kept
 
     def save(self) -> None:
-        """Write the file if anything is new; raises InputError where it cannot be written, or a file of that name is
-        no file of kept corners."""
+        """Write the file if anything changed; raises InputError if it cannot be written, or is no corner cache."""
         if self._changed and self.path is not None:
             if self.path.is_file() and not FILE_START.match(read_bytes(self.path)):
                 raise InputError(f"'{self.path}' is no file of corners kept by rigkit and is left as it is; rename it")
@@ -138,20 +126,20 @@ class CornerCache:
 
 
 def kept_corners(data: Any) -> dict[str, FoundCorners]:
-    """Return what a file of kept corners has of each image; raises whatever damage leads to."""
+    """Return the corners by image of a cache file's content; damage raises any error."""
     if data["schema"] != CORNERS_SCHEMA:
         raise InputError(f"its schema is not '{CORNERS_SCHEMA}'")
     return {str(image): _found_in(entry) for image, entry in data["images"].items()}
 
 
 def _target(board: Board) -> str:
-    """Return what the detector looks for of a board."""
+    """Return a key of everything about a board that its detection depends on."""
     size = f"{board.columns}x{board.rows}:{board.pattern!r}"
     return f"{board.board_id}:{size}:{board.square_x_mm:g}:{board.square_y_mm:g}" if board.identified else size
 
 
 def lens_key(images: Mapping[str, str], boards: Sequence[Board], *options: object) -> str:
-    """Return a key for the lens that a first calibration gives: its images (name -> hash), boards, and options."""
+    """Return a key of the first calibration, from its images (name -> hash), boards and options."""
     known = [*images.items(), *map(repr, boards), *map(str, options), source_hash()]
     return hashlib.sha256(json.dumps(known).encode()).hexdigest()
 

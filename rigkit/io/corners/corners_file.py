@@ -1,12 +1,13 @@
-"""Corners on disk: CSV with the columns image, board, column, row, u_px, v_px, sigma_px, one corner a line.
+"""Corner files: CSV with the columns image, board, column, row, u_px, v_px, sigma_px, one corner a line.
 
-Columns and rows count from the upper left as the board stands upright. Kalibr counts an AprilGrid's corners row by row
-from the lower left: there column c of row r, of C x R corners, has number (R - 1 - r) C + c.
+Columns and rows count from the upper left of the upright board. Kalibr counts an AprilGrid's corners row by row from
+the lower left: there column c of row r, of C x R corners, has number (R - 1 - r) C + c.
 
-A board without a name is written as `?NUMBER:COLUMNSxROWS`, counted from 1 in each image, so that reading gives back
-what was found. Read are also the `corners.json` that calibrations keep, and the `corners.vnl` of mrgingham and mrcal:
-a line `# filename x y level`, then all corners of the one board in each image, row by row; '-' for what was not found.
-The level is that of the image pyramid: each one doubles the standard deviation (mrgingham's manual).
+A board without an id is written as `?NUMBER:COLUMNSxROWS`, numbered from 1 in each image.
+
+The corner cache `corners.json` is read, too, and `corners.vnl` of mrgingham and mrcal: a line `# filename x y level`,
+then all corners of the one board in each image, row by row, with '-' for missing ones. The level is that of the image
+pyramid: each one doubles the standard deviation (mrgingham's manual).
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from rigkit.io.disk.writing import write_atomic
 COLUMNS = ("image", "board", "column", "row", "u_px", "v_px", "sigma_px")
 
 LEVEL_0_SIGMA_PX = 0.1
-"""Standard deviation of a .vnl file's corner at level 0; a calibration measures the scale of its corners itself."""
+"""Standard deviation of a .vnl file's corner at level 0; a calibration estimates the true scale."""
 MAX_LEVEL = 10
 VNL_COLUMNS = {"filename", "x", "y"}
 
@@ -39,12 +40,12 @@ UNNAMED = re.compile(r"^\?\d+:(\d+)x(\d+)$")
 
 
 def corners_text(detections: Mapping[str, Sequence[BoardDetection]]) -> str:
-    """Return the file's text for the detections of each image, in the order given."""
+    """Return the CSV text of the detections by image, in the order given."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)
     for image, boards in detections.items():
-        # Readers take it for the end of a line, quoted or not.
+        # CSV readers end a line at \r, quoted or not.
         image = image.replace("\r", "\\r")
         for number, found in enumerate(boards, 1):
             name = found.board_id or f"?{number}:{found.columns}x{found.rows}"
@@ -59,12 +60,12 @@ def write_corners(path: str | Path, detections: Mapping[str, Sequence[BoardDetec
 
 
 def read_corners(path: str | Path, boards: Sequence[Board] = ()) -> dict[str, tuple[BoardDetection, ...]]:
-    """Return the detections of each image, in the order of the file; images without any board have none.
+    """Return the detections by image, in the order of the file.
 
-    The size of a named board is that of `boards`; where the name is not among them, the largest column and row read. A
-    .vnl file needs its board: it names none.
+    The size of a named board is that in `boards`, or else the largest column and row read. A .vnl file needs exactly
+    one board.
 
-    Raises InputError: no such file, other columns, or a line that cannot be understood; names the line.
+    Raises InputError: no such file, other columns, or, with its number, an invalid line.
     """
     source = Path(path)
     text = read_text(source, "corners file")
@@ -101,7 +102,7 @@ def read_corners(path: str | Path, boards: Sequence[Board] = ()) -> dict[str, tu
 
 
 def _from_json(source: Path, text: str) -> dict[str, tuple[BoardDetection, ...]]:
-    """Return what a calibration keeps of its images."""
+    """Return the detections of a corner cache."""
     try:
         return {image: found.detections for image, found in kept_corners(parse_json(text)).items()}
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, InputError) as error:
@@ -109,7 +110,7 @@ def _from_json(source: Path, text: str) -> dict[str, tuple[BoardDetection, ...]]
 
 
 def _from_vnl(source: Path, text: str, boards: Sequence[Board]) -> dict[str, tuple[BoardDetection, ...]]:
-    """Return the detections of mrgingham's or mrcal's file, which is about one board."""
+    """Return the detections of a file of mrgingham or mrcal, which has one board."""
     if len(boards) != 1:
         raise InputError(f"corners file '{source}' is about one board, and {len(boards)} are given; give that one")
     names: list[str] = []
@@ -133,7 +134,7 @@ def _from_vnl(source: Path, text: str, boards: Sequence[Board]) -> dict[str, tup
 
 
 def _vnl_corner(cells: Mapping[str, str]) -> tuple[float, float, float]:
-    """Return u, v, sigma of a line; NaN where there is no corner."""
+    """Return u, v, sigma of a line; NaN for a missing corner."""
     absent = (math.nan, math.nan, math.nan)
     if "-" in (cells["x"], cells["y"], cells.get("level"), cells.get("weight")):
         return absent
@@ -151,7 +152,7 @@ def _vnl_corner(cells: Mapping[str, str]) -> tuple[float, float, float]:
 def _vnl_detections(
     source: Path, image: str, corners: list[tuple[float, float, float]], board: Board
 ) -> tuple[BoardDetection, ...]:
-    """Return the board's detection, none where not one corner was found."""
+    """Return the board's detection; () without any corner."""
     table = np.array(corners)
     found = ~np.isnan(table[:, 0])
     if not found.any():

@@ -1,17 +1,16 @@
-"""Correspondences on disk: CSV with a header, NPZ, and the headerless text of AffineExtractor.
+"""Files of correspondences: CSV with a header, NPZ, and the headerless text of AffineExtractor.
 
 CSV: u1_px, v1_px, u2_px, v2_px; optionally a11, a12, a21, a22; optionally du1_1, dv1_1, du2_1, dv2_1, du1_2, ... for
 the directions; optionally sigma_px and sigma_A. An empty field is unknown. Columns come in any order, other columns are
 an error. NPZ: arrays pixels1, pixels2 and optionally A21, directions1, directions2 (N, K, 2), sigma_px, sigma_A.
 
-COLMAP's database (`interop.colmap_database`) and NPZ of matchers are read too: points, and rough affinities where
+COLMAP's database (`interop.colmap_database`) and NPZ of matchers are read, too: points, and rough affinities if
 features have frames. Arrays of matchers: keypoints0, keypoints1 with matches (K, 2) or matches0 (N,), -1 for none
 (LightGlue, SuperGlue); mkpts0, mkpts1 or kpts0, kpts1 (LoFTR, RoMa); lafs0, lafs1 (N, 2, 3), frames with the point in
-the last column (kornia). A leading batch of one is taken off. Pixel (0, 0) is the centre of the top-left pixel.
+the last column (kornia). A leading batch dimension of one is removed. Pixel (0, 0) is the centre of the top-left pixel.
 
 AffineExtractor (https://github.com/LeventeHajder/AffineExtractor): ten numbers a line, a11 a21 a12 a22 tx ty x1 y1 x2
-y2, with q2 = A q1 + t. Its refinement moves t and leaves x2, y2 as they were matched, so the point in image 2 is
-A q1 + t.
+y2, with q2 = A q1 + t. Its refinement changes t but not x2, y2, so the refined point in image 2 is A q1 + t.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from rigkit.affine.correspondences import Correspondences
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
-from rigkit.interop.colmap_database import is_colmap_database, read_colmap_matches
+from rigkit.interop.colmap_database import affinities_of_frames, is_colmap_database, read_colmap_matches
 from rigkit.io.disk.reading import MAX_NUMBER, csv_table, damage, is_number, read_bytes
 
 POINT_COLUMNS = ("u1_px", "v1_px", "u2_px", "v2_px")
@@ -44,20 +43,20 @@ MATCHED = (("mkpts0", "mkpts1"), ("kpts0", "kpts1"), ("keypoints0", "keypoints1"
 ARRAYS = ("pixels1", "pixels2", "A21", "directions1", "directions2", *SIGMA_COLUMNS)
 
 SIGMA_OF_FRAMES = 0.2
-"""Of affinities from features' own scale and orientation, or detected shape: no better than that, as matchers go."""
+"""Standard deviation of affinities from the frames (scale and orientation, or shape) of matched features."""
 MAX_ARRAY_BYTES = 500_000_000
-"""Of one array of an NPZ, unpacked."""
+"""Maximum size of an uncompressed array of an NPZ."""
 EXTRACTOR_COLUMNS = "a11 a21 a12 a22 tx ty x1 y1 x2 y2"
 MAX_REFINEMENT_PX = 30.0
-"""AffineExtractor refines within patches of this half width: a point further from its match means other columns."""
+"""Half width of AffineExtractor's patches: points further from their matches mean a wrong order of columns."""
 
 
 def read_correspondences(path: str | Path, images: Sequence[str] = ()) -> Correspondences:
-    """Return the correspondences of a .csv, .npz, AffineExtractor text or COLMAP database file, told by their content.
+    """Return the correspondences of a CSV, NPZ, AffineExtractor text or COLMAP database, recognised by its content.
 
-    `images` are the names of the two images' files: a database has matches of many.
+    `images` are the file names of the two images, which a database with many images needs.
 
-    Raises InputError: the file cannot be read or understood; says where and what was expected.
+    Raises InputError, with the line, if the file cannot be read.
     """
     source = Path(path)
     payload = read_bytes(source, "correspondences")
@@ -81,7 +80,7 @@ def read_correspondences(path: str | Path, images: Sequence[str] = ()) -> Corres
 
 
 def correspondences_text(found: Correspondences) -> str:
-    """Return the CSV text; numbers as exact as needed to read back the same correspondences."""
+    """Return the CSV text, with numbers at full precision."""
     columns: dict[str, FloatArray] = dict(zip(POINT_COLUMNS, np.hstack([found.pixels1, found.pixels2]).T, strict=True))
     if found.A21 is not None:
         columns |= dict(zip(AFFINE, found.A21.reshape(-1, 4).T, strict=True))
@@ -202,9 +201,9 @@ def _from_npz(source: Path, payload: bytes) -> Correspondences:
 
 
 def _from_matcher(table: dict[str, FloatArray]) -> dict[str, FloatArray] | None:
-    """Return pixels1, pixels2 and perhaps A21 of a matcher's arrays; None where they are no matcher's.
+    """Return pixels1, pixels2 and, if known, A21 from a matcher's arrays; None for other arrays.
 
-    Raises InputError where they do not fit each other.
+    Raises InputError for inconsistent arrays.
     """
     names = next((pair for pair in MATCHED if pair[0] in table and pair[1] in table), None)
     if names is None:
@@ -217,9 +216,7 @@ def _from_matcher(table: dict[str, FloatArray]) -> dict[str, FloatArray] | None:
         return {"pixels1": first, "pixels2": second}
     if first.shape[1:] != (2, 3) or second.shape[1:] != (2, 3):
         raise InputError(f"{names[0]}: local affine frames must be Nx2x3, got {first.shape}")
-    flat = np.abs(np.linalg.det(first[..., :2])) > 0.0
-    A21 = np.full((len(first), 2, 2), np.nan)
-    A21[flat] = second[flat][..., :2] @ np.linalg.inv(first[flat][..., :2])
+    A21 = affinities_of_frames(first[..., :2], second[..., :2])
     return {"pixels1": first[..., 2], "pixels2": second[..., 2], "A21": A21}
 
 
@@ -231,7 +228,7 @@ def _unbatched(values: FloatArray, rank: int) -> FloatArray:
 
 
 def _index_pairs(table: dict[str, FloatArray], names: tuple[str, str], count0: int, count1: int) -> IntArray:
-    """Return the indices (K, 2) of what matches, all in order where nothing says."""
+    """Return the index pairs (K, 2) of the matches; without match arrays, points of equal index."""
     if "matches" in table:
         pairs: IntArray = _unbatched(table["matches"], 2).astype(np.int64)
     elif "matches0" in table:
@@ -249,12 +246,12 @@ def _index_pairs(table: dict[str, FloatArray], names: tuple[str, str], count0: i
 
 
 def _rough(A21: FloatArray | None) -> dict[str, FloatArray]:
-    """Return the sigma of affinities from features' own frames."""
+    """Return the column sigma_A for affinities from features' frames."""
     return {} if A21 is None else {"sigma_A": np.full(len(A21), SIGMA_OF_FRAMES)}
 
 
 def _arrays(payload: bytes) -> dict[str, FloatArray]:
-    """Return the arrays of an NPZ by name; the size that each states is checked before memory is taken for it."""
+    """Return the arrays of an NPZ by name; stated sizes are checked before memory is allocated."""
     table: dict[str, FloatArray] = {}
     with zipfile.ZipFile(io.BytesIO(payload)) as archive:
         for info in archive.infolist():

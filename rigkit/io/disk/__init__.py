@@ -1,1 +1,1 @@
-"""Files as such: read strictly, written whole or not at all."""
+"""Strict readers, and atomic writers, of any file."""

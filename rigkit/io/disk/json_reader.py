@@ -1,10 +1,11 @@
-"""JSON as the program writes it, and a strict reader: no key twice, no number without end, no bare NaN."""
+"""JSON as rigkit writes it, and a strict reader: no duplicate key, no oversized number, no NaN."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,13 @@ from rigkit.core.errors import InputError
 from rigkit.io.disk.reading import MAX_NUMBER, MIN_POSITIVE, read_text
 
 MAX_JSON_DIGITS = 18
-"""Of a whole number: what 64 bits hold."""
+"""Digits of an integer: 64 bits hold so many."""
 _BEGINS = re.compile(r'\A\s*\{\s*"schema":\s*"([^"\\]*)"')
-"""How the program writes its files: what they are stands first."""
+"""Start of the files that rigkit writes: the schema is their first key."""
 
 
 def parse_json(text: str) -> Any:
-    """Return what the text says; raises ValueError (in words) for what is not JSON as the program writes it."""
+    """Return the value of a JSON text; raises ValueError, with the reason, for what is not strict JSON."""
     try:
         return json.loads(
             text, object_pairs_hook=_once, parse_constant=_no_constant, parse_float=_finite, parse_int=_short
@@ -32,14 +33,14 @@ def parse_json(text: str) -> Any:
 
 
 def json_text(data: Any) -> str:
-    """Return a file's content; raises ValueError for what is not finite."""
+    """Return `data` as the content of a JSON file; raises ValueError for NaN and infinity."""
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
 def json_schema(path: str | Path) -> str | None:
-    """Return the schema that the file states; None for one that states none, is no JSON or cannot be read.
+    """Return the schema that a file states; None if it states none, is no JSON or cannot be read.
 
-    A damaged file that begins as the program writes it is of its schema: what reads it says what is wrong.
+    The start of a damaged file of rigkit's is enough: its reader reports the damage.
     """
     try:
         text = read_text(path)
@@ -53,10 +54,10 @@ def json_schema(path: str | Path) -> str | None:
 
 
 def read_json(path: str | Path, schema: str, keys: Collection[str], what: str, *, remedy: str) -> dict[str, Any]:
-    """Return the outermost object of the file of `schema`.
+    """Return the outermost object of a file of `schema`; `what` names such a file in messages.
 
-    Raises InputError for a file that `what` is not: not there, no JSON, another schema, a key not in `keys`; `remedy`
-    says what to do.
+    Raises InputError, with the `remedy`, if the file does not exist, is no JSON, has another schema or a key that is
+    not in `keys`.
     """
     try:
         data = parse_json(read_text(path, what))
@@ -73,7 +74,7 @@ def read_json(path: str | Path, schema: str, keys: Collection[str], what: str, *
 
 
 def real(value: Any) -> float:
-    """Return a number; raises ValueError for a word, true or false, and what no measurement is."""
+    """Return a number as a float; raises ValueError for other types, NaN, and more than MAX_NUMBER."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{str(value)[:40]!r} is not a number")
     if not abs(value) <= MAX_NUMBER:
@@ -82,7 +83,7 @@ def real(value: Any) -> float:
 
 
 def positive(value: Any) -> float:
-    """Return a number of at least `MIN_POSITIVE`; raises ValueError for any other."""
+    """Return a number of at least MIN_POSITIVE; raises ValueError for any other."""
     number = real(value)
     if not number >= MIN_POSITIVE:
         raise ValueError(f"{number:g} must be positive, at least {MIN_POSITIVE:g}")
@@ -90,7 +91,7 @@ def positive(value: Any) -> float:
 
 
 def freedom(value: Any) -> float:
-    """Return degrees of freedom, null being infinitely many; raises ValueError for less than one."""
+    """Return degrees of freedom; null is infinity. Raises ValueError below one."""
     if value is None:
         return math.inf
     if not (number := real(value)) >= 1.0:
@@ -99,7 +100,7 @@ def freedom(value: Any) -> float:
 
 
 def reals(value: Any, *, nullable: bool = False) -> FloatArray:
-    """Return lists of numbers as an array, null as NaN where it is `nullable`; raises ValueError like `real`."""
+    """Return nested lists of numbers as an array, with null as NaN if `nullable`; raises ValueError like `real`."""
     array = np.array(value)
     if array.dtype.kind not in "iuf":
         if not nullable or any(one is not None and type(one) not in (int, float) for one in array.flat):
@@ -112,7 +113,7 @@ def reals(value: Any, *, nullable: bool = False) -> FloatArray:
 
 
 def whole(value: Any) -> int:
-    """Return a whole number; raises ValueError for anything else, 640.5 and true among it."""
+    """Return an integer; raises ValueError for anything else, such as 640.5 and true."""
     number = real(value)
     if number != math.floor(number):
         raise ValueError(f"{value} is not a whole number")
@@ -122,11 +123,8 @@ def whole(value: Any) -> int:
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     out = dict(pairs)
     if len(out) < len(pairs):
-        seen: set[str] = set()
-        for key, _ in pairs:
-            if key in seen:
-                raise ValueError(f"key {key[:60]!r} is there twice")
-            seen.add(key)
+        ((key, _),) = Counter(key for key, _ in pairs).most_common(1)
+        raise ValueError(f"key {key[:60]!r} is there twice")
     return out
 
 

@@ -1,6 +1,6 @@
-"""Reading files: regular ones, of a size that they may have, and the range of numbers in them.
+"""Reading regular files up to a maximum size, and limits of the numbers in them.
 
-Whatever lies outside of these limits is a slip or damage, and the error says what is wrong with it.
+Values outside of these limits are mistakes or damage; errors say which.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MAX_TEXT_BYTES = 64_000_000
 MAX_BINARY_BYTES = 1_000_000_000
 """An image of 160 megapixels in 16 bits, a cloud of ten million points."""
 MAX_NAME_BYTES, MAX_PATH_BYTES = 255, 4095
-"""What file systems take of one name, and the system of a whole path."""
+"""Limits of file systems for a name, and of the system for a path."""
 MAX_NUMBER = 1e9
 """A thousand kilometres in mm."""
 MIN_POSITIVE = 1e-9
@@ -29,13 +29,12 @@ MIN_POSITIVE = 1e-9
 
 
 def is_file_or_lost_link(path: Path) -> bool:
-    """Say whether a folder's entry is a file, or a link to one that is not there: what reads it says so."""
+    """Return whether a folder's entry is a file or a broken link, which its reader reports."""
     return path.is_file() or (path.is_symlink() and not path.exists())
 
 
 def usable_path(path: str | Path) -> Path:
-    """Return the path; raises InputError where no system could open it: a NUL character, names too long, links that
-    lead to each other."""
+    """Return the path; raises InputError for a NUL character, names that are too long, and circular links."""
     text = str(path)
     shown = ascii(text if len(text) < 80 else text[:80] + "...")
     if "\0" in text:
@@ -44,20 +43,20 @@ def usable_path(path: str | Path) -> Path:
     if max(names, default=0) > MAX_NAME_BYTES or len(os.fsencode(text)) > MAX_PATH_BYTES:
         raise InputError(f"{shown}: a name is longer than {MAX_NAME_BYTES} bytes; give a shorter path")
     try:
-        Path(text).resolve(strict=True)  # from Python 3.13 on, only this meets links in a circle
+        Path(text).resolve(strict=True)  # from Python 3.13 on, only this detects circular links
     except (FileNotFoundError, NotADirectoryError, PermissionError):
-        pass  # for those who read or write it to say
+        pass  # reading or writing reports these
     except (RuntimeError, OSError) as error:
         raise InputError(f"{shown} cannot be followed: its links lead to each other; correct the path") from error
     return Path(text)
 
 
 ARCHIVES = {b"PK\x03\x04": "a ZIP archive", b"\x1f\x8b": "a gzip archive", b"7z\xbc\xaf\x27\x1c": "a 7-Zip archive"}
-"""What files of others come packed in, by their first bytes."""
+"""Archives by their first bytes."""
 
 
 def refuse_archive(data: bytes, name: str) -> None:
-    """Raise InputError where a file that begins with `data` is packed; `name` is said of it."""
+    """Raise InputError, which begins with `name`, if `data` is an archive."""
     packed = next((words for start, words in ARCHIVES.items() if data.startswith(start)), None)
     if packed is not None:
         raise InputError(f"{name} is {packed}; unpack it, and give what is in it")
@@ -66,7 +65,7 @@ def refuse_archive(data: bytes, name: str) -> None:
 def read_bytes(path: str | Path, what: str = "", *, max_bytes: int = MAX_BINARY_BYTES) -> bytes:
     """Return the content of a regular file.
 
-    `what` the file is comes before its name in the InputError for one that is not there, cannot be read, is a folder, a
+    Raises InputError, which begins with `what` and the name, if the file does not exist, cannot be read, is a folder, a
     pipe or a device, or has more than `max_bytes`.
     """
     source = usable_path(path)
@@ -89,9 +88,9 @@ def read_bytes(path: str | Path, what: str = "", *, max_bytes: int = MAX_BINARY_
 
 
 def read_text(path: str | Path, what: str = "", *, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """Return the text of a UTF-8 file, without the byte order mark that spreadsheets and editors may put in front.
+    """Return the text of a UTF-8 file, without a byte order mark and with \\n as the line ending.
 
-    Raises InputError as `read_bytes` does, and for what is no text, an archive by that name.
+    Raises InputError as `read_bytes`, and for files that are not UTF-8; archives are named as such.
     """
     data = read_bytes(path, what, max_bytes=max_bytes)
     try:
@@ -105,9 +104,9 @@ def read_text(path: str | Path, what: str = "", *, max_bytes: int = MAX_TEXT_BYT
 
 
 def csv_rows(path: str | Path, what: str = "", *, delimiter: str = ",") -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and cells of the rows of a CSV file that are not empty.
+    """Yield (line number, cells) of the non-empty rows of a CSV file.
 
-    Raises InputError as `read_text` does, and for a line that is none of a table.
+    Raises InputError as `read_text`, and for a malformed line.
     """
     reader = csv.reader(io.StringIO(read_text(path, what)), delimiter=delimiter)
     try:
@@ -121,10 +120,10 @@ def csv_rows(path: str | Path, what: str = "", *, delimiter: str = ",") -> Itera
 def csv_table(
     path: str | Path, what: str = "", *, delimiter: str = ","
 ) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
-    """Return the head of a CSV file and its rows, each with its line number, cells by column and without blanks around;
-    empty rows and those that begin with # are left out.
+    """Return the column names of a CSV file, and its rows as (line number, cells by column); cells are stripped.
 
-    Raises InputError as `csv_rows` does, and for a row that has not as many cells as the head.
+    Empty rows and rows that begin with # are skipped. Raises InputError as `csv_rows`, and for a row whose length
+    differs from the head's.
     """
     head: list[str] = []
     rows = []
@@ -146,7 +145,7 @@ def csv_table(
 
 @contextmanager
 def about(*paths: str | Path) -> Iterator[None]:
-    """Let errors of the block, which is about these files, name them."""
+    """Prefix the errors of the block with the names of these files, unless they name one already."""
     try:
         yield
     except RigkitError as error:
@@ -156,17 +155,16 @@ def about(*paths: str | Path) -> Iterator[None]:
 
 
 def damage(error: Exception) -> str:
-    """Return what is wrong with a file in one line, of a reader's error that may quote much of it."""
+    """Return a parser's error on one line of at most 200 characters."""
     return " ".join(str(error).split())[:200]
 
 
 def _named(path: str | Path, what: str) -> str:
-    """Return what the file is and its name."""
     return f"{what} '{path}'" if what else f"'{path}'"
 
 
 def fault_of_number(value: object, *, positive: bool = True) -> str | None:
-    """Return what is wrong with a number of a file, in words that follow its name and "must be"; None if nothing is."""
+    """Return what a number of a file must be, in words that follow "must be"; None if it is valid."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return "a number"
     if isinstance(value, float) and not math.isfinite(value):
@@ -181,7 +179,7 @@ def fault_of_number(value: object, *, positive: bool = True) -> str | None:
 
 
 def is_number(text: str) -> bool:
-    """Say whether words are a number."""
+    """Return whether a text is a number."""
     try:
         float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Pieces of JSON Schemas (draft 2020-12): objects with every key described, arrays, tables of dataclasses."""
+"""Builders of JSON Schemas (draft 2020-12): objects with described keys, arrays, schemas of dataclasses."""
 
 from __future__ import annotations
 
@@ -17,49 +17,49 @@ POSITIVE: Schema = {"type": "number", "exclusiveMinimum": 0}
 INTEGER: Schema = {"type": "integer", "minimum": 0}
 BOOLEAN: Schema = {"type": "boolean"}
 NAME: Schema = {"type": "string", "format": "identifier"}
-"""What something is called: see `rigkit.core.identifiers`."""
+"""A name: see `rigkit.core.identifiers`."""
 COUNT: Schema = {"type": "integer", "minimum": 1}
 PLAIN_KINDS: Mapping[type, Schema] = {str: TEXT, float: NUMBER, int: INTEGER, bool: BOOLEAN}
 
 
 def described(schema: Schema, words: str, *examples: object) -> Schema:
-    """Return the schema with its meaning and, for people who write it, an example."""
+    """Return the schema with a description and examples."""
     return {**schema, "description": words, **({"examples": list(examples)} if examples else {})}
 
 
 def choice(*values: str) -> Schema:
-    """Return the schema of one of some words."""
+    """Return the schema of a string that is one of `values`."""
     return {"enum": list(values)}
 
 
 def nullable(schema: Schema) -> Schema:
-    """Return the schema of that, or null where there is none."""
+    """Return the schema of a value that may be null."""
     return {ANY_OF: [schema, {"type": "null"}]}
 
 
 def array(items: Schema, min_items: int = 0) -> Schema:
-    """Return the schema of a list of at least so many."""
+    """Return the schema of a list of at least `min_items`."""
     return {"type": "array", "items": items, **({"minItems": min_items} if min_items else {})}
 
 
 def texts(min_items: int = 0, items: Schema = TEXT) -> Schema:
-    """Return the schema of a list of at least so many words, all different."""
+    """Return the schema of a list of at least `min_items` different strings."""
     return {**array(items, min_items), "uniqueItems": True}
 
 
 def row(length: int, items: Schema = NUMBER) -> Schema:
-    """Return the schema of a list of exactly so many."""
+    """Return the schema of a list of exactly `length` items."""
     return {"type": "array", "items": items, "minItems": length, "maxItems": length}
 
 
 def matrix(rows: int | None = None, columns: int | None = None) -> Schema:
-    """Return the schema of a matrix, row by row; None: of any number."""
+    """Return the schema of a matrix as a list of rows; None: any number of rows or columns."""
     inner = array(NUMBER) if columns is None else row(columns)
     return array(inner) if rows is None else row(rows, inner)
 
 
 def obj(keys: Mapping[str, Schema], words: str = "") -> Schema:
-    """Return the schema of an object with these keys and no others; a key that may be missing ends with "?"."""
+    """Return the schema of an object with exactly these keys; names of optional keys end with "?"."""
     properties = {key.removesuffix("?"): schema for key, schema in keys.items()}
     required = [key for key in keys if not key.endswith("?")]
     out: Schema = {"type": "object", "properties": properties, "additionalProperties": False}
@@ -69,30 +69,32 @@ def obj(keys: Mapping[str, Schema], words: str = "") -> Schema:
 
 
 def optional(keys: Mapping[str, Schema], *names: str) -> dict[str, Schema]:
-    """Return the keys as those of an object that may lack the ones named, or any where none is named."""
+    """Return the keys with those named, or all if none is named, marked as optional."""
     return {f"{key.removesuffix('?')}?" if not names or key in names else key: schema for key, schema in keys.items()}
 
 
 def rows(keys: Mapping[str, Schema], words: str = "", *, min_items: int = 0) -> Schema:
-    """Return the schema of a list of at least so many objects."""
+    """Return the schema of a list of at least `min_items` objects."""
     out = array(obj(keys), min_items)
     return described(out, words) if words else out
 
 
 def table(values: Schema) -> Schema:
-    """Return the schema of an object whose keys are names that somebody chose."""
+    """Return the schema of an object with arbitrary keys."""
     return {"type": "object", "additionalProperties": values}
 
 
 def file(schema: str, title: str, keys: Mapping[str, Schema]) -> Schema:
-    """Return the schema of a whole file, which says itself which one it is."""
+    """Return the schema of a whole file, whose key "schema" has this value."""
     own = obj({"schema": {"const": schema}, **keys})
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, **own}
 
 
 def of_dataclass(cls: type, *, only: Sequence[str] = (), without: Sequence[str] = ()) -> Schema:
-    """Return the schema of a result as `asdict` gives it: its fields, with what its docstring says of them. Numbers may
-    be null, which is what files have for NaN."""
+    """Return the schema of a dataclass as `asdict` gives it, with descriptions from its docstring.
+
+    Numbers may be null, which stands for NaN in files.
+    """
     hints, words = get_type_hints(cls), _attributes(cls)
     properties = {}
     for field in dataclasses.fields(cls):
@@ -114,7 +116,7 @@ def _of_type(hint: Any) -> Schema:
 
 
 def _attributes(cls: type) -> dict[str, str]:
-    """Return what the docstring of a class says of each field under "Attributes"."""
+    """Return the descriptions of the fields in the docstring's section "Attributes"."""
     lines = cleandoc(cls.__doc__ or "").partition("----------")[2].splitlines()
     out: dict[str, str] = {}
     names: list[str] = []

@@ -1,7 +1,7 @@
-"""A strict reader for the TOML files that people write: the schema of a file is its reader.
+"""A strict reader for the TOML files that people write, driven by their JSON Schemas.
 
-A key that the schema does not have is an error, so a misspelt option cannot be silently ignored. Every message names
-the file, the table and the key, and says what to write.
+An unknown key is an error, so that a misspelt option is not ignored. Every message names the file, the table and the
+key, and says what to write.
 """
 
 from __future__ import annotations
@@ -31,16 +31,15 @@ COUNTED = ("no", "one", "two", "three")
 
 
 def named_path(path: Path) -> Path:
-    """Return the absolute path of a file under its own name: that of a link, not of what it leads to.
+    """Return the absolute path of a file; a link at its end is not resolved.
 
-    Frames, views and reports go by names of images; a store of data (git-annex, DVC) links them to checksums.
+    Images are assigned to frames by their names; data stores (git-annex, DVC) link these names to checksums.
     """
     return path.parent.resolve() / path.name
 
 
 def relative_path(path: Path, folder: Path) -> str:
-    """Return a path as a file in `folder` names it: from there, under its own name (`named_path`), whole where it is on
-    another drive."""
+    """Return a path relative to `folder`, as `named_path`; absolute if it is on another drive."""
     try:
         return Path(os.path.relpath(named_path(path), folder.resolve())).as_posix()
     except ValueError:
@@ -48,7 +47,7 @@ def relative_path(path: Path, folder: Path) -> str:
 
 
 def toml_text(value: object) -> str:
-    """Return a value as TOML writes it; raises InputError for words that UTF-8 cannot hold."""
+    """Return a value as TOML; raises InputError for text that UTF-8 cannot encode."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {toml_text(one)}" for key, one in value.items()) + " }"
     if isinstance(value, list | tuple):
@@ -62,14 +61,14 @@ def toml_text(value: object) -> str:
 
 
 class TomlTable(Mapping[str, Any]):
-    """One table of a file, which fits its schema: tables in it are `TomlTable`, lists tuples, numbers floats.
+    """A validated table of a file: tables in it are `TomlTable`, lists are tuples, numbers floats.
 
-    `table[key]` is an error that says what to add where the key is missing, `table.get(key)` is not. `where` says which
-    table it is, in the words of the file: "[[pairs]] 'fisheye-forward'".
+    `table[key]` of a missing key raises InputError that says what to add. `where` names the table in messages, such as
+    "[[pairs]] 'fisheye-forward'".
     """
 
     def __init__(self, values: Mapping[str, Any], schema: Schema, path: Path, where: str = "") -> None:
-        """Raise InputError for values that the schema does not have."""
+        """Raise InputError for values that do not fit the schema."""
         self._schema, self.path, self.where = schema, path, where
         self._values: dict[str, Any] = {}
         known, others = schema.get("properties", {}), schema.get("additionalProperties", True)
@@ -95,7 +94,7 @@ class TomlTable(Mapping[str, Any]):
         return len(self._values)
 
     def get(self, key: str, default: Any = None) -> Any:
-        """Return the value; `default` where there is none."""
+        """Return the value, or `default`."""
         return self._values.get(key, default)
 
     def error(self, message: str) -> InputError:
@@ -105,8 +104,8 @@ class TomlTable(Mapping[str, Any]):
 
     @contextmanager
     def located(self, remedy: str = "") -> Iterator[None]:
-        """Let complaints of the block start with the file and the table, and end with a remedy, unless they name the
-        file already."""
+        """Prefix an InputError of the block with the file and the table, and append `remedy`, unless it names the file
+        already."""
         try:
             yield
         except InputError as error:
@@ -121,10 +120,10 @@ class TomlTable(Mapping[str, Any]):
                 raise self.error(f"unknown key {_shown(key)}; {remedy}")
 
     def beside(self, name: str) -> Path:
-        """Return the absolute path of `name`, taken from the folder of the file, as both are written."""
+        """Return the absolute path of `name`, relative to the folder of the file; links are not resolved."""
         with self.located():
             path = usable_path(self.path.parent / name)
-            # Without links: a folder's ".." is where the link leads to.
+            # abspath is wrong for ".." after a link to a folder.
             written = Path(os.path.abspath(path))
             return written if written.resolve() == path.resolve() else named_path(path)
 
@@ -134,7 +133,7 @@ class TomlTable(Mapping[str, Any]):
                 raise self.error(f"'{key}' is missing; add {_hint(key, self._schema['properties'].get(key, {}))}")
 
     def _checked(self, key: str, value: Any, schema: Schema) -> Any:
-        """Return a value as the schema has it; raises InputError for one that it does not have."""
+        """Return a value converted as the schema has it; raises InputError if it does not fit."""
         if ANY_OF in schema:
             is_list = isinstance(value, list)
             return self._checked(key, value, next(s for s in _choices(schema) if (s["type"] == "array") == is_list))
@@ -173,13 +172,13 @@ class TomlTable(Mapping[str, Any]):
 
 
 def _choices(schema: Schema, key: str = ANY_OF) -> list[Schema]:
-    """Return the schemas that a schema is one of, or that of its items, with its own description and examples."""
+    """Return the alternatives of a schema, or the schema of its items, with its description and examples."""
     own = {name: value for name, value in schema.items() if name in ("description", "examples")}
     return [{**own, **one} for one in (schema[key] if key == ANY_OF else [schema[key]])]
 
 
 def _fault(value: Any, kind: str, schema: Schema) -> str | None:
-    """Return what a value of a kind must be, in words that follow "must"; None where it is that."""
+    """Return what a value must be, in words that follow "must"; None if it is valid."""
     if kind == "string":
         return None if isinstance(value, str) and value.strip() else "be a string"
     if kind == "boolean":
@@ -205,7 +204,7 @@ def _fault(value: Any, kind: str, schema: Schema) -> str | None:
 
 
 def _hint(key: str, schema: Schema) -> str:
-    """Return what a person may write, as the file has it, and what it means."""
+    """Return an example of a key as the file has it, with its meaning."""
     if "enum" in schema:
         return f'{key} = "{schema["enum"][0]}" ({", ".join(schema["enum"])})'
     words = schema.get("description", "")
@@ -216,7 +215,7 @@ def _hint(key: str, schema: Schema) -> str:
 
 
 def _shown(value: object) -> str:
-    """Return the value on one line, cut where it is long."""
+    """Return a value on one line, truncated to MAX_SHOWN characters."""
     try:
         text = ascii(value)
     except (ValueError, RecursionError):
@@ -229,10 +228,9 @@ def _is_word(value: object) -> bool:
 
 
 def read_toml(path: str | Path, schema: Schema) -> TomlTable:
-    """Return the file's outermost table, which fits the `schema` of a whole file.
+    """Return the outermost table of a file, validated by its `schema`.
 
-    Raises InputError: no such file, not TOML (with the line), no schema, another schema or another version, values of
-    another kind.
+    Raises InputError: no such file, not TOML (with the line), another schema or version, or invalid values.
     """
     source, wanted = Path(path), schema["properties"]["schema"]["const"]
     text = read_text(source, max_bytes=MAX_TOML_BYTES)

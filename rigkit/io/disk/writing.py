@@ -1,4 +1,4 @@
-"""Writing files whole or not at all, and never over something that is already there unless told to."""
+"""Atomic writing of files; existing files are only replaced with `force`."""
 
 from __future__ import annotations
 
@@ -17,18 +17,16 @@ from rigkit.core.errors import InputError
 from rigkit.io.disk.reading import usable_path
 
 FORCE = "use --force (force=True in Python)"
-"""What replaces files."""
+"""Part of messages about existing files."""
 
 
 def ensure_writable(
     paths: str | Path | Iterable[str | Path | None] | None, *, force: bool = False, inputs: Iterable[str | Path] = ()
 ) -> None:
-    """Raise InputError if one of `paths` (None: not asked for) could not be written: call it before work that takes
-    long.
+    """Raise InputError if one of `paths` (None is ignored) cannot be written; to be called before long work.
 
-    A path that exists is refused without `force`; so is a folder in its place, and a parent that is a file. With force
-    too, no file is written over one of `inputs`, which the work reads, nor two to the same path, nor over a pipe or a
-    device.
+    Refused are existing files without `force`, folders, parents that are files or without permission, and even with
+    `force` the files `inputs`, two results of the same path, pipes and devices.
     """
     asked = [p for p in ([paths] if paths is None or isinstance(paths, str | Path) else paths) if p is not None]
     read = {usable_path(path).resolve() for path in inputs} if asked else set()
@@ -45,19 +43,19 @@ def ensure_writable(
             raise InputError(f"cannot write '{target}': a folder of that name exists; give another name")
         if target.exists() and not target.is_file():
             raise InputError(f"cannot write '{target}': it is a pipe or a device; give the name of a file")
-        # A link to nothing is somebody's too.
+        # A broken link counts as an existing file.
         if (target.exists() or target.is_symlink()) and not force:
             raise InputError(f"'{target}' exists and is left as it is; {FORCE} to replace it, or another name")
         _ensure_place(target, target.absolute().parent)
 
 
 def ensure_folder_writable(folder: str | Path) -> None:
-    """Raise InputError if files could not be written into `folder`, which need not exist yet."""
+    """Raise InputError if files cannot be written into `folder`, which need not exist yet."""
     _ensure_place(Path(folder), usable_path(folder).absolute())
 
 
 def _ensure_place(target: Path, folder: Path) -> None:
-    """Raise InputError where `target` could not be written because of `folder`, or of the folder to make that in."""
+    """Raise InputError if `folder` or its first existing parent does not permit writing `target`."""
     place = next(p for p in (folder, *folder.parents) if p.exists())
     if not place.is_dir():
         raise InputError(f"cannot write '{target}': '{place}' is a file, not a folder; give another name")
@@ -66,21 +64,21 @@ def _ensure_place(target: Path, folder: Path) -> None:
 
 
 def write_atomic(path: str | Path, data: str | bytes, *, force: bool = False) -> None:
-    """Write `data` (text as UTF-8) to `path` so that a reader sees the old file or the whole new one.
+    """Write `data` (text as UTF-8) to `path` atomically: a reader sees the old file or the complete new one.
 
     A temporary file in the same folder is flushed to the disk and renamed. Missing folders are made.
 
-    Raises InputError: the file exists and `force` is not set, or it cannot be written (permission, full disk); what was
-    there before is still there.
+    Raises InputError: the file exists and `force` is not set, or it cannot be written (permission, full disk); an old
+    file is unchanged then.
     """
     write_together({Path(path): data}, force=force)
 
 
 def write_together(files: Mapping[Path, str | bytes], *, force: bool = False) -> None:
-    """Write all `files` (path -> content) or none: none takes its name before all are on the disk.
+    """Write all `files` (path -> content) or none: they are renamed after all are on the disk.
 
-    Raises InputError as `write_atomic` does; what was there before is still there then, and no new folder is left. Only
-    where files are replaced and the system refuses a later one its name are those before it new; the message says so.
+    Raises InputError as `write_atomic`; old files are unchanged then, and no new folder is left. Only if a rename fails
+    after others have replaced files do those stay replaced; the message says so.
     """
     ensure_writable(files, force=force)
     made: list[Path] = []
@@ -94,7 +92,7 @@ def write_together(files: Mapping[Path, str | bytes], *, force: bool = False) ->
                 made.append(folder)
             handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
             staged[target] = Path(name)
-            # Names of files may have bytes that are no UTF-8.
+            # The text may name files whose names are not UTF-8.
             _fill(handle, data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
             # mkstemp makes files that only the owner may read; a result should have the permissions of any new file.
             staged[target].chmod(0o666 & ~_umask())
@@ -102,7 +100,7 @@ def write_together(files: Mapping[Path, str | bytes], *, force: bool = False) ->
             if force:
                 temporary.replace(target)
             else:
-                # A hard link fails if somebody made the file meanwhile, where a rename would silently replace it.
+                # If the file was created meanwhile, a hard link fails; a rename would replace it.
                 _link_new(temporary, target)
             renamed.append(target)
     except BaseException as error:
@@ -118,7 +116,7 @@ def write_together(files: Mapping[Path, str | bytes], *, force: bool = False) ->
         for temporary in staged.values():
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
-        # Those with files in them stay.
+        # Folders with files are not removed.
         for folder in reversed(made):
             with suppress(OSError):
                 folder.rmdir()

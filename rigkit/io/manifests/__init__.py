@@ -1,1 +1,1 @@
-"""What a person writes: sessions, data sets, studies, and what was measured."""
+"""Files that people write: sessions, data sets, studies, and measured truth."""

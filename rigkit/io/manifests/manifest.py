@@ -1,4 +1,4 @@
-"""Data sets: which images were taken with which cameras of which boards, and what a person measured."""
+"""Manifests of data sets: pairs of images with their cameras and boards, and measured truth."""
 
 from __future__ import annotations
 
@@ -119,9 +119,9 @@ class CameraEntry:
 
     Attributes
     ----------
-    camera_id : its name in the manifest.
-    calibration : the calibration file; need not exist yet if there is a session.
-    session : the session file to calibrate from, or None.
+    camera_id : name in the manifest.
+    calibration : calibration file; need not exist if there is a session.
+    session : session file to calibrate from, or None.
     """
 
     camera_id: str
@@ -135,16 +135,16 @@ class Pair:
 
     Attributes
     ----------
-    pair_id : its name.
-    camera1, camera2 : names of cameras; the same name where one camera was moved.
-    image1, image2 : files.
+    pair_id : name of the pair.
+    camera1, camera2 : cameras; the same one if one camera was moved.
+    image1, image2 : image files.
     pose_type : as declared; AUTO lets the data decide.
-    level_sigma_deg : how well the spirit level held: a soft prior; 0: exactly; None: as a carefully set one does.
-    boards : the boards that stand there.
-    truth : what a person measured.
-    layout : board id -> "left", "right", "floor", "ceiling" or "back", as seen from camera 1; empty where not stated.
-    planes : what is known of a board's points, see `Planes`.
-    down : which way is down in the frames of camera 1 and 2, for planar motion of cameras that are not level; or None.
+    level_sigma_deg : standard deviation of the levelling, a prior; 0: exactly level; None: that of careful levelling.
+    boards : boards in the images.
+    truth : measured truth.
+    layout : board id -> "left", "right", "floor", "ceiling" or "back", as seen from camera 1; may be empty.
+    planes : constraint on a board's points, see `Planes`.
+    down : direction of gravity in the frames of cameras 1 and 2, for planar motion of tilted cameras, or None.
     """
 
     pair_id: str
@@ -165,7 +165,7 @@ class Pair:
         return tuple(board.board_id for board in self.boards)
 
     def require_images(self) -> None:
-        """Raise InputError if an image is not there: worth knowing before the work starts."""
+        """Raise InputError if an image file does not exist."""
         for number, path in ((1, self.image1), (2, self.image2)):
             if not path.is_file():
                 what = "is a folder" if path.is_dir() else "does not exist"
@@ -174,12 +174,12 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dataset:
-    """A manifest as it was read, with absolute paths.
+    """The content of a manifest, with absolute paths.
 
     Attributes
     ----------
-    sources : the files of boards and of truth that the manifest names.
-    images : "real" or "rendered"; None where the manifest does not say.
+    sources : files of boards and truth that the manifest names.
+    images : "real" or "rendered"; None if not stated.
     """
 
     name: str
@@ -195,7 +195,7 @@ class Dataset:
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """The files that work on this data set may read, which no result may be written over."""
+        """All files that work on this data set may read; results must not replace them."""
         images = (image for pair in self.pairs for image in (pair.image1, pair.image2))
         calibrations = (camera.calibration for camera in self.cameras if camera.calibration.is_file())
         sessions = (camera.session for camera in self.cameras if camera.session is not None)
@@ -204,7 +204,7 @@ class Dataset:
 
     @property
     def used_cameras(self) -> frozenset[str]:
-        """The ids of the cameras that a pair was taken with."""
+        """Ids of the cameras that pairs use."""
         return frozenset(e.camera_id for pair in self.pairs for e in (pair.camera1, pair.camera2))
 
     def pair(self, pair_id: str) -> Pair:
@@ -216,16 +216,16 @@ class Dataset:
         return _named(camera_id, {c.camera_id: c for c in self.cameras}, f"{self.manifest}: camera")
 
     def select(self, pair_ids: Iterable[str]) -> Dataset:
-        """Return the data set with only these pairs, in the order of the manifest; all of them where none is named."""
+        """Return the data set with these pairs only, in the order of the manifest; with all if none is named."""
         wanted = {self.pair(name).pair_id for name in pair_ids}
         return replace(self, pairs=tuple(p for p in self.pairs if p.pair_id in wanted)) if wanted else self
 
 
 def load_dataset(path: str | Path) -> Dataset:
-    """Read a manifest, given its folder or the file itself.
+    """Return the data set of a manifest, given its folder or file.
 
-    Raises InputError: no manifest, unknown keys, a missing fact (no square size, pose type or name has a default), a
-    reference to something that is not declared, two things of one name, a camera with neither calibration nor session.
+    Raises InputError: no manifest, an unknown or missing key, a reference to something undeclared, a duplicate id, or a
+    camera with neither calibration nor session.
     """
     given = usable_path(path)
     source = given / MANIFEST if given.is_dir() else given
@@ -258,7 +258,7 @@ def load_dataset(path: str | Path) -> Dataset:
 
 
 def _files_of(session: Path) -> tuple[Path, ...]:
-    """Return what a calibration from the session reads; of a damaged one itself: that is said where it is needed."""
+    """Return the files that a calibration from the session reads; only the session itself if it is damaged."""
     try:
         return files_of_session(session)
     except InputError:
@@ -319,7 +319,7 @@ def _pair(entry: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEnt
 def _level(
     level: TomlTable, pose_type: PoseType
 ) -> tuple[float | None, tuple[tuple[float, ...], tuple[float, ...]] | None]:
-    """Return how well the level held, and which way is down in either camera where that was said."""
+    """Return the standard deviation of the level, and the direction of gravity in both cameras if stated."""
     if "down1" not in level:
         return level["sigma_deg"], None
     if pose_type is not PoseType.PLANAR:
@@ -331,7 +331,7 @@ def _level(
 
 
 def _with_table(top: TomlTable, pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
-    """Add what a spreadsheet says to the pairs; a pair's truth is either there or in the manifest."""
+    """Return the pairs with the truth of the spreadsheet; a pair's truth must not be in both."""
     source = top.beside(top["truth_table"])
     stated = load_truth_csv(source, {pair.pair_id: pair.boards for pair in pairs})
     for pair in pairs:

@@ -1,4 +1,4 @@
-"""A first manifest from a folder of images: what the images tell is filled in, what only a person knows is given."""
+"""Writer of a new manifest: pairs and boards found in images, and what a person states."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from rigkit.core.errors import InputError
 from rigkit.io.boards.board_file import board_values
 from rigkit.io.disk.toml_reader import relative_path, toml_text
 from rigkit.io.manifests.manifest import DATASET_SCHEMA
-from rigkit.io.media.images import IMAGE_ENDINGS
+from rigkit.io.media.images import IMAGE_ENDINGS, images_below
 
 SIDES = (
     (re.compile(r"(left|_l|-l|view1|cam1|_1|-1|a)$", re.IGNORECASE), 1),
     (re.compile(r"(right|_r|-r|view2|cam2|_2|-2|b)$", re.IGNORECASE), 2),
 )
-"""How people mark the two images of a pair at the end of a name."""
+"""Marks of the two images of a pair at the end of a name."""
 
 SIDES_FIRST = (
     (re.compile(r"^left(?=[ _-]|\d)", re.IGNORECASE), 1),
     (re.compile(r"^right(?=[ _-]|\d)", re.IGNORECASE), 2),
 )
-"""The same at the beginning: left01, right_p0."""
+"""Marks at the beginning of a name: left01, right_p0."""
 
 SIDE_FOLDERS = (
     (re.compile(r"(left|cam(era)?[_-]?0*1)$", re.IGNORECASE), 1),
     (re.compile(r"(right|cam(era)?[_-]?0*2)$", re.IGNORECASE), 2),
 )
-"""The same of a folder; mere numbers and letters are more often those of pairs."""
+"""Marks at the end of a folder's name; bare numbers and letters usually number pairs."""
 
 NUMBERED = re.compile(r"(.*\D)0*(\d+)")
 """A name that ends in a number."""
@@ -42,7 +42,7 @@ NUMBERED = re.compile(r"(.*\D)0*(\d+)")
 
 @dataclass(frozen=True, slots=True)
 class ImageBoards:
-    """What was found in one image: its size and the sizes of the complete boards."""
+    """The size of an image and of the complete boards found in it."""
 
     image: Path
     size_px: tuple[int, int]
@@ -51,13 +51,13 @@ class ImageBoards:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DeclaredBoard:
-    """A board that somebody declared: in a file, or in words that make its keys."""
+    """A declared board: in a `file`, or by its keys."""
 
     board: Board
     file: Path | None = None
 
     def lines(self, root: Path) -> list[str]:
-        """Return the board as it stands in a manifest in the folder `root`."""
+        """Return the lines of the board in a manifest in folder `root`."""
         named = ["[[boards]]", f"id = {toml_text(self.board.board_id)}"]
         if self.file is not None:
             return [*named, f"file = {toml_text(relative_path(self.file, root))}", ""]
@@ -67,7 +67,7 @@ class DeclaredBoard:
 
 @dataclass(frozen=True, slots=True)
 class FoundPair:
-    """Two images that look like a pair."""
+    """Two images that form a pair by their names or folders."""
 
     name: str
     first: ImageBoards
@@ -75,10 +75,10 @@ class FoundPair:
 
 
 def find_images(folder: Path) -> list[Path]:
-    """Return all images below `folder`, sorted; raises InputError where there are none, or a name is no text."""
+    """Return all images below `folder`, sorted; raises InputError if there are none, or a name is not UTF-8."""
     if not folder.is_dir():
         raise InputError(f"init: '{folder}' is not a folder; give the folder that holds the images")
-    images = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
+    images = images_below(folder)
     if not images:
         raise InputError(f"init: no images ({', '.join(IMAGE_ENDINGS)}) under '{folder}'")
     undecodable = [path for path in images if path.name != path.name.encode("utf-8", "ignore").decode()]
@@ -90,18 +90,17 @@ def find_images(folder: Path) -> list[Path]:
 
 
 def board_sizes(detections: Sequence[BoardDetection]) -> tuple[tuple[int, int], ...]:
-    """Return the sizes of boards that are complete, or known by name, wider than high: which way round a board hangs is
-    not a fact about it."""
+    """Return the sizes (larger, smaller) of boards that are complete or identified, the largest first."""
     whole = [d for d in detections if d.complete or d.board_id is not None]
     sizes = [(max(d.columns, d.rows), min(d.columns, d.rows)) for d in whole]
     return tuple(sorted(sizes, reverse=True))
 
 
 def group_pairs(shown: Sequence[ImageBoards], root: Path) -> list[FoundPair]:
-    """Return the pairs: images whose names differ only in how the two sides are marked, images of one name in two
-    folders that are marked so, number 1 and 2 where there are no others of the name, or the two of a folder.
+    """Return the pairs, sorted by name; images without a board are ignored.
 
-    Images that show no board are left out.
+    Pairs are images whose names differ in the mark of the side only, images of the same name in two marked folders,
+    NAME1 and NAME2 if there are no other numbers, or the only two images of a folder.
     """
     free = [s for s in shown if s.boards]
     pairs: list[FoundPair] = []
@@ -132,19 +131,19 @@ def group_pairs(shown: Sequence[ImageBoards], root: Path) -> list[FoundPair]:
 
 
 def _by_name(image: Path, root: Path) -> tuple[tuple[Path, str], int] | None:
-    """Return folder and name without the mark of the side, and that side (1 or 2); None where there is no mark."""
+    """Return (folder, name without the mark) and the side 1 or 2, by the end of the name; None without a mark."""
     found = _side(image.stem, SIDES)
     return None if found is None else ((image.parent, found[0]), found[1])
 
 
 def _by_first(image: Path, root: Path) -> tuple[tuple[Path, str], int] | None:
-    """Return the same where the mark comes first: of left_1 and right_1, not of left_1 and left_2."""
+    """Return the same by the beginning of the name: for left_1 and right_1, not for left_1 and left_2."""
     found = _side(image.stem, SIDES_FIRST)
     return None if found is None else ((image.parent, found[0]), found[1])
 
 
 def _by_folder(image: Path, root: Path) -> tuple[tuple[Path, str], int] | None:
-    """Return the same of an image in a folder that is marked: left/0001.png."""
+    """Return the same by the name of the folder: left/0001.png."""
     parent = image.parent
     found = None if parent == root else _side(parent.name, SIDE_FOLDERS)
     return None if found is None else ((parent.parent / found[0], image.stem), found[1])
@@ -160,18 +159,18 @@ def _side(name: str, marks: Sequence[tuple[re.Pattern[str], int]]) -> tuple[str,
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class NewManifest:
-    """What a manifest says.
+    """The content of a new manifest.
 
     Attributes
     ----------
-    name : of the data set.
-    pairs : at least one.
-    declared : the boards, or the side of a square of all chessboards that are found, mm, as a person measured it.
-    calibrations : camera -> path of its calibration file, absolute or from the folder of the manifest.
-    cameras : pair -> the cameras of its two images.
+    name : name of the data set.
+    pairs : one pair or more.
+    declared : the boards, or the measured side of a square of all chessboards found, mm.
+    calibrations : camera -> path of its calibration file, absolute or relative to the manifest's folder.
+    cameras : pair -> cameras of its two images.
     pose_types : pair -> pose type.
-    baselines : pair -> (mm, sigma mm), where measured.
-    angles : pair -> (deg, sigma deg) between every two boards, where measured.
+    baselines : pair -> measured (mm, sigma mm).
+    angles : pair -> measured (deg, sigma deg) between every two boards.
     """
 
     name: str
@@ -185,7 +184,7 @@ class NewManifest:
 
 
 def manifest_text(new: NewManifest, root: Path) -> str:
-    """Return the manifest as text, with what was found as comments; images are named relative to its folder `root`."""
+    """Return the text of the manifest in folder `root`, with what was found in images as comments."""
     pairs, declared = new.pairs, new.declared
     if not pairs:
         raise InputError(
@@ -237,15 +236,15 @@ def _pair_lines(
 def _truth_lines(
     baseline: tuple[float, float] | None, angle: tuple[float, float] | None, boards: Sequence[str]
 ) -> list[str]:
-    """Return what was measured of a pair; examples, as comments, of what was not."""
+    """Return the lines of a pair's measured truth; commented examples for what was not measured."""
     out = ["[pairs.truth]"]
     if baseline is not None:
         value, sigma = baseline
-        out.append(f'baseline = {{ value_mm = {value:g}, sigma_mm = {sigma:g}, how = "as told to rigkit init" }}')
+        out.append(f'baseline = {{ value_mm = {value:g}, sigma_mm = {sigma:g}, how = "as given to rigkit init" }}')
     else:
         out.append('# baseline = { value_mm = 300.0, sigma_mm = 2.0, how = "steel rule between tripod marks" }')
     if angle is not None and len(boards) > 1:
-        tail = f'value_deg = {angle[0]:g}, sigma_deg = {angle[1]:g}, how = "as told to rigkit init"'
+        tail = f'value_deg = {angle[0]:g}, sigma_deg = {angle[1]:g}, how = "as given to rigkit init"'
         rows = [f"    {{ a = {toml_text(a)}, b = {toml_text(b)}, {tail} }}," for a, b in combinations(boards, 2)]
         out += ["angles = [", *rows, "]"]
     else:

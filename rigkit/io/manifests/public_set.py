@@ -1,4 +1,4 @@
-"""Public captures with measured truth: what was measured and by what, licence, source, and each file's hash.
+"""Descriptions of public captures with measured truth: measurements, licence, source, and the files' hashes.
 
 ::
 
@@ -69,7 +69,7 @@ PUBLIC_FILE = file(
 
 @dataclass(frozen=True, slots=True)
 class PublicMeasurement:
-    """A quantity that somebody measured: `sigma` is None where nobody stated one; `how` says by what."""
+    """A measured quantity; `sigma` is None if not stated, `how` names the instrument."""
 
     what: str
     value: float
@@ -84,14 +84,14 @@ class PublicSet:
 
     Attributes
     ----------
-    path : the file that describes it.
-    name, about, source, licence : in words.
-    rendered : images of a computer, not of a camera.
-    folder : where its files are in a folder of captures.
-    boards : in its images.
-    measured : what is known of it.
-    sha256 : of each file, by its path in the set.
-    urls : of the files that can be fetched.
+    path : file of the description.
+    name, about, source, licence : texts.
+    rendered : whether the images are rendered, not real.
+    folder : folder of its files in the folder of captures.
+    boards : boards in its images.
+    measured : measured quantities.
+    sha256 : hash of each file by its path in the set.
+    urls : addresses of files that can be downloaded.
     """
 
     path: Path
@@ -107,7 +107,7 @@ class PublicSet:
     urls: Mapping[str, str]
 
     def measurement(self, what: str) -> PublicMeasurement:
-        """Return what was measured under this name; raises InputError that lists the names."""
+        """Return the measurement of this name; raises InputError that lists the known ones."""
         for measurement in self.measured:
             if measurement.what == what:
                 return measurement
@@ -116,8 +116,11 @@ class PublicSet:
 
 
 def load_public_set(path: str | Path) -> PublicSet:
-    """Return the description of a public capture; raises InputError for a missing or unknown key, a path that leaves
-    the set, something that is no hash or address, or an address of a file that is not listed."""
+    """Return the description of a public capture.
+
+    Raises InputError for a missing or unknown key, a path outside of the set, an invalid hash or address, or an address
+    of a file that is not listed.
+    """
     top = read_toml(path, PUBLIC_FILE)
     sha256, urls = ({_inside(top, f): value for f, value in top.get(key, {}).items()} for key in ("files", "urls"))
     for key, listed in (("files", sha256), ("urls", urls)):
@@ -141,7 +144,7 @@ def load_public_set(path: str | Path) -> PublicSet:
 
 
 def _inside(top: TomlTable, name: str) -> str:
-    """Return a path that stays in its folder."""
+    """Return the relative path `name`; raises InputError if it leaves its folder."""
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name:
         raise top.error(f"'{name}' leaves the folder of the set; give a path in it, with /")

@@ -21,12 +21,12 @@
     boards = ["left", "floor"]
     angles = [ { a = "left", b = "floor", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]
 
-Every key, with its meaning, stands in `rigkit.io.manifests.session.SESSION_FILE`. A session of one
-camera with [[rigid_boards]] has `images` as ever.
+`rigkit.io.manifests.session.SESSION_FILE` has every key with its meaning. A session of one camera with [[rigid_boards]]
+has `images`.
 
 Images of one moment have the same file name without its ending in every camera's folder (frames = "name"), the same
-number at the end of that name ("number": left07 and right07), or the same place in the sorted list ("order"). Where
-`frames` is not given, it is the first of name and number that any two cameras share.
+number at the end of that name ("number": left07 and right07), or the same place in the sorted list ("order"). By
+default it is the first of name and number that two cameras share.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ from rigkit.io.manifests.session import (
 from rigkit.io.manifests.truth_file import measured_value, truth_from_table
 
 ONE = "camera"
-"""What the only camera of a session without [[cameras]] is called."""
+"""Name of the camera of a session without [[cameras]]."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredBaseline:
-    """The distance between the centres of cameras `a` and `b` as a person measured it."""
+    """The measured distance between the centres of cameras `a` and `b`."""
 
     a: str
     b: str
@@ -68,7 +68,7 @@ class MeasuredBaseline:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RigidBoards:
-    """Boards mounted to each other: their ids, on which side those are that look alike, and what was measured."""
+    """Boards on one mount: their ids, the sides of those that look alike, and measured truth."""
 
     boards: tuple[str, ...]
     layout: Mapping[str, str]
@@ -77,17 +77,17 @@ class RigidBoards:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigSession:
-    """What to calibrate together.
+    """The session of a rig.
 
     Attributes
     ----------
-    path : the session file.
-    cameras : one session a camera, by its name, in the order of the file; the first is the rig's frame.
-    frames : "name", "number" or "order"; None to choose.
-    baselines : what was measured between cameras.
-    rigid_boards : what is mounted to each other.
-    lenses : by camera, the file of a lens that stays as it is.
-    known_rig : the file of a rig of which the cameras stay as they are, lens and mount; None: of none.
+    path : session file.
+    cameras : session of each camera by name, in the order of the file; the first defines the rig's frame.
+    frames : "name", "number" or "order"; None: chosen automatically.
+    baselines : measured distances between cameras.
+    rigid_boards : groups of boards on one mount.
+    lenses : files of fixed lenses by camera.
+    known_rig : file of a rig whose lenses and poses are fixed, or None.
     """
 
     path: Path
@@ -102,12 +102,12 @@ class RigSession:
 
     @property
     def rig_path(self) -> Path:
-        """Where the result goes, beside the session: that of one camera is a calibration like any other."""
+        """Default path of the result: a rig file, or the calibration of a single camera."""
         return beside_session(self.path, "rig.json" if len(self.cameras) > 1 else "calibration.json")
 
 
 def is_rig_session(path: str | Path) -> bool:
-    """Say whether the session has several cameras or boards on one mount; raises InputError like `load_session`."""
+    """Return whether a session has several cameras or boards on one mount; raises InputError as `load_session`."""
     table = read_toml(path, SESSION_FILE)
     return "cameras" in table or "rigid_boards" in table
 
@@ -115,8 +115,8 @@ def is_rig_session(path: str | Path) -> bool:
 def load_rig_session(path: str | Path) -> RigSession:
     """Return the session of a rig.
 
-    Raises InputError for a missing file or board, an unknown key, one camera only or two of one name, a baseline
-    between cameras that are not there, and boards on a mount that are not listed or are on two.
+    Raises InputError for a missing file or board, an unknown key, a single camera or two of one name, a baseline
+    between unknown cameras, and a board on a mount that is not listed or is on two mounts.
     """
     source = Path(path)
     table = read_toml(source, SESSION_FILE)
@@ -177,9 +177,9 @@ def _baseline(entry: TomlTable, names: Sequence[str]) -> MeasuredBaseline:
 
 
 def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None) -> dict[str, dict[str, str]]:
-    """Return camera -> image -> frame: images of one moment have the same frame.
+    """Return camera -> image -> frame; images of one moment have the same frame.
 
-    Raises InputError: two images of a camera would be of one frame, the numbers of images differ ("order"), or no two
+    Raises InputError: two images of a camera have the same frame, the numbers of images differ ("order"), or no two
     cameras share a frame.
 
     Parameters
@@ -221,7 +221,7 @@ FRAME_KEYS: dict[str, Callable[[str], str]] = {
 
 
 def _twice(frames: Mapping[str, Mapping[str, str]]) -> str | None:
-    """Return two images of one camera that have the same frame, in words."""
+    """Return two images of one camera with the same frame, in words, or None."""
     for name, own in frames.items():
         seen: dict[str, str] = {}
         for image, frame in own.items():

@@ -1,4 +1,4 @@
-"""Poses of a robot's hand as CSV: base_from_hand, one row an image, or one a moment.
+"""Poses of a robot's hand (base_from_hand) as CSV, one row for each image or moment.
 
 ::
 
@@ -6,8 +6,8 @@
     0001.png,412.1,-88.0,630.5,0.01,0.99,0.02,0.1
 
 Lengths may be x_m, y_m, z_m instead; a rotation vector rx_rad, ry_rad, rz_rad (or rx_deg, ...) instead of the
-quaternion. Motion capture has a column timestamp_ns instead of image: images are then named by their moments
-(1606153907495166540.png), and have the pose between the two rows around it.
+quaternion. Motion capture has a column timestamp_ns instead of image: images are then named by their timestamps
+(1606153907495166540.png), and their poses are interpolated.
 """
 
 from __future__ import annotations
@@ -26,17 +26,16 @@ LENGTHS = {"mm": 1.0, "m": 1000.0}
 TURNS = {"rad": 1.0, "deg": np.pi / 180.0}
 QUATERNION = ("qx", "qy", "qz", "qw")
 MAX_GAP_NS = 200_000_000
-"""Between poses further apart in time than this a hand may have gone anywhere."""
+"""Maximum time between poses to interpolate."""
 UNIT_TOLERANCE = 0.01
-"""Quaternions are written with three digits at least."""
+"""Tolerance of a quaternion's length: files have three digits or more."""
 
 
 def read_robot_poses(path: str | Path, images: Sequence[str] = ()) -> dict[str, Rigid3]:
-    """Return base_from_hand by name of the image; from a table of moments, those of the `images` alone.
+    """Return base_from_hand by image name; from a table of timestamps, those of the `images`.
 
-    Raises InputError that names the line for columns that are missing, values that are no numbers, a quaternion that is
-    not of length one, and an image that is there twice; and where an image is of no moment, or of one without poses
-    around it.
+    Raises InputError, with the line, for missing columns, invalid numbers, a quaternion that is not of unit length, and
+    a duplicate image; also for an image whose name is no timestamp, or whose timestamp is not between two close rows.
     """
     source = Path(path)
     head, rows = csv_table(source, "robot poses")
@@ -71,7 +70,7 @@ def read_robot_poses(path: str | Path, images: Sequence[str] = ()) -> dict[str, 
 
 
 def _between(source: Path, poses: Mapping[str, Rigid3], images: Sequence[str]) -> dict[str, Rigid3]:
-    """Return the poses at the moments that images are named by."""
+    """Return the poses interpolated at the timestamps that images are named by."""
     try:
         times = np.array([int(time) for time in poses], dtype=np.int64)
     except (ValueError, OverflowError) as error:
@@ -81,7 +80,7 @@ def _between(source: Path, poses: Mapping[str, Rigid3], images: Sequence[str]) -
     out = {}
     for image in images:
         stem = Path(image).stem
-        if not (stem.isascii() and stem.isdigit() and len(stem) <= 18 + 1):
+        if not (stem.isascii() and stem.isdigit() and len(stem) <= 19):
             raise InputError(f"'{source}': image '{image}' is not named by its moment, in ns; give a column image")
         k = int(np.clip(np.searchsorted(times, int(stem)), 1, max(len(times) - 1, 1)))
         before, after = (int(times[max(k - 1, 0)]), int(times[min(k, len(times) - 1)]))

@@ -1,4 +1,4 @@
-"""Session files: what a person writes to have a camera calibrated (schema "rigkit.session/1").
+"""Session files: images, boards and options of a calibration, written by a person (schema "rigkit.session/1").
 
 ::
 
@@ -55,7 +55,7 @@ _MODEL_KEYS: Mapping[str, Schema] = {
     ),
 }
 ONE_CAMERA_KEYS = ("schema", "images", "board", "boards", "model", "degree", "board_shape")
-"""Other keys of a session are of rigs."""
+"""Keys of sessions of one camera; all others are of rigs."""
 _CAMERA_KEYS: Mapping[str, Schema] = {
     "id": described(NAME, "its name", "left"),
     "images": _IMAGES,
@@ -100,17 +100,17 @@ SESSION_FILE = file(
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Session:
-    """What to calibrate and how.
+    """The session of one camera.
 
     Attributes
     ----------
-    path : the session file.
-    images : the image files that are there, sorted by name.
-    boards : the boards that may be in them.
+    path : session file.
+    images : existing image files, sorted by name.
+    boards : boards that the images may show.
     model : name of a camera model, or "auto".
-    degree : size of the model, or None to choose.
+    degree : order of the model; None: chosen automatically.
     board_shape : "flat", "warp", "released" or "auto".
-    camera : name of the camera where the session is one of a rig's, else None.
+    camera : name of the camera in a rig's session, else None.
     """
 
     path: Path
@@ -125,24 +125,24 @@ class Session:
 
     @property
     def whose(self) -> str:
-        """Of which camera, in words that follow what it is about; "" where there is one only."""
+        """The words "of camera NAME" after a blank, for messages; "" outside of a rig."""
         return "" if self.camera is None else f" of camera '{self.camera}'"
 
     @property
     def calibration_path(self) -> Path:
-        """Where the calibration goes: beside the session, see `beside_session`."""
+        """Default path of the calibration, beside the session (see `beside_session`)."""
         return beside_session(self.path, "calibration.json")
 
     @property
     def corners_path(self) -> Path:
-        """Where the corners found are kept, so that calibrating again needs no images."""
+        """Path of the corner cache, beside the session."""
         name = "corners.json" if self.camera is None else f"corners-{self.camera}.json"
         return beside_session(self.path, name)
 
 
 def beside_session(session: Path, name: str) -> Path:
-    """Return where a result of that name goes: of a session that is not called session.toml after the session's name,
-    so that those of two sessions in one folder do not meet."""
+    """Return the path of a result in the session's folder; its name begins with the session's unless that is
+    session.toml."""
     return session.parent / (name if session.stem == "session" else f"{session.stem}-{name}")
 
 
@@ -157,8 +157,7 @@ def load_session(path: str | Path) -> Session:
 
 
 def options_of(table: TomlTable, of_all: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return model, degree and board shape that a table asks for, by the fields of `Session`; what it leaves out is as
-    `of_all` cameras have it."""
+    """Return model, degree and board shape of a table, as fields of `Session`; by default those `of_all` cameras."""
     typical = {"model": "auto", "degree": None, "board_shape": "auto"} if of_all is None else dict(of_all)
     typical |= {"degree": None} if "model" in table else {}
     out = typical | {key: table[key] for key in typical if key in table}
@@ -169,32 +168,32 @@ def options_of(table: TomlTable, of_all: Mapping[str, Any] | None = None) -> dic
 
 
 def images_of(table: TomlTable) -> tuple[Path, ...]:
-    """Return the image files that are there, of the patterns that a table lists."""
+    """Return the existing image files that match the patterns of a table."""
     patterns = (table["images"],) if isinstance(table["images"], str) else table["images"]
     found: dict[Path, Path] = {}
     absent = []
     for pattern in patterns:
         table.beside(pattern)
-        # Only what the person wrote is a pattern, and no file's own name: both may have brackets in them.
+        # The root is no pattern: its name may have brackets.
         root = table.path.parent
         matches = [root / m for m in sorted(glob.glob(pattern, root_dir=root))]
         if not matches and (root / pattern).is_file():
             matches = [root / pattern]
         for match in filter(is_file_or_lost_link, matches):
-            # The same file twice is one image, under the name by which it was found first.
+            # A file found twice is one image, under its first name.
             found.setdefault(match.resolve(), named_path(match))
         absent += [pattern] if not matches else []
-    # No image at all is well where corners are kept; one of several is a mistake.
+    # No image at all is valid if the corners are cached; a single pattern without a match is a mistake.
     if found and absent:
         raise table.error(f"'images': nothing matches '{absent[0]}'; correct or remove it")
     return tuple(found.values())
 
 
 def files_of_session(path: str | Path) -> tuple[Path, ...]:
-    """Return every file that a calibration of this session, or rig's session, reads: itself, boards, images, and the
-    corners kept beside it, whether they are there or not.
+    """Return all files that a calibration of a session (of one camera or a rig) reads: itself, boards, images, and
+    corner caches, existing or not.
 
-    Raises InputError like `load_session`.
+    Raises InputError as `load_session`.
     """
     source = Path(path)
     table = read_toml(source, SESSION_FILE)
@@ -212,7 +211,7 @@ def _board_files(table: TomlTable) -> list[Path]:
 
 
 def boards_of(table: TomlTable) -> tuple[Board, ...]:
-    """Return the boards that a table lists by file."""
+    """Return the boards whose files a table lists."""
     if "boards" in table and "board" in table:
         raise table.error("'board' and 'boards'; keep one of the two")
     with table.located():

@@ -1,4 +1,4 @@
-"""Study files: what `rigkit simulate` computes, written by a person."""
+"""Study files for `rigkit simulate`, written by a person."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from rigkit.study.study import NOISE_KINDS, Claim, Study, Variant
 from rigkit.synthetic.noise import NoisyImages
 
 DEFAULTS: Mapping[str, Any] = {f.name: f.default for f in fields(Study) if f.name in ("support", "det_scale")}
-"""What a study that says nothing of them works with: the paper's."""
+"""Default values of a study: those of the paper."""
 
 _SIDE: Schema = {"type": "integer", "minimum": 3}
 _NUMBERS = array(NUMBER, 1)
@@ -121,7 +121,7 @@ STUDY_FILE = file(
 def load_study(path: str | Path) -> Study:
     """Return the study of a file.
 
-    Raises InputError for unknown keys or values, and where one of name, trials, seed, pose_types, methods and noise is
+    Raises InputError for unknown keys or values, and if one of name, trials, seed, pose_types, methods and noise is
     missing.
     """
     top = read_toml(path, STUDY_FILE)

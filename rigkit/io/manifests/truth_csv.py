@@ -1,4 +1,4 @@
-"""Measured truth kept in a spreadsheet: one row a measurement, units in the head of the table.
+"""Measured truth in a spreadsheet: one row for each measurement, with units in the head of the table.
 
 ::
 
@@ -35,15 +35,15 @@ Units = dict[str, tuple[str, float]]
 
 
 def load_truth_csv(path: str | Path, boards: Mapping[str, Sequence[Board]]) -> dict[str, PairTruth]:
-    """Return what was measured of each pair that the table names.
+    """Return the measured truth by pair.
 
-    Raises InputError with the line: a unit that is missing, unknown or mixed, an unknown column, pair, board or
-    quantity, a value or sigma that is no number or left out, a baseline stated twice.
+    Raises InputError, with the line: a missing, unknown or mixed unit, an unknown column, pair, board or quantity, a
+    missing or invalid value or sigma, or a second baseline of a pair.
 
     Parameters
     ----------
-    path : the CSV file.
-    boards : pair -> the boards that stand there; a row about any other pair is an error.
+    path : CSV file.
+    boards : pair -> its boards; a row about any other pair is an error.
     """
     source = Path(path)
     head, rows = _read(source)
@@ -81,7 +81,7 @@ def load_truth_csv(path: str | Path, boards: Mapping[str, Sequence[Board]]) -> d
 
 
 def _read(source: Path) -> tuple[list[str], list[tuple[int, Row]]]:
-    """Return the head and the rows that are not empty, each with its line."""
+    """Return the head and the non-empty rows with their lines."""
     text = read_text(source, "truth table")
     first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     delimiter = max(",;\t", key=first.count)
@@ -92,7 +92,7 @@ def _read(source: Path) -> tuple[list[str], list[tuple[int, Row]]]:
 
 
 def _units(source: Path, head: Sequence[str]) -> Units:
-    """Return for each of "value mm", "sigma mm", "value deg", "sigma deg" its column and the factor to mm or deg."""
+    """Return the column and the factor to mm or deg of "value mm", "sigma mm", "value deg" and "sigma deg"."""
     units: Units = {}
     for name in head:
         if name in PLAIN:

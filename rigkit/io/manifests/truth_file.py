@@ -1,4 +1,4 @@
-"""Measured truth as people write it: a table of the manifest, or a CSV file kept in a spreadsheet."""
+"""Measured truth in tables of manifests and sessions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rigkit.io.disk.toml_reader import TomlTable
 
 
 def measured(unit: str) -> dict[str, Schema]:
-    """Return the keys of something measured in a unit."""
+    """Return the keys of a measurement in `unit`."""
     return {
         f"value_{unit}": described(POSITIVE, f"as measured, {unit}", {"deg": 90.0, "mm": 300.0}[unit]),
         f"sigma_{unit}": described(POSITIVE, "how far off the measurement may well be: one standard deviation", 0.5),
@@ -22,7 +22,7 @@ def measured(unit: str) -> dict[str, Schema]:
 
 
 def between(unit: str, what: str, a: str, b: str) -> Schema:
-    """Return the schema of something measured between two things, such as `a` and `b`."""
+    """Return the schema of a measurement between two things, such as `a` and `b`."""
     return obj({"a": described(TEXT, what, a), "b": described(TEXT, "the other one", b), **measured(unit)})
 
 
@@ -41,8 +41,7 @@ TRUTH_KEYS: Mapping[str, Schema] = {
 
 
 def truth_from_table(table: Mapping[str, Any], boards: Sequence[Board]) -> PairTruth:
-    """Return what a table with TRUTH_KEYS, and perhaps a baseline, says; raises InputError for boards that are not in
-    the pair."""
+    """Return the truth of a table of TRUTH_KEYS and perhaps a baseline; raises InputError for other boards."""
     baseline, angles, distances = None, [], []
     if (inner := table.get("baseline")) is not None:
         with inner.located():
@@ -66,10 +65,10 @@ def make_angle(a: str, b: str, value_deg: float, sigma_deg: float, how: str, boa
 def make_distance(
     a: str, b: str, value_mm: float, sigma_mm: float, how: str, boards: Sequence[Board]
 ) -> MeasuredDistance:
-    """Return the distance between two features, written as `Feature` reads them.
+    """Return the distance between two features in the notation of `Feature`.
 
-    Raises InputError for a board that is not in the pair, a corner that is not on its board, and a corner of a board
-    that looks the same turned by 180 degrees: nobody can say which one it is, unless both ends are on that board.
+    Raises InputError for a board that is not in the pair, a corner outside of its board, or a corner of a board that is
+    symmetric under a half turn, which is ambiguous unless both features are on that board.
     """
     first, second = Feature.parse(a), Feature.parse(b)
     for feature in (first, second):

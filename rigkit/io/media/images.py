@@ -1,13 +1,13 @@
-"""Reading images, refusing those that are not whole.
+"""Reading images; truncated and damaged files are refused.
 
-Decoders fill the missing part of a cut-off JPEG with grey and say nothing; corners would then be looked for in it. So
-the file's own structure is walked before it is decoded.
+Decoders silently fill the missing part of a truncated JPEG with grey, so the structure of the file is checked first.
 """
 
 from __future__ import annotations
 
 import io
 import logging
+import os
 import re
 import struct
 import zlib
@@ -27,49 +27,32 @@ from rigkit.io.media.tiff import TIFF_STARTS, as_stored, page_sizes
 _log = logging.getLogger(__name__)
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
-"""(H, W) grey or (H, W, 3) red green blue."""
+"""(H, W) grey or (H, W, 3) RGB."""
 
 IMAGE_ENDINGS = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
-UNREAD_ENDINGS = (
-    *(
-        ".arw",
-        ".avif",
-        ".cr2",
-        ".cr3",
-        ".dng",
-        ".exr",
-        ".fits",
-        ".gif",
-        ".heic",
-        ".heif",
-        ".jp2",
-        ".jxl",
-        ".nef",
-        ".orf",
-    ),
-    *(".raf", ".rw2"),
-)
-"""What cameras and phones write besides."""
+UNREAD_ENDINGS = (".arw", ".avif", ".cr2", ".cr3", ".dng", ".exr", ".fits", ".gif",
+                  ".heic", ".heif", ".jp2", ".jxl", ".nef", ".orf", ".raf", ".rw2")  # fmt: skip
+"""Image formats that are not read."""
 MAX_PIXELS = 200_000_000
-"""Of an image: the largest sensors have 150 million; with detection that is 4 GB."""
+"""The largest sensors have 150 million; detection takes 4 GB for these."""
 JPEG_START = b"\xff\xd8"
 JPEG_END = 0xD9
 JPEG_SCAN = 0xDA
 JPEG_STANDALONE = {0x01, *range(0xD0, 0xD8)}
 JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
-"""In entropy-coded data 0xff is followed by 0 (stuffing), a restart mark or 0xff (fill): else it is a marker."""
+"""In entropy-coded data 0xff is followed by 0 (stuffing), a restart marker or 0xff (fill); all else is a marker."""
 BMP_START = b"BM"
 PNG_START = b"\x89PNG\r\n\x1a\n"
 
 
 def read_image(path: str | Path) -> Image:
-    """Return the image as uint8 or uint16, (H, W) or (H, W, 3) in red, green, blue order.
+    """Return the image as uint8 or uint16, (H, W) or (H, W, 3) in RGB order.
 
-    Pixels come as the sensor wrote them: an orientation in the file (EXIF, TIFF) is not applied, because a calibration
-    belongs to the sensor. An alpha channel is dropped.
+    Orientation tags (EXIF, TIFF) are not applied, because a calibration belongs to the sensor. An alpha channel is
+    dropped.
 
-    Raises InputError: no such file, not an image, several in one file, cut off or damaged, of more than `MAX_PIXELS`,
-    or a pixel type other than 8 or 16 bit.
+    Raises InputError: no such file, not an image, several images in one file, truncated or damaged, more than
+    MAX_PIXELS, or a pixel type other than 8 or 16 bits.
     """
     source = Path(path)
     data = read_bytes(source, "image")
@@ -110,7 +93,7 @@ UNREAD_CONTAINERS = {
     b"ftypmp42": "a video (MP4)",
     b"ftypqt  ": "a video (MOV)",
 }
-"""By the eight bytes from the fifth on, ISO/IEC 14496-12."""
+"""Formats by bytes 4 to 11 (ISO/IEC 14496-12)."""
 
 UNREAD_STARTS = {
     b"II*\x00\x10\x00\x00\x00CR": "a raw image (CR2)",
@@ -128,16 +111,16 @@ UNREAD_STARTS = {
 
 
 def unread_format(data: bytes) -> str | None:
-    """Return what a file that begins with `data` is, where that is known and not read as an image."""
+    """Return the name of the known but unsupported format that `data` begins with, or None."""
     container = UNREAD_CONTAINERS.get(data[4:12])
     return container or next((name for start, name in UNREAD_STARTS.items() if data.startswith(start)), None)
 
 
 def announced_sizes(data: bytes) -> list[tuple[int, int]]:
-    """Return the (width, height) of every image or frame that a file announces, before a decoder makes room for them.
+    """Return (width, height) of every image or frame by the headers of a file, without decoding it.
 
-    A file of a kilobyte may announce a thousand megapixels of one colour, and OpenCV returns the first frame of an
-    animation and says nothing. None are returned where Pillow does not know the format, or cannot read its head.
+    A kilobyte may announce a thousand megapixels, and OpenCV silently returns the first frame of an animation. The list
+    is empty if Pillow cannot read the headers.
     """
     if data.startswith(TIFF_STARTS):
         return page_sizes(data)
@@ -155,19 +138,25 @@ def announced_sizes(data: bytes) -> list[tuple[int, int]]:
 
 
 def images_of_folder(folder: Path) -> list[Path]:
-    """Return the images of a folder, by name."""
+    """Return the images of a folder, sorted by name."""
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS and is_file_or_lost_link(p))
 
 
+def images_below(folder: Path) -> list[Path]:
+    """Return the images of a folder and its subfolders, sorted; unreadable subfolders are skipped."""
+    files = (Path(place) / name for place, _, names in os.walk(folder) for name in names)
+    return sorted(p for p in files if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
+
+
 def no_images(folder: Path) -> str:
-    """Return that a folder has no images, and what it holds instead: pictures that are not read, folders with some."""
+    """Return the message that a folder has no images, with the unsupported images or subfolders that it has instead."""
     words = f"folder '{folder}' has no images ({' '.join(IMAGE_ENDINGS)})"
     unread = _unread(folder)
     if unread:
         return (
             f"{words}, but pictures of formats that are not read, '{unread[0]}' the first; convert them to PNG or JPEG"
         )
-    inside = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
+    inside = images_below(folder)
     if not inside:
         return f"{words}; give another"
     first, others = inside[0].parent, len({path.parent for path in inside}) - 1
@@ -178,7 +167,7 @@ def no_images(folder: Path) -> str:
 
 
 def name_unread(folder: Path) -> None:
-    """Say which files of a folder are pictures that are not read: of a raw picture beside its JPEG nothing is lost."""
+    """Warn of images of unsupported formats in a folder, except where a readable one has the same name."""
     read = {path.stem for path in images_of_folder(folder)}
     lost = [name for name in _unread(folder) if Path(name).stem not in read]
     if lost:
@@ -191,7 +180,7 @@ def _unread(folder: Path) -> list[str]:
 
 
 def to_grey(image: Image) -> Image:
-    """Return (H, W) of the same type; a grey image comes back as it is."""
+    """Return the image as grey (H, W), of the same type."""
     if image.ndim == 2:
         return image
     if image.ndim != 3 or image.shape[2] != 3:
@@ -200,7 +189,7 @@ def to_grey(image: Image) -> Image:
 
 
 def require_pixels(size_px: tuple[int, int], what: str) -> None:
-    """Raise InputError, which begins with `what`, for an image that is too large to be worked on."""
+    """Raise InputError, which begins with `what`, for more than MAX_PIXELS."""
     width, height = size_px
     if width * height > MAX_PIXELS:
         raise InputError(
@@ -209,15 +198,14 @@ def require_pixels(size_px: tuple[int, int], what: str) -> None:
 
 
 def read_image_of(path: str | Path, size_px: tuple[int, int], calibration: str | Path) -> Image:
-    """Return an image of a camera; raises InputError also where it is of another size than `calibration`, the file that
-    the camera is from, says."""
+    """Return an image of a camera; raises InputError as `read_image`, and as `require_size`."""
     image = read_image(path)
     require_size((image.shape[1], image.shape[0]), f"image '{path}'", size_px, calibration)
     return image
 
 
 def require_size(given_px: tuple[int, int], what: str, size_px: tuple[int, int], calibration: str | Path) -> None:
-    """Raise InputError where `what` is of another size than `calibration`, the file that the camera is from, says."""
+    """Raise InputError if `what` has another size than the camera; `calibration` is the camera's file."""
     if given_px != size_px:
         raise InputError(
             f"{what} is {given_px[0]}x{given_px[1]} px, but '{calibration}' is of a camera of "
@@ -227,8 +215,8 @@ def require_size(given_px: tuple[int, int], what: str, size_px: tuple[int, int],
 
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV's own lines off stderr: what is wrong is said once, in one line, by the error that follows."""
-    # OpenCV 5 moved the two functions; 0 is silence in both.
+    """Silence OpenCV's log in the block: errors are reported by rigkit."""
+    # OpenCV 5 moved the two functions; level 0 is silent in both.
     log: Any = cv2.utils.logging if hasattr(cv2.utils, "logging") else cv2
     level = log.getLogLevel()
     log.setLogLevel(0)
@@ -239,7 +227,7 @@ def quiet_opencv() -> Iterator[None]:
 
 
 def _fault(data: bytes) -> str | None:
-    """Return what is wrong with the file's structure, in words that follow "is"; None if nothing was found."""
+    """Return the fault of a file's structure, in words that follow "is"; None if there is none."""
     if not data:
         return "empty"
     if data.startswith(JPEG_START):
@@ -253,7 +241,7 @@ def _fault(data: bytes) -> str | None:
 
 
 def _jpeg_fault(data: bytes) -> str | None:
-    """Walk the segments up to the end-of-image marker (a thumbnail inside a segment has its own: it is skipped)."""
+    """Check the segments up to the end-of-image marker, skipping thumbnails inside segments."""
     at = len(JPEG_START)
     while at + 1 < len(data):
         if data[at] != 0xFF:

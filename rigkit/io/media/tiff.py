@@ -1,7 +1,7 @@
-"""What decoders get wrong in TIFF files: an orientation that they apply unasked, pages that they leave out unsaid.
+"""Orientation and page sizes of TIFF files: decoders apply the one and silently drop further pages.
 
-TIFF 6.0 and BigTIFF: a header of 8 (16) bytes, then a chain of directories, each a list of entries (tag, type, count,
-value).
+TIFF 6.0 and BigTIFF have a header of 8 (16) bytes, then a chain of directories, each a list of entries (tag, type,
+count, value).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 
 NEW_SUBFILE_TYPE, IMAGE_WIDTH, IMAGE_LENGTH, ORIENTATION = 254, 256, 257, 274
 REDUCED_OR_MASK = 1 | 4
-"""Bits of NewSubfileType: a smaller copy of another page, or its transparency."""
+"""Bits of NewSubfileType: a reduced copy of another page, or a transparency mask."""
 AS_STORED = 1
 TIFF_STARTS = (b"II*\0", b"II+\0", b"MM\0*", b"MM\0+")
 VALUE_BYTES = {1: 1, 3: 2, 4: 4, 16: 8}
@@ -18,7 +18,7 @@ VALUE_BYTES = {1: 1, 3: 2, 4: 4, 16: 8}
 
 
 class _Tag(NamedTuple):
-    """The value of an integer entry, and where it stands in the file."""
+    """An integer entry: its value, and offset and size of the value in the file."""
 
     value: int
     at: int
@@ -26,10 +26,7 @@ class _Tag(NamedTuple):
 
 
 def as_stored(data: bytes) -> bytes:
-    """Return the TIFF with its pixels declared to be upright as they are stored; other data come back as they are.
-
-    OpenCV turns and mirrors TIFF images by their orientation, whatever it is asked for.
-    """
+    """Return a TIFF with its orientation reset, because OpenCV always applies it; other data unchanged."""
     order = _byte_order(data)
     if order is None:
         return data
@@ -41,7 +38,7 @@ def as_stored(data: bytes) -> bytes:
 
 
 def page_sizes(data: bytes) -> list[tuple[int, int]]:
-    """Return the (width, height) of every image in a TIFF, without previews and masks; none for other data."""
+    """Return (width, height) of every image in a TIFF, without previews and masks; [] for other data."""
     order = _byte_order(data)
     if order is None:
         return []
@@ -60,7 +57,7 @@ def _byte_order(data: bytes) -> Literal["little", "big"] | None:
 
 
 def _pages(data: bytes, order: Literal["little", "big"]) -> list[dict[int, _Tag]]:
-    """Return the integer entries of every directory by tag, as far as the file is whole."""
+    """Return the integer entries by tag of every directory, up to the first damaged one."""
 
     def number(at: int, size: int) -> int:
         return int.from_bytes(data[at : at + size], order)

@@ -1,7 +1,7 @@
-"""Videos, sequences and live cameras as images: decoded by OpenCV, one frame at a time.
+"""Frames of videos, image sequences and live cameras, decoded one at a time by OpenCV.
 
-A source is a video file, a pattern of a sequence's files such as `img_%04d.png`, or `camera:0`. Pixels come as the
-sensor wrote them: an orientation in the file is not applied, because a calibration belongs to the sensor.
+A source is a video file, a pattern of image files such as `img_%04d.png`, or `camera:0`. Orientation tags are not
+applied, because a calibration belongs to the sensor.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ VIDEO_ENDINGS = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mp
 LIVE_CAMERA = re.compile(r"camera:(\d{1,2})")
 SEQUENCE = re.compile(r"%0?\d?d")
 COMPLETE = 0.95
-"""Part of the frames announced: containers without an index tell the duration alone."""
+"""Fraction of the announced frames: containers without an index only state the duration."""
 TIMESTAMPS = ("sync_index", "cam_id", "frame_index")
 
 
 def is_video(source: str | Path) -> bool:
-    """Say whether `source` names a video, a numbered sequence or a live camera rather than an image or a folder."""
+    """Return whether `source` names a video, a numbered sequence or a live camera."""
     name = Path(source).name
     return (
         Path(name).suffix.lower() in VIDEO_ENDINGS
@@ -41,20 +41,20 @@ def is_video(source: str | Path) -> bool:
 
 
 class Video:
-    """The frames of a video, one after the other; only one is in memory.
+    """An open video, read forwards; one frame is in memory.
 
     Attributes
     ----------
-    source : as it was named.
-    count : frames announced, 0 where that is not known.
-    rate_hz : frames per second announced, 0 where that is not known.
-    live : whether it is a camera, which has no end.
-    size_px : width and height of its frames.
-    next_number : of the frame that comes next, from 0.
+    source : the given path.
+    count : announced number of frames, 0 if unknown.
+    rate_hz : announced frames per second, 0 if unknown.
+    live : whether it is a live camera.
+    size_px : width and height of the frames.
+    next_number : number of the next frame, from 0.
     """
 
     def __init__(self, source: str | Path, *, colour: bool = False) -> None:
-        """Open `source`, whose frames are to be grey or in `colour` (RGB); raises InputError where it cannot be."""
+        """Open `source` for grey frames, or RGB frames with `colour`; raises InputError if it cannot be opened."""
         self._colour = colour
         self.source = Path(source)
         number = LIVE_CAMERA.fullmatch(self.source.name)
@@ -66,7 +66,7 @@ class Video:
         if not self._capture.isOpened():
             if self.live:
                 raise InputError(f"camera '{source}' is not connected, or another program has it")
-            # The index of an MP4 is at its end: without it there is nothing to convert.
+            # The index of an MP4 is at its end: a truncated one cannot be converted.
             raise InputError(
                 f"video '{source}' cannot be decoded: cut off, or of a format that is not read; copy it again, or "
                 "convert it to MP4"
@@ -88,10 +88,7 @@ class Video:
         self._capture.release()
 
     def frame(self, number: int) -> Image | None:
-        """Return frame `number`, counted from 0; None at the end. Frames are asked for in rising order.
-
-        Raises InputError for a frame that is past already.
-        """
+        """Return frame `number`, from 0; None at the end. Raises InputError for a frame before `next_number`."""
         if number < self.next_number:
             raise InputError(
                 f"video '{self.source}': frame {number} is before frame {self.next_number}; ask in rising order"
@@ -113,8 +110,7 @@ class Video:
         return cast(Image, picture)
 
     def passed_over(self) -> int:
-        """Return how many frames there are from the next to the last, and pass over them: what is announced may be
-        wrong."""
+        """Return the true number of remaining frames, by skipping to the end of the video."""
         first = self.next_number
         with quiet_opencv():
             while self._capture.grab():
@@ -123,7 +119,7 @@ class Video:
         return self.next_number - first
 
     def _warn_of_truncation(self) -> None:
-        """Say once that the video ends before the frames that it announces do."""
+        """Warn once if the video ends before the announced number of frames."""
         if self.next_number < COMPLETE * self.count:
             _log.warning(
                 f"video '{self.source}': {self.next_number} of {self.count} frames can be decoded; it is cut off or "
@@ -133,12 +129,12 @@ class Video:
 
 
 def read_timestamps(path: Path, cameras: Sequence[str]) -> dict[int, Mapping[str, int]]:
-    """Return moment -> camera -> number of the frame in that camera's video, from a file with the columns TIMESTAMPS.
+    """Return moment -> camera -> frame number in the camera's video, from a CSV file with the columns TIMESTAMPS.
 
-    A camera of the file, `cam_id`, is the one of `cameras` that is called so or has that number at its end. Frames are
-    counted from the first that a camera has in the file: recorders count those before the recording, too.
+    `cam_id` is a name of `cameras`, or the number at its end. Frame numbers start at the first one that a camera has in
+    the file, because recorders also count frames before the recording.
 
-    Raises InputError: columns are missing, a field is no number, or a camera has no rows.
+    Raises InputError: a column is missing, a field is no integer, or a camera has no rows.
     """
     head, lines = csv_table(path, "timestamps")
     if not set(TIMESTAMPS) <= set(head):
