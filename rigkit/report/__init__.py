@@ -1,1 +1,1 @@
-"""What people look at: figures, tables, the HTML page."""
+"""Reports: figures, tables and HTML pages."""

@@ -1,4 +1,4 @@
-"""Results and progress in a notebook: a verdict with a small picture, and a bar that fills."""
+"""Display of results (verdict and 3D scene) and progress in notebooks."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from rigkit.report.tables import measured_words
 
 SCENE_WIDTH, SCENE_HEIGHT, SCENE_RIM = 420.0, 300.0, 14.0
 MAX_DRAWN_POINTS = 600
-"""Points drawn; of more, every second, third, ..."""
+"""Maximum number of points drawn; larger clouds are subsampled."""
 SHADES = ("#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#b79a00", "#17becf", "#e377c2", "#7f7f7f")
 COLOUR_OF = {Severity.GOOD: "#1a7f42", Severity.LOOK: "#8a5f00", Severity.BAD: "#b3261e"}
 VIEWED_FROM = exp_so3(np.array([0.45, 0.0, 0.0])) @ exp_so3(np.array([0.0, 0.45, 0.0]))
-"""From above and from the side, as the 3D view of pages begins."""
+"""View from above and from the side, as the initial 3D view of pages."""
 REDRAW_AFTER_S = 0.1
 
 
 def html_of(result: Calibration | RigCalibration | Reconstruction) -> str:
-    """Return a result as a notebook shows it: what it is, the verdict, and its 3D scene as a drawing."""
+    """Return a result as HTML for a notebook: summary, verdicts, and a drawing of its 3D scene."""
     if isinstance(result, Calibration):
         scene = boards_scene(result.views, result.boards)
         return _shown(repr(result), most_severe_first(result.verdicts)[:2], scene)
@@ -63,7 +63,7 @@ def _shown(words: str, findings: Sequence[Finding], scene: Mapping[str, Any]) ->
 
 
 def scene_svg(scene: Mapping[str, Any]) -> str:
-    """Draw a 3D scene, as pages have it for their viewer, from above and aside, orthographic."""
+    """Return an orthographic drawing (SVG) of a 3D scene of the page viewer."""
     cameras = [np.array(camera["corners"]) for camera in scene["cameras"]]
     planes = [np.array(plane["corners"]) for plane in scene["planes"]]
     points = np.array(scene["points"]).reshape(-1, 3)
@@ -96,7 +96,7 @@ def scene_svg(scene: Mapping[str, Any]) -> str:
 
 
 def notebook_progress() -> Progress:
-    """Return a progress callback that fills a bar below the notebook's cell; silent where there is no notebook."""
+    """Return a progress callback that shows a bar below the notebook's cell; silent outside of notebooks."""
     try:
         display, html = (getattr(importlib.import_module("IPython.display"), name) for name in ("display", "HTML"))
         shell = importlib.import_module("IPython").get_ipython()

@@ -1,4 +1,4 @@
-"""Pages from templates: whatever comes from a file or a person is escaped, only our own drawings go in as they are."""
+"""HTML pages from templates; all content is escaped except rigkit's own drawings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 LONG_WORDS = 60
-"""Longer words of a cell are set in several lines."""
+"""Longer texts in cells are wrapped."""
 
 
 def render(template: str, **context: Any) -> str:
@@ -26,7 +26,7 @@ def render(template: str, **context: Any) -> str:
 
 
 def data_uri(mime: str, data: bytes) -> str:
-    """Return what stands in an image's `src`, so that the page needs no other file."""
+    """Return a data URI for an image's `src`; SVG gets the style sheet of drawings."""
     if mime == "image/svg+xml":
         head, sign, rest = data.decode().partition(">")
         data = f"{head}{sign}<style>{asset('drawings.css')}</style>{rest}".encode()
@@ -34,14 +34,14 @@ def data_uri(mime: str, data: bytes) -> str:
 
 
 def drawing(svg: str) -> Any:
-    """Mark SVG of rigkit itself, whose words are escaped already, to go into a page as it is."""
+    """Return SVG of rigkit marked as safe, because its texts are escaped already."""
     from markupsafe import Markup
 
     return Markup(svg)
 
 
 def shown_table(table: Table, pictures: Sequence[str | None] = ()) -> dict[str, Any]:
-    """Return a table in words, as the template `table.html` shows it; `pictures`: a source for each row, or none."""
+    """Return a table for the template `table.html`; `pictures` are image sources of the rows."""
     return {
         "title": table.title,
         "head": [(column_label(column), text) for column, text in zip(table.columns, in_words(table), strict=True)],
@@ -74,7 +74,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    # Also "<" in a string of JSON is escaped, so no name in it can end or open a script element.
+    # "<" in strings of JSON is escaped, too, so that no name can end or open a script element.
     made.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     made.globals["asset"] = asset
     return made
@@ -82,5 +82,5 @@ def _environment() -> Environment:
 
 @functools.cache
 def asset(name: str) -> Any:
-    """Return a style sheet or script of the package, as it is."""
+    """Return a style sheet or script of the package, unescaped."""
     return drawing(resources.files("rigkit.report").joinpath(name).read_text(encoding="utf-8"))

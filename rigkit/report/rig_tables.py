@@ -1,4 +1,4 @@
-"""Tables of a calibrated rig: its cameras, its baselines, and what was left out."""
+"""Tables of a calibrated rig: cameras, baselines, mounts, intrinsics, boards, and views left out."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rigkit.validation.check import Check
 
 
 def rig_tables(rig: RigCalibration, checks: Sequence[Check]) -> tuple[Table, ...]:
-    """Return the tables that stand first on the page of a rig."""
+    """Return the tables of a rig's page."""
     tables = [_cameras(rig)]
     if len(rig.cameras) > 1:
         tables += [_baselines(rig, checks), _mounts(rig)]
@@ -47,7 +47,7 @@ def _cameras(rig: RigCalibration) -> Table:
 
 
 def _intrinsics(rig: RigCalibration) -> Table:
-    """Return the intrinsics as the joint solution has them, a column a camera."""
+    """Return the intrinsics of the joint solution, one column for each camera."""
     sigmas = rig.sigmas
     own_words: list[dict[str, str]] = []
     start = 0
@@ -65,7 +65,7 @@ def _intrinsics(rig: RigCalibration) -> Table:
 
 
 def _mounts(rig: RigCalibration) -> Table:
-    """Return how the cameras stand against the first one."""
+    """Return the poses of the cameras relative to the first one."""
     sigmas = rig.sigmas
     heads = (Column("camera"), *(Column(f"turned about {a}", "deg") for a in "xyz"))
     heads += tuple(Column(f"moved along {a}", "mm") for a in "xyz")
@@ -80,7 +80,7 @@ def _mounts(rig: RigCalibration) -> Table:
 
 
 def rig_basis(rig: RigCalibration) -> str:
-    """Return what the rig's solution rests on, in words."""
+    """Return the data that the rig's solution is based on, in words."""
     return (
         "All intrinsics and mounts solved together; held out: frames that took no part, with one pose for all cameras. "
         f"{rig.corner_count} corners, {rig.shared_count} poses shared by several views. Frames disagree "
@@ -90,7 +90,7 @@ def rig_basis(rig: RigCalibration) -> str:
 
 
 def rig_reach(rig: RigCalibration, checks: Sequence[Check]) -> str:
-    """Say how sure the distances of the cameras are, and where one sees what another does; what was measured too."""
+    """Return in words the uncertainty of baselines and of transferred points, and how many measured facts hold."""
     sentences = []
     names = [camera.name for camera in rig.cameras]
     pairs = list(combinations(names, 2))
@@ -137,7 +137,7 @@ def _angles(target: BoardRig, checks: Sequence[Check]) -> Table:
     for a, b in combinations(target.names, 2):
         value, sigma = target.angle_deg(a, b)
         both = (target.boards[target.index(name)].board for name in (a, b))
-        # A board that looks the same turned has no first corner that a person could measure from.
+        # A symmetric board has no unique first corner to measure from.
         corners: tuple[float | None, float | None] = (None, None)
         if not any(board.looks_same_turned for board in both):
             corners = target.distance_mm(Feature(a, grid=(0, 0)), Feature(b, grid=(0, 0)))
@@ -157,7 +157,7 @@ def _angles(target: BoardRig, checks: Sequence[Check]) -> Table:
 
 
 def _measured(checks: Sequence[Check], *names: str) -> tuple[Cell, Cell, Cell]:
-    """Return what was measured, how, and the verdict; empty where nothing was."""
+    """Return the cells measured, how, and verdict of the check with one of these names; empty cells without one."""
     known = next((c for c in checks if c.name in names), None)
     if known is None:
         return Cell(None), Cell(""), Cell("")

@@ -18,7 +18,7 @@ from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.disk.reading import is_number
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""What a spreadsheet takes for the beginning of a formula."""
+"""First characters of formulas in spreadsheets."""
 
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -39,7 +39,7 @@ LATEX = {
 
 
 def tables_to_markdown(tables: Sequence[Table]) -> str:
-    """Return all tables as Markdown: the paper's number in brackets, sigma behind a plus-minus, the best one bold."""
+    """Return all tables as Markdown: value ± sigma, the paper's value in brackets, best and failed cells bold."""
     parts = []
     for table in tables:
         head = [_escape_markdown(column_label(column)) for column in table.columns]
@@ -61,9 +61,9 @@ def tables_to_markdown(tables: Sequence[Table]) -> str:
 
 
 def tables_to_csv(tables: Sequence[Table]) -> str:
-    """Return all tables one below the other, each after a line "# title"; full precision, units in the head.
+    """Return all tables as CSV, each after a line "# title", at full precision, with units in the head.
 
-    The paper's numbers and the sigmas have columns of their own, so a spreadsheet can calculate with every cell.
+    Sigmas and the paper's values have separate columns.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -127,7 +127,7 @@ def tables_to_json(tables: Sequence[Table]) -> str:
 
 
 def tables_to_list(tables: Sequence[Table]) -> list[dict[str, Any]]:
-    """Return all tables for JSON: a list of rows each, every cell with what it has of value, sigma, paper and marks."""
+    """Return all tables for JSON; a cell is its value, or an object of value, sigma, paper and marks."""
     out = []
     for table in tables:
         rows = [
@@ -158,7 +158,7 @@ TABLE_WRITERS = {"md": tables_to_markdown, "csv": tables_to_csv, "tex": tables_t
 
 
 def table_files(tables: Sequence[Table], stem: str, *endings: str) -> dict[str, str]:
-    """Return tables as files (name -> content), of all kinds or of such `endings`."""
+    """Return tables as files (name -> content) of all formats, or of these `endings`."""
     return {f"{stem}.{ending}": TABLE_WRITERS[ending](tables) for ending in endings or TABLE_WRITERS}
 
 
@@ -177,7 +177,7 @@ def column_label(column: Column) -> str:
 
 
 def _text(cell: Cell, column: Column) -> str:
-    """Return the cell as a person reads it."""
+    """Return the text of a cell."""
     value = without_nan(cell.value)
     if value is None:
         text = "" if cell.paper is None else "-"
@@ -189,7 +189,7 @@ def _text(cell: Cell, column: Column) -> str:
 
 
 def measured_words(value: float, sigma: float | None, decimals: int) -> str:
-    """Return "value ± sigma", with more than `decimals` where the sigma would else be shown as nothing.
+    """Return "value ± sigma" with `decimals`, or more if the sigma would be rounded to zero.
 
     >>> measured_words(120.0031, 0.0042, 2), measured_words(301.0, 0.5, 2), measured_words(301.0, None, 2)
     ('120.003 ± 0.004', '301.00 ± 0.50', '301.00')
@@ -218,24 +218,24 @@ def rounded_words(value: float, sigma: float) -> str:
 
 
 def rounded_parameters(camera: Camera, sigmas: FloatArray) -> dict[str, str]:
-    """Return the camera's parameters with their standard deviations (P,) in words, by their names."""
+    """Return "value ± sigma" of the camera's parameters by name; `sigmas` (P,)."""
     values, spreads = camera.named(camera.parameters), camera.named(sigmas)
     return {name: rounded_words(value, spreads[name]) for name, value in values.items()}
 
 
 def in_words(table: Table) -> list[bool]:
-    """Return which columns hold words: those are set to the left."""
+    """Return for each column whether it holds text, which is aligned to the left."""
     return [any(isinstance(row[j].value, str) for row in table.rows) for j in range(len(table.columns))]
 
 
 def below(table: Table) -> str:
-    """Return what stands below a table as text: its note, and what brackets mean where there are any."""
+    """Return the text below a table: its note, and the meaning of brackets if there are any."""
     printed = any(cell.paper is not None for row in table.rows for cell in row)
     return " ".join(filter(None, [table.note, "In brackets: the paper's." if printed else ""]))
 
 
 def _extra(table: Table, j: int) -> tuple[bool, bool]:
-    """Return whether column j needs a column of sigmas, and one of the paper's numbers."""
+    """Return whether column j has sigmas, and values of the paper."""
     cells = [row[j] for row in table.rows]
     return any(cell.sigma is not None for cell in cells), any(cell.paper is not None for cell in cells)
 
@@ -254,19 +254,18 @@ def _bar(cells: Sequence[str]) -> str:
 
 
 def _in_cell(text: str) -> str:
-    """Return words in one line for a spreadsheet, which takes a cell that begins like a formula for one: those are
-    quoted."""
+    """Return a text on one line for a spreadsheet; texts that begin like a formula are quoted."""
     text = _one_line(text)
     return f"'{text}" if text.lstrip().startswith(FORMULA) and not is_number(text) else text
 
 
 def _one_line(text: str) -> str:
-    """Return words without line ends or other control characters, which a terminal would obey."""
+    """Return a text with line ends and other control characters replaced by blanks."""
     return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def _escape_markdown(text: str) -> str:
-    """Return words as Markdown shows them: no markup, no HTML, no line of their own."""
+    """Return a text on one line with Markdown and HTML escaped."""
     return re.sub(r"[\\`*|<>\[\]]", r"\\\g<0>", _one_line(text))
 
 

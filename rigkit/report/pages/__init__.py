@@ -1,1 +1,1 @@
-"""The pages that verbs write, what they say, and their charts."""
+"""The HTML pages of verbs: their facts, charts and drawings."""

@@ -1,4 +1,4 @@
-"""Charts of a calibration as SVG: error by image and by radius, how residuals are spread, and the lens's curve."""
+"""Charts of a calibration as SVG: error by image and by radius, histogram of residuals, curve of the lens."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ LEFT, RIGHT, TOP, BOTTOM = 70.0, 24.0, 12.0, 46.0
 LINES, FAINT_WORDS = "#c2410c", "#5b6575"
 MAX_RESIDUAL_DOTS = 4000
 BARS_NAMED = 24
-"""More images are numbered only: their names would lie over each other."""
+"""Maximum number of images whose bars have names; more are numbered."""
 MAX_NAME = 16
-"""Longer names of images show their end,"""
+"""Longer names are truncated to their end."""
 LEVEL_NAME = 3
-"""and those of no more letters stand level."""
+"""Names of at most so many letters are horizontal, longer ones vertical."""
 LETTER = 7.4
-"""Width of a letter, at most."""
+"""Maximum width of a letter."""
 BINS = 41
 IMAGE_RINGS = 12
-"""Rings of equal numbers of corners, each with its own RMS."""
+"""Number of rings with equal numbers of corners, for the RMS by radius."""
 CURVE_POINTS = 120
 TICKS = (1.0, 2.0, 2.5, 5.0, 10.0)
 HALF_STEPS = np.arange(1.0, 10.1, 0.5)
@@ -41,7 +41,7 @@ Value = TypeVar("Value", float, FloatArray)
 
 
 class _Plot:
-    """Axes from data to the drawing."""
+    """Axes that map data to the drawing."""
 
     def __init__(
         self,
@@ -121,7 +121,7 @@ def images_svg(calibration: Calibration) -> str:
 
 
 def _short(names: Sequence[str]) -> list[str]:
-    """Return names without what all of them begin and end with, numbers whole; long ones by their end."""
+    """Return names without endings and without their common prefix (numbers are not split); long ones truncated."""
     stems = [Path(name).stem for name in names]
     if len(set(stems)) > 1:
         columns = zip(*stems, strict=False)
@@ -133,8 +133,8 @@ def _short(names: Sequence[str]) -> list[str]:
 
 
 def radius_svg(calibration: Calibration) -> str:
-    """Draw the error of every corner against its distance from the image's centre, and the RMS of rings: a lens that
-    the model does not follow shows in the outer ones."""
+    """Draw the error of every corner over its distance from the image centre, and the RMS of rings: a lens that the
+    model does not fit shows in the outer ones."""
     pixels, residuals = calibration.corners.used
     centre = 0.5 * (np.array(calibration.camera.size_px) - 1.0)
     radius, error = np.linalg.norm(pixels - centre, axis=1), np.linalg.norm(residuals, axis=1)
@@ -158,7 +158,7 @@ def radius_svg(calibration: Calibration) -> str:
 
 
 def histogram_svg(calibration: Calibration) -> str:
-    """Draw how often residuals of each size are, u and v together, beside the normal curve of their scatter."""
+    """Draw the histogram of residuals (u and v), with the normal distribution of their robust sigma."""
     _, residuals = calibration.corners.used
     values = residuals.reshape(-1)
     sigma = float(SIGMA_OF_MEDIAN * np.median(np.abs(values)))
@@ -181,8 +181,8 @@ def histogram_svg(calibration: Calibration) -> str:
 
 
 def lens_svg(calibration: Calibration) -> str:
-    """Draw where the lens puts a ray (px from the principal point) by its angle off the axis, to the right, beside the
-    perspective and the equidistant projection; the band is the uncertainty, magnified."""
+    """Draw the radius (px from the principal point, to the right) over the angle from the axis, and the perspective and
+    the equidistant projection to compare; the band is the magnified uncertainty."""
     camera = calibration.camera
     edge = np.array([[camera.size_px[0] - 1.0, 0.5 * (camera.size_px[1] - 1.0)]])
     axis, _ = camera.project(np.array([[0.0, 0.0, 1.0]]))
@@ -220,7 +220,7 @@ def lens_svg(calibration: Calibration) -> str:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Return round values between `low` and `high`, some five of them."""
+    """Return about five round values between `low` and `high`."""
     rough = max(high - low, 1e-12) / 5.0
     power = 10.0 ** np.floor(np.log10(rough))
     step = next(m * power for m in TICKS if m * power >= rough)

@@ -1,6 +1,6 @@
-"""Drawings of a calibration: residuals, what they have in common, coverage, and the uncertainty map.
+"""Drawings of a calibration: residuals, their local means, coverage, and the uncertainty map.
 
-Each is an SVG and, after it, the words that stand below (HTML).
+Each is an SVG followed by its caption (HTML).
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from rigkit.report import svg
 from rigkit.report.svg import DRAWN_WIDTH, INK, MARK, SOFT, WRONG, dots, round_down, strokes
 
 FOOT = 24.0
-"""Below the image: room for a scale or a bar of colours."""
+"""Height below the image for a scale or a colour bar."""
 MAX_VECTORS = 5000
-"""More residuals make the drawing black and the page heavy: of more, every second, third, ... is drawn."""
+"""Maximum number of residuals drawn; more are subsampled."""
 RMS_LENGTH = 0.02
-"""The RMS residual is drawn about as long as this part of the image's width."""
+"""Drawn length of the RMS residual, as a fraction of the image's width."""
 CELLS_ACROSS = 16
 MIN_IN_CELL = 4
-"""Corners that make a mean worth drawing."""
+"""Minimum number of corners of a mean."""
 CHANCE = 0.01
-"""Share of cells whose mean is drawn as beyond chance where there is chance only."""
+"""Significance level of a cell's mean."""
 MAP_GRID = (40, 30)
 MAP_PX = (0.003, 10.0)
-"""Ends of the colours of every uncertainty map, in equal ratios: maps of different calibrations can be compared."""
+"""Ends of the logarithmic colour scale of all uncertainty maps, so that maps can be compared."""
 CONTOURS_PX = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 ARROW_HEAD = 3.2
 """Length of the strokes of an arrow's head, in units of the drawing."""
@@ -38,7 +38,7 @@ VIRIDIS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [
 
 
 def residuals_svg(calibration: Calibration) -> str:
-    """Draw how far each corner was measured from where the calibration puts it, magnified; outliers as crosses."""
+    """Draw the magnified residual of each corner; outliers are crosses."""
     corners, (pixels, residuals) = calibration.corners, calibration.corners.used
     times = round_down(RMS_LENGTH * calibration.camera.size_px[0] / max(calibration.rms_px, 1e-9))
     step = -(-len(pixels) // MAX_VECTORS)
@@ -61,8 +61,8 @@ def residuals_svg(calibration: Calibration) -> str:
 
 
 def pattern_svg(calibration: Calibration) -> str:
-    """Draw the mean residual of each part of the image: chance leaves short grey arrows, a lens or board that the
-    model does not follow long coloured ones that agree with their neighbours."""
+    """Draw the mean residual of each cell of the image. Noise gives short grey arrows; a lens or board that the model
+    does not fit gives long coloured ones that agree with their neighbours."""
     pixels, residuals = calibration.corners.used
     width, height = calibration.camera.size_px
     size = width / CELLS_ACROSS
@@ -75,7 +75,7 @@ def pattern_svg(calibration: Calibration) -> str:
     squared = np.bincount(index, weights=(residuals**2).sum(axis=1), minlength=cells)
     enough = count >= MIN_IN_CELL
     mean = total[enough] / count[enough, None]
-    # Corners far out scatter more: each cell is judged by its own scatter about its mean.
+    # Corners near the border scatter more: each cell is tested by its own scatter about its mean.
     freedom = 2.0 * (count[enough] - 1.0)
     own = np.sqrt((squared[enough] - count[enough] * (mean**2).sum(axis=1)).clip(0.0) / freedom)
     reach = np.sqrt(freedom * (CHANCE ** (-2.0 / freedom) - 1.0))
@@ -97,7 +97,7 @@ def pattern_svg(calibration: Calibration) -> str:
 
 
 def coverage_svg(calibration: Calibration) -> str:
-    """Draw where corners were seen: every corner used, over cells as dark as they hold corners."""
+    """Draw every corner used, over cells whose darkness is their number of corners."""
     pixels, _ = calibration.corners.used
     width, height = calibration.camera.size_px
     columns, rows = 12, max(round(12 * height / width), 1)
@@ -124,7 +124,7 @@ def coverage_svg(calibration: Calibration) -> str:
 
 
 def uncertainty_svg(calibration: Calibration) -> str:
-    """Draw how uncertain the projection of a far point is over the image: one standard deviation, worst direction."""
+    """Draw the uncertainty of a far point's projection over the image: one standard deviation, worst direction."""
     width, height = calibration.camera.size_px
     grid = uncertainty_map(calibration, grid=MAP_GRID)
     known = np.isfinite(grid.worst_px)
@@ -150,7 +150,7 @@ def uncertainty_svg(calibration: Calibration) -> str:
 
 
 def _contours(worst_px: FloatArray, cell_width: float, cell_height: float) -> str:
-    """Return the lines of equal uncertainty over the map, each with its figure."""
+    """Return contour lines of the uncertainty with labels."""
     from contourpy import contour_generator
 
     rows, columns = worst_px.shape
@@ -164,7 +164,7 @@ def _contours(worst_px: FloatArray, cell_width: float, cell_height: float) -> st
         for line in lines:
             out.append(f'<path d="{svg.line(line)}" fill="none" stroke="#fff" stroke-opacity=".75" stroke-width="1"/>')
         if lines:
-            # Where the line is far from the figures that stand on the map.
+            # The label is placed far from the figures on the map.
             longest = max(lines, key=len)
             a, b = longest[np.linalg.norm(longest[:, None] - figures, axis=-1).min(axis=1).argmax()]
             out.append(f'<text x="{a:.1f}" y="{b:.1f}" font-size="12.5" fill="#fff">{value:g}</text>')
@@ -172,7 +172,7 @@ def _contours(worst_px: FloatArray, cell_width: float, cell_height: float) -> st
 
 
 def _scale(calibration: Calibration, times: float) -> str:
-    """Return a stroke below the drawing as long as a round number of pixels, magnified as the residuals are."""
+    """Return a scale bar of a round number of pixels, magnified as the residuals."""
     per_px = _zoom(calibration) * times
     length = round_down(0.15 * DRAWN_WIDTH / per_px)
     y, x = _zoom(calibration) * calibration.camera.size_px[1] + 12.0, DRAWN_WIDTH - 4.0
@@ -183,7 +183,7 @@ def _scale(calibration: Calibration, times: float) -> str:
 
 
 def _heads(start: FloatArray, by: FloatArray) -> str:
-    """Return the heads of arrows, two strokes each; arrows shorter than a head have none."""
+    """Return arrow heads of two strokes each, without those of short arrows."""
     length = np.linalg.norm(by, axis=-1, keepdims=True)
     long = length[:, 0] > 1.5 * ARROW_HEAD
     tip, along = (start + by)[long], (by / np.maximum(length, 1e-12))[long]
@@ -196,7 +196,7 @@ def _heads(start: FloatArray, by: FloatArray) -> str:
 
 
 def _colour_bar(y: float, low: float, high: float) -> str:
-    """Return a strip with the colours of the map, from `low` to `high` px in equal ratios."""
+    """Return the colour bar of the map from `low` to `high` px, logarithmic."""
     levels = np.linspace(0.0, 1.0, 24)
     strip = "".join(
         f'<rect x="{380 + 6 * k}" y="{y:.1f}" width="7" height="10" fill="{_colour(v)}"/>' for k, v in enumerate(levels)
@@ -205,7 +205,7 @@ def _colour_bar(y: float, low: float, high: float) -> str:
 
 
 def _numbers(calibration: Calibration) -> list[str]:
-    """Return the uncertainty in figures at the centre, the corners and the middles of the sides."""
+    """Return labels of the uncertainty at the centre, the corners and the middles of the sides."""
     at = grid_pixels(calibration.camera.size_px, (3, 3))
     worst = projection_uncertainty(calibration, at).worst_px
     zoom = _zoom(calibration)
@@ -248,8 +248,7 @@ def _open(calibration: Calibration, title: str) -> str:
 
 
 def _foot(calibration: Calibration, *lines: str) -> str:
-    """Close the drawing with a frame over what sticks out; what there is to say stands below it, as words of the page:
-    those stay legible where the drawing is small."""
+    """Return the end of the drawing with a frame, and the caption as HTML, which stays legible in small drawings."""
     height = _zoom(calibration) * calibration.camera.size_px[1]
     words = "<br>".join(escape(line) for line in lines if line)
     return (

@@ -1,4 +1,4 @@
-"""What the page of a calibration says: of one camera, and of the cameras of a rig."""
+"""The facts on the page of a calibration, of one camera or of a rig."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from rigkit.report.tables import rounded_parameters, rounded_words
 from rigkit.validation.check import Check
 
 FOCAL_STEP = 1e-3
-"""Step of derivatives of the focal length, in standard deviations: rounding leaves 1e-7 of them or so."""
+"""Step of the numerical derivatives of the focal length, in standard deviations; the rounding error is about 1e-7."""
 IN_PX = ("fx", "fy", "cx", "cy")
 MAX_RATIO_BEYOND = 3.0
-"""Where the projection is no worse than so many times the worst place that boards reached, all of the image serves."""
+"""If the uncertainty outside of the boards is below so many times its maximum inside, the whole image can be used."""
 BADGE_WORDS = {"good": "good", "look": "usable, with care", "bad": "do not use"}
 PASSED = {Severity.GOOD: True, Severity.LOOK: None, Severity.BAD: False}
 IMAGES_KEY, LEFT_OUT_KEY, NEXT_KEY = "images", "left-out", "plan"
-"""Keys of tables that the page shows with pictures."""
+"""Keys of tables that pages show with pictures."""
 
 
 def camera_facts(c: Calibration, plan: Plan | None = None) -> PageFacts:
-    """Return what the page says of one camera; `plan`: the pictures that would help most next."""
+    """Return the facts of one camera; `plan` has the pictures to take next."""
     tables = [_parameters(c), _candidates(c), _boards(c), _images(c)]
     if c.dropped:
         tables.append(
@@ -57,7 +57,7 @@ def camera_facts(c: Calibration, plan: Plan | None = None) -> PageFacts:
 
 
 def rig_facts(rig: RigCalibration, checks: Sequence[Check], cameras: Mapping[str, PageFacts]) -> PageFacts:
-    """Return what the page says of a rig, of which it says `cameras` one by one."""
+    """Return the facts of a rig, with those of its `cameras` as parts."""
     severity = worst(rig.verdicts)
     return PageFacts(
         headline=rig_reach(rig, checks),
@@ -76,7 +76,7 @@ def next_words(plan: Plan) -> str:
 
 
 def training_note(rms_px: float, heldout_rms_px: float | None) -> str:
-    """Return why the training RMS is above the held-out RMS, which readers take for a mistake; "" where it is not."""
+    """Return an explanation if the training RMS exceeds the held-out RMS, which looks like a mistake; else ""."""
     if heldout_rms_px is None or rms_px <= heldout_rms_px:
         return ""
     return "every corner alike, in the held-out RMS blurred ones count less"
@@ -93,7 +93,7 @@ def _basis(c: Calibration) -> str:
 
 
 def _reach(c: Calibration) -> str:
-    """Say how sure the projection is where boards were and beyond, in pixels."""
+    """Return the uncertainty of the projection where boards were and outside, in words."""
     far = FarProjection.of(c)
     if not np.isfinite(far.worst_px):
         return ""
@@ -115,22 +115,22 @@ def _reach(c: Calibration) -> str:
 
 
 def focal_words(c: Calibration) -> str:
-    """Return the focal length on the optical axis and its standard deviation, px a radian, in words.
+    """Return the focal length on the optical axis with its standard deviation, px a radian, in words.
 
-    fx and fy are that in some models only: those of a narrow double sphere may be several times less.
+    Only in some models is it fx and fy: in a narrow double sphere these may be several times smaller.
     """
     p, sigmas, here = c.camera.parameters, c.parameter_sigmas, c.camera.focal_px
-    # Far less than is known of each number: so near the focal length is a straight line.
+    # Steps far below the standard deviations, where the focal length is linear.
     steps = np.where(sigmas > 0.0, FOCAL_STEP * sigmas, FOCAL_STEP * np.maximum(np.abs(p), 1.0))
 
     def moved(k: int, step: float) -> tuple[float, float]:
-        """Return the focal length beside `here`, and by how much the parameter; both 0 beyond the model."""
+        """Return the changes of focal length and parameter k; both 0 outside of the model's domain."""
         try:
             return c.camera.with_parameters(p + step * (np.arange(p.size) == k)).focal_px - here, step
         except InputError:
             return 0.0, 0.0
 
-    # A lens at the edge of its model, such as eucm with alpha = 0, has neighbours on one side.
+    # At the edge of a model's domain, such as eucm with alpha = 0, the difference is one-sided.
     sides = np.array([np.subtract(moved(k, step), moved(k, -step)) for k, step in enumerate(steps.tolist())])
     gradient = sides[:, 0] / np.maximum(sides[:, 1], np.finfo(float).tiny)
     sigma = c.widening * float(np.sqrt(max(gradient @ c.covariance @ gradient, 0.0)))
@@ -171,7 +171,7 @@ def _boards(c: Calibration) -> Table:
 
 
 def _images(c: Calibration) -> Table:
-    """Return every view: where the board was, and how well it is shown."""
+    """Return the table of views: error, corners, and distance and tilt of the board."""
     middle_mm = {board.board_id: board.points_mm.mean(axis=0) for board in c.boards}
     rows = []
     for view in c.views:

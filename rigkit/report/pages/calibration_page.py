@@ -1,4 +1,4 @@
-"""A calibration as an HTML page: how good it is first, then what it rests on, picture by picture."""
+"""The HTML page of a calibration: verdict first, then tables, drawings and images."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from rigkit.report.render import data_uri, drawing, render, shown_table
 from rigkit.validation.check import Check
 
 THUMBNAILS_PX = (640, 320)
-"""Width of the thumbnails: large ones can be enlarged, small ones are twice what the page shows, for dense screens."""
+"""Width of large and small thumbnails; the small ones are twice as wide as shown, for high-resolution screens."""
 MAX_LARGE = 40
-"""More images than this get small thumbnails: the page stays below 5 MB."""
+"""More images get small thumbnails, so that the page stays below 5 MB."""
 PAGE_JPEG_QUALITY = 70
 KEPT_COLOUR, LEFT_OUT_COLOUR = (60, 220, 60), (60, 60, 255)
-"""Blue, green, red of the corners in thumbnails."""
+"""BGR colours of the corners in thumbnails."""
 DRAWINGS: tuple[tuple[str, Callable[[Calibration], str]], ...] = (
     ("Projection uncertainty", uncertainty_svg),
     ("Residuals", residuals_svg),
@@ -59,8 +59,8 @@ class CalibrationSection:
 
     Attributes
     ----------
-    thumbnails : JPEG, by name of the image; not every image needs one.
-    plan : the pictures that would help most next; None: the page shows none.
+    thumbnails : JPEG by image name; not every image needs one.
+    plan : pictures to take next, or None.
     """
 
     name: str
@@ -79,9 +79,9 @@ def build_calibration_page(
     rig: RigCalibration | None = None,
     checks: Sequence[Check] = (),
 ) -> str:
-    """Return the page as HTML that needs no other file.
+    """Return the page as self-contained HTML.
 
-    `rig` is what the cameras share; `checks` compare it with what a person measured.
+    `rig` is the rig of the cameras; `checks` compare it with measurements.
     """
     return render(
         "calibration.html",
@@ -94,8 +94,8 @@ def build_calibration_page(
 
 
 def thumbnail_jpeg(image: Image, views: Sequence[ViewResult] = (), *, count: int = 1) -> bytes:
-    """Return a small picture of `image` ((H, W) or (H, W, 3) RGB), one of `count` on the page, with the corners of its
-    views: used ones as dots, those left out as rings."""
+    """Return a thumbnail of `image` ((H, W) or (H, W, 3) RGB), one of `count` on the page, with the corners of its
+    views: inliers as dots, outliers as rings."""
     wide = THUMBNAILS_PX[count > MAX_LARGE]
     zoom = wide / image.shape[1]
     size = (wide, max(round(image.shape[0] * zoom), 1))
@@ -115,7 +115,7 @@ def thumbnail_jpeg(image: Image, views: Sequence[ViewResult] = (), *, count: int
 
 
 def _shared(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
-    """Return what the cameras share, as the template shows it."""
+    """Return the rig for the template."""
     facts = rig_facts(rig, checks, {})
     return {
         **_summary(rig, facts, "frames"),
@@ -125,7 +125,7 @@ def _shared(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
 
 
 def _shown(section: CalibrationSection) -> dict[str, Any]:
-    """Return one camera in words and pictures, as the template shows it."""
+    """Return one camera for the template."""
     c = section.calibration
     facts = camera_facts(c, section.plan)
     sources = {name: data_uri("image/jpeg", data) for name, data in section.thumbnails.items()}
@@ -141,7 +141,7 @@ def _shown(section: CalibrationSection) -> dict[str, Any]:
 
 
 def _pictures(table: Table, sources: Mapping[str, str]) -> list[str | None]:
-    """Return the picture of each row of a table of images, each with the first of its boards; of others none."""
+    """Return the pictures of the rows of a table of images, each image once; [] for other tables."""
     if table.key not in (IMAGES_KEY, LEFT_OUT_KEY):
         return []
     names = [str(row[0].value) for row in table.rows]
@@ -149,8 +149,7 @@ def _pictures(table: Table, sources: Mapping[str, str]) -> list[str | None]:
 
 
 def _summary(c: Calibration | RigCalibration, facts: PageFacts, taken: str) -> dict[str, Any]:
-    """Return what is said first, of a camera or a rig alike: how good it is, severity, colour and words of each
-    finding, the gravest first, and what it rests on."""
+    """Return the summary of a camera or a rig for the template: errors, findings (the most severe first) and basis."""
     held, note = c.heldout_rms_px, training_note(c.rms_px, c.heldout_rms_px)
     return {
         "heldout": f"not available (too few {taken})" if held is None else f"{held:.3f} px",

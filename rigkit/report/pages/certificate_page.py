@@ -1,4 +1,4 @@
-"""A certificate in words, as a table, as one HTML page and as one sheet of A4."""
+"""A certificate as facts, table, HTML page, and A4 sheet."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ WHAT = {
 }
 A4_INCHES = (8.27, 11.69)
 LEVELS = 8
-"""Contours of the bound."""
+"""Number of contours of the bound."""
 COVERED = 98.0
-"""The colours end at this percentile: at the rim of the field the bound grows without end."""
+"""Percentile at which the colours end: at the border of the field the bound is unlimited."""
 LINE_CHARACTERS = 98
 
 
 def certificate_facts(certificate: Certificate, limit: float | None = None) -> PageFacts:
-    """Return what a certificate states, against `limit` (in the task's unit) where one is given, and its table.
+    """Return the facts of a certificate, compared with `limit` (in the task's unit) if given.
 
-    What rests on a calibration that was called bad is no certificate, whatever the limit.
+    A certificate of a calibration with a verdict BAD never passes.
     """
     task, unit = certificate.task, certificate.task.unit
     what = WHAT[task.quantity].format(size=f"{task.size_mm:g}") + f", {task.distance_mm:g} mm away"
@@ -67,7 +67,7 @@ def _sentence(finding: Finding) -> str:
 
 
 def causes_table(certificate: Certificate) -> Table:
-    """Return what each cause contributes, one standard deviation, and its part of the variance where it is worst."""
+    """Return the standard deviation from each cause, and its part of the variance at the worst place."""
     unit, shares = certificate.task.unit, certificate.shares()
     row, column = certificate.worst_place
     rows = tuple(
@@ -83,7 +83,7 @@ def causes_table(certificate: Certificate) -> Table:
 def certificate_page(
     certificate: Certificate, title: str, provenance: Mapping[str, str], limit: float | None = None
 ) -> str:
-    """Return the certificate as an HTML page that needs no other file."""
+    """Return the certificate as self-contained HTML."""
     return build_facts_page(
         title,
         certificate_facts(certificate, limit),
@@ -104,7 +104,7 @@ def certificate_pdf(
 
 
 def basis(certificate: Certificate) -> dict[str, str]:
-    """Return what the certificate rests on, in words."""
+    """Return the basis of the certificate: cameras, corners, baseline and statistics, in words."""
     i = certificate.instrument
     cameras = "; ".join(
         f"'{name}', {camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px"
@@ -125,7 +125,7 @@ def basis(certificate: Certificate) -> dict[str, str]:
 
 
 def bound_figure(certificate: Certificate) -> Figure:
-    """Draw the bound over the image of the first camera, and the causes in the middle and where it is worst."""
+    """Draw the bound over the image of the first camera, and the causes at the median and the worst place."""
     figure = new_figure(8, 4.2, dpi=DPI, layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 1.15))
     _draw_map(left, certificate)
@@ -134,7 +134,7 @@ def bound_figure(certificate: Certificate) -> Figure:
 
 
 def sheet_pdf(certificate: Certificate, title: str, statements: Sequence[str], facts: Sequence[str]) -> bytes:
-    """Return one page of A4: what is stated, the map and the causes, what it rests on, and room for a signature."""
+    """Return one A4 page with statements, map, causes, basis, and lines for a signature."""
     figure = new_figure(*A4_INCHES)
     figure.text(0.09, 0.945, title, fontsize=15, weight="bold", va="top")
     top = _write(figure, 0.905, statements, size=9.5)
@@ -190,7 +190,7 @@ def _draw_causes(axis: Any, certificate: Certificate) -> None:
 
 
 def _write(figure: Figure, top: float, paragraphs: Sequence[str], *, size: float) -> float:
-    """Write paragraphs from `top` downwards; return where they end."""
+    """Write paragraphs downwards from `top`; return the position of their end."""
     step = size * 1.45 / (72.0 * A4_INCHES[1])
     for paragraph in paragraphs:
         for line in textwrap.wrap(paragraph, int(LINE_CHARACTERS * 9.5 / size)):

@@ -1,4 +1,4 @@
-"""A check of a calibration in words, as a table and as a page."""
+"""A check of a calibration as facts, tables, and HTML page."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from rigkit.validation.sentinel.power import FOUND, TIMES, Power
 
 ARROWS = (21, 16)
 ARROW_LENGTH = 0.05
-"""The largest arrow is as long as this part of the image's width."""
+"""Drawn length of the largest arrow, as a fraction of the image's width."""
 LIKELY_SEEN = 0.5
-"""Pictures that would miss a change more often than find it do not say that there was none."""
+"""Pictures with a smaller chance to detect a change do not prove that there was none."""
 PART_OF = {"focus": "lens", "principal point": "lens", "distortion": "lens", "rotation": "moved", "shift": "moved"}
-"""What changes in several ways are made of."""
+"""Kinds of changes that are parts of a combined kind."""
 
 
 def check_facts(check: SentinelCheck) -> PageFacts:
-    """Return what a check states, and its tables."""
+    """Return the facts of a check."""
     frames = counted(check.frames, "fresh frame")
     p = f"p = {check.chance:.3g}"
     sentences = [
@@ -61,7 +61,7 @@ def check_facts(check: SentinelCheck) -> PageFacts:
             "or another board; check what was photographed, and calibrate anew."
         )
     else:
-        # What changed in several ways is told by what it does alone.
+        # The amounts of a combined change are not named: only its effect is meaningful.
         what = change.hypothesis.words if change.hypothesis.kind == "lens" else change
         message = "Moved since" if check.baseline is not None else "Does NOT hold"
         headline = f"{message} ({p}): {what}; {_cost_words(check, change)}"
@@ -90,7 +90,7 @@ def check_facts(check: SentinelCheck) -> PageFacts:
 
 
 def _since_words(then: Baseline | None) -> list[str]:
-    """Return what frames of before say of the file, where there are any."""
+    """Return a sentence about the earlier frames; [] without them."""
     if then is None:
         return []
     return [
@@ -100,7 +100,7 @@ def _since_words(then: Baseline | None) -> list[str]:
 
 
 def _cost_words(check: SentinelCheck, change: Change) -> str:
-    """Return what a change costs: in the length that is measured, or of what is a metre away."""
+    """Return the cost of a change in words: in the measured length, or in the projection."""
     if check.cost_unit != "px":
         return f"an error of {check.cost:.2g} {check.cost_unit} rms in the length"
     c = 0 if change.hypothesis.camera is None else check.monitored.names.index(change.hypothesis.camera)
@@ -108,7 +108,7 @@ def _cost_words(check: SentinelCheck, change: Change) -> str:
 
 
 def _nearest_words(check: SentinelCheck, change: Change) -> str:
-    """Return what explains most of a change in several ways by itself, "" for other changes."""
+    """Return the single change that explains most of a combined change, in words; "" for other changes."""
     simpler = [
         c
         for c in check.tried
@@ -123,7 +123,7 @@ def _nearest_words(check: SentinelCheck, change: Change) -> str:
 
 
 def _could_have_found(power: Power) -> str:
-    """Return what the change that is seen worst would have needed."""
+    """Return the chance to detect the least visible change, and what would raise it, in words."""
     whose = "" if power.camera is None else f" of camera '{power.camera}'"
     size = f"{power.size:g} {power.unit}"
     seen = f"A change of {size} rms over the image" if power.unit == "px" else f"A turn of {size}"
@@ -147,7 +147,7 @@ def _frames_needed(power: Power) -> str:
 
 
 def power_table(powers: Sequence[Power], title: str = "What these pictures would have found") -> Table:
-    """Return how well changes are seen."""
+    """Return the table of the chances to detect changes."""
     heads = columns(f"change | of | found with chance .2 | {FOUND:.0%} found from | frames for {FOUND:.0%}")
     rows = tuple(
         cells(
@@ -164,7 +164,7 @@ def power_table(powers: Sequence[Power], title: str = "What these pictures would
 
 
 def check_table(check: SentinelCheck) -> Table:
-    """Return everything that may have happened, each as if it alone had."""
+    """Return the table of possible changes, each as if it alone had happened."""
     rows = []
     for change in check.tried:
         amounts = ", ".join(
@@ -179,7 +179,7 @@ def check_table(check: SentinelCheck) -> Table:
 
 
 def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
-    """Return what a program needs to know."""
+    """Return the check as JSON values."""
     change, facts = check.change, check_facts(check)
     return {
         "holds": check.holds,
@@ -199,7 +199,7 @@ def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
 
 
 def check_page(check: SentinelCheck, title: str, provenance: Mapping[str, str]) -> str:
-    """Return the check as an HTML page that needs no other file."""
+    """Return the check as self-contained HTML."""
     chance = check.holds and check.chance >= ALARM_CHANCE
     moves = "no more than chance; magnified" if chance else "how the best explanation moves what it sees"
     return build_facts_page(
@@ -211,7 +211,7 @@ def check_page(check: SentinelCheck, title: str, provenance: Mapping[str, str]) 
 
 
 def change_svg(check: SentinelCheck, c: int) -> str:
-    """Draw how the best explanation moves the projection of camera `c` of what stays where it is, magnified."""
+    """Draw how the most likely change moves the projection of fixed points in camera `c`, magnified."""
     before, after = far_camera(check.monitored.cameras[c]), far_camera(check.fixed.cameras[c])
     turn = check.fixed.cam_from_rig[c].rotation @ check.monitored.cam_from_rig[c].rotation.T
     pixels = grid_pixels(before.size_px, ARROWS).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""A dense cloud as a page: it turns in any browser, and what it needs is inside."""
+"""A dense cloud as a self-contained page with an interactive view."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from rigkit.core.cloud import OrientedCloud
 from rigkit.report.render import render
 
 MAX_DRAWN = 150_000
-"""Points of a page: of more, every second, third, ... is shown."""
+"""Maximum number of points on the page; larger clouds are subsampled."""
 REACH_QUANTILE = 0.95
-"""Of the points' distances from their middle: a few far ones do not make the others small."""
+"""Quantile of the points' distances from their median that scales the view: a few far points do not shrink it."""
 SPACING_SAMPLES = 2000
 POINT_SIDE = 2.0
-"""Side of a drawn point, in distances to its nearest neighbour: surfaces look closed."""
+"""Side of a drawn point, in distances to its nearest neighbour, so that surfaces look closed."""
 
 
 def build_cloud_page(title: str, cloud: OrientedCloud, provenance: Mapping[str, str], *, unit: str) -> str:
-    """Return the page of a cloud of at least two points as text; lengths are in `unit`."""
+    """Return the page of a cloud of two points or more; lengths are in `unit`."""
     from scipy.spatial import cKDTree
 
     shown = cloud.select(np.arange(len(cloud)) % (1 + (len(cloud) - 1) // MAX_DRAWN) == 0)

@@ -1,4 +1,4 @@
-"""A register of checks over months as a page: drift plots, the same over the temperature, every entry."""
+"""A register of checks over months as a page: drift over time and over temperature, and all entries."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from rigkit.validation.sentinel.judge import ALARM_CHANCE
 DRIFT_HEIGHT, LEFT_MARGIN = 190.0, 56.0
 ZERO_HEIGHT = 0.5 * (DRIFT_HEIGHT - 24.0)
 CONTROL_SIGMAS = 3.0
-"""Control limits: what one amount of unchanged cameras leaves in one of 370 checks."""
+"""Control limits, which an amount exceeds in one of 370 checks of an unchanged camera."""
 
 
 def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
-    """Return what the page of a register says."""
+    """Return the facts of a register."""
     alarms = sum(not entry.holds for entry in entries)
     labels = {0: "none an alarm", 1: "one an alarm"}.get(alarms, f"{alarms} of them alarms")
     count = "one entry" if len(entries) == 1 else f"{len(entries)} entries, {labels}"
@@ -52,7 +52,7 @@ def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
 
 
 def overwritten(kept: Sequence[Edition]) -> tuple[str, ...]:
-    """Return which calibrations were replaced by others of the same name, in sentences."""
+    """Return sentences about calibration files that were overwritten."""
     lines = []
     for watched in dict.fromkeys(edition.watched for edition in kept if edition.several):
         own = [edition for edition in kept if edition.watched == watched]
@@ -65,8 +65,8 @@ def overwritten(kept: Sequence[Edition]) -> tuple[str, ...]:
 
 
 def history_page(entries: Sequence[HistoryEntry], title: str, provenance: Mapping[str, str]) -> str:
-    """Return the register as a page: of each calibration a drift plot for each thing that may change, over time and,
-    where temperatures differ, over these; then every entry."""
+    """Return the page of a register, with drift plots of each calibration and amount over time and, if temperatures
+    differ, over temperature."""
     kept = editions(entries)
     drawings = []
     for edition in kept:
@@ -85,7 +85,7 @@ def _names(edition: Edition) -> list[str]:
 
 
 def _warm(edition: Edition, name: str) -> list[HistoryEntry]:
-    """Return the entries that say an amount and the temperature, by temperature."""
+    """Return the entries with this amount and a temperature, sorted by temperature."""
     own = [entry for entry in edition.entries if name in entry.amounts and entry.temperature_c is not None]
     return sorted(own, key=lambda entry: entry.temperature_c or 0.0)
 
@@ -103,7 +103,7 @@ def _celsius(entries: Sequence[HistoryEntry]) -> FloatArray:
 
 
 def _heat_tables(kept: Sequence[Edition]) -> tuple[Table, ...]:
-    """Return how amounts go with the temperature, where entries tell."""
+    """Return the table of drifts with temperature; () without any."""
     rows: list[tuple[Cell, ...]] = []
     for edition in kept:
         for name in _names(edition):
@@ -122,7 +122,7 @@ def _heat_tables(kept: Sequence[Edition]) -> tuple[Table, ...]:
 
 
 def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
-    """Draw one amount over time with its standard deviations, zero (as calibrated), and the control limits."""
+    """Draw an amount over time with standard deviations, zero (as calibrated) and control limits."""
     own = [entry for entry in entries if name in entry.amounts]
     days = np.array([entry.moment.timestamp() / 86400.0 for entry in own])
     value, sigma = np.array([entry.amounts[name] for entry in own]).T
@@ -130,7 +130,7 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
     top = _top(float(limit.max()), value, sigma)
     x = _across(days)
     out = [svg.opened(name, f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
-    # One picture tells less than three: every entry has its own limits, up to halfway to its neighbours.
+    # The limits depend on the number of pictures: every entry has its own, up to halfway to its neighbours.
     ends = np.concatenate([[LEFT_MARGIN], 0.5 * (x[1:] + x[:-1]), [DRAWN_WIDTH - 6.0]])
     for side, colour, dash in ((0.0, SOFT, ""), (1.0, WRONG, "5 4"), (-1.0, WRONG, "5 4")):
         height = np.repeat(ZERO_HEIGHT * (1.0 - side * limit / top), 2)
@@ -145,7 +145,7 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
 
 
 def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str:
-    """Draw one amount over the temperature of entries (by it), with its standard deviations and the line through it."""
+    """Draw an amount over temperature, with standard deviations and the fitted line; `entries` by temperature."""
     celsius = _celsius(entries)
     value, sigma = np.array([entry.amounts[name] for entry in entries]).T
     top = _top(0.0, value, sigma)
@@ -164,25 +164,25 @@ def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str
 
 
 def _top(limit: float, value: FloatArray, sigma: FloatArray) -> float:
-    """Return the amount at the upper rim of a drawing."""
+    """Return the amount at the upper edge of a drawing."""
     return 1.1 * max(limit, float((np.abs(value) + sigma).max()), np.finfo(float).tiny)
 
 
 def _across(values: FloatArray) -> FloatArray:
-    """Return where values are between the left and the right of a drawing; one alone in the middle."""
+    """Return x coordinates of values, from the left to the right of a drawing; a single one in the middle."""
     part = (values - values[0]) / max(float(np.ptp(values)), 1e-9) if len(values) > 1 else np.full(1, 0.5)
     return np.asarray(LEFT_MARGIN + (DRAWN_WIDTH - LEFT_MARGIN - 14.0) * part)
 
 
 def _below(x: FloatArray, labels: Sequence[str]) -> list[str]:
-    """Return the words below the first and the last of the points at `x`."""
+    """Return the labels below the first and the last point."""
     if len(labels) == 1:
         return [svg.words(x[0], DRIFT_HEIGHT - 6, labels[0], "middle")]
     return [svg.words(x[k], DRIFT_HEIGHT - 6, labels[k], anchor) for k, anchor in ((0, "start"), (-1, "end"))]
 
 
 def _points(entries: Sequence[HistoryEntry], name: str, x: FloatArray, top: float) -> list[str]:
-    """Return the amount of each entry at `x` with its standard deviation."""
+    """Return the points of entries at `x` with their standard deviations."""
     out = []
     for a, entry in zip(x, entries, strict=True):
         value, sigma = entry.amounts[name]

@@ -1,4 +1,4 @@
-"""The HTML report: one page without network access, with an interactive 3D view of every pair."""
+"""The HTML report of a validation: a self-contained page with an interactive 3D view of every pair."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rigkit.report.render import data_uri, render, shown_table
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairSection:
-    """What the page shows of one pair."""
+    """One pair on the page."""
 
     pair_id: str
     lead: str
@@ -34,8 +34,8 @@ def build_page(
     provenance: Mapping[str, str],
     remarks: Sequence[str] = (),
 ) -> str:
-    """Return the page as text; everything it needs is inside it. Its 3D view is of the first pair that fails, or of the
-    first; `remarks` stand below the tables of the `summary`."""
+    """Return the self-contained page. Its first 3D view shows the first failed pair, or the first one; `remarks` are
+    below the `summary` tables."""
     shown = [
         {
             "pair_id": pair.pair_id,
@@ -67,7 +67,7 @@ def validation_facts(
     pairs: Sequence[PairSection],
     remarks: Sequence[str] = (),
 ) -> PageFacts:
-    """Return what the page of a validation says."""
+    """Return the facts of a validation."""
     return PageFacts(
         headline=verdict.headline,
         badge=verdict.badge,

@@ -1,5 +1,4 @@
-"""What a page says, apart from its pictures: for the page and for programs alike, so that neither lacks what the other
-has; and the page of such facts in the one look of all."""
+"""The facts of a page without its pictures, for both the page and `--json`, and the common page layout."""
 
 from __future__ import annotations
 
@@ -18,17 +17,17 @@ BADGES = {None: "look", True: "pass", False: "fail"}
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PageFacts:
-    """What a page says.
+    """The facts of a page.
 
     Attributes
     ----------
     headline : the result in the user's units.
     badge : the verdict in a word or two; "": none.
-    passed : its colour: good, bad, or (None) neither.
-    sentences : below the headline.
-    basis : what the result rests on.
-    tables : every table.
-    parts : the same of the cameras, or pairs, that the page is of, by name.
+    passed : whether the verdict is good; None: neither good nor bad.
+    sentences : sentences below the headline.
+    basis : data that the result is based on.
+    tables : all tables.
+    parts : facts of the page's cameras or pairs by name.
     """
 
     headline: str
@@ -40,7 +39,7 @@ class PageFacts:
     parts: Mapping[str, PageFacts] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as a document of its own, rigkit.page/1."""
+        """Return the facts as a document of schema rigkit.page/1."""
         return {
             "schema": PAGE_SCHEMA,
             **self._summary(),
@@ -59,7 +58,7 @@ class PageFacts:
 
 
 def verdict_line(facts: PageFacts) -> dict[str, str]:
-    """Return the verdict that stands first: in a word or two, and the result in the user's units."""
+    """Return badge, colour and headline for the template."""
     return {"words": facts.badge, "colour": BADGES[facts.passed], "headline": facts.headline}
 
 
@@ -73,15 +72,15 @@ def build_facts_page(
     drawings: Sequence[tuple[str, str]] = (),
     signed: bool = False,
 ) -> str:
-    """Return the page as text; everything it needs is inside it.
+    """Return the self-contained page of `facts`.
 
     Parameters
     ----------
-    title, facts, provenance : what every page has.
+    title, facts, provenance : content of every page.
     links : (words, page) below the sentences.
-    pictures : (words for those who cannot see them, what draws a figure as PNG), drawn for light and for dark screens.
-    drawings : (heading, SVG of rigkit itself).
-    signed : whether it ends in lines for date, name and signature.
+    pictures : (alternative text, function that draws a PNG), drawn for light and for dark screens.
+    drawings : (heading, SVG of rigkit).
+    signed : whether the page ends in lines for date, name and signature.
     """
     return render(
         "facts.html",

@@ -1,4 +1,4 @@
-"""Views to take: drawn into the image as outlines to hold the board into, in words, and as a page."""
+"""A plan of views in words, as drawings of the board in the image, and as HTML page."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ VIEW_WIDTH = 320.0
 """Width of a drawn view, in units of the drawing."""
 CIRCLE_CORNERS = 12
 MAX_DOTS = 1500
-"""More corners taken so far make the drawing black: of more, a part is drawn."""
+"""Maximum number of earlier corners drawn; more are subsampled."""
 
 
 def plan_words(plan: Plan) -> list[str]:
-    """Return one line a view, the error after it last."""
+    """Return one line for each view, with the error after it."""
     unit, several = plan.goal.unit, len({v.board.board_id for v in plan.views}) > 1
     lines = []
     for number, view in enumerate(plan.views, start=1):
@@ -43,7 +43,7 @@ def plan_words(plan: Plan) -> list[str]:
 
 
 def plan_to_dict(plan: Plan) -> dict[str, Any]:
-    """Return what a program needs to know."""
+    """Return the plan as JSON values."""
     return {
         "goal": plan.goal.what,
         "unit": plan.goal.unit,
@@ -68,10 +68,10 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
 
 
 def plan_table(plan: Plan) -> Table:
-    """Return the error of the goal after each view."""
+    """Return the table of the goal's error after each view."""
     heads = (Column("views more"), Column(plan.goal.what, plan.goal.unit), Column("less than before by", "%", 0))
     errors = [plan.error, *(view.error for view in plan.views)]
-    # Before the first picture nothing is told of a change: its share is taken from the first error there is.
+    # Without pictures the error is infinite: changes are relative to the first finite error.
     first = next((k for k, error in enumerate(errors) if np.isfinite(error)), len(errors))
     rows = tuple(
         cells(str(k), float(f"{errors[k]:.4g}"), 100.0 * (1.0 - errors[k] / errors[first]))
@@ -81,7 +81,7 @@ def plan_table(plan: Plan) -> Table:
 
 
 def view_svg(plan: Plan, index: int, taken: Pixels | None = None) -> str:
-    """Draw the board as it should be seen, over the corners (N, 2) that were taken so far."""
+    """Draw the board as it should be seen, over the earlier corners `taken` (N, 2)."""
     view = plan.views[index]
     camera = view.camera
     zoom = VIEW_WIDTH / camera.size_px[0]
@@ -99,7 +99,7 @@ def view_svg(plan: Plan, index: int, taken: Pixels | None = None) -> str:
 
 
 def printed_outlines(camera: Camera, board: Board, cam_from_board: Rigid3) -> list[Pixels]:
-    """Return the outlines (K, 2) in the image of what is printed on a board, of what the lens sees whole."""
+    """Return the image outlines (K, 2) of the printed shapes of a board that the lens sees completely."""
     ink = board.ink()
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     out = []
@@ -121,7 +121,7 @@ def _path(pixels: Pixels) -> str:
 
 
 def plan_facts(plan: Plan, found: Sequence[Table] = ()) -> PageFacts:
-    """Return what the page of a plan says, with tables of what else the pictures bring."""
+    """Return the facts of a plan; `found` are tables of further improvements."""
     headline = f"{plan_lead(plan, 'after these pictures')}."
     return PageFacts(
         headline=headline[0].upper() + headline[1:],
@@ -131,7 +131,7 @@ def plan_facts(plan: Plan, found: Sequence[Table] = ()) -> PageFacts:
 
 
 def plan_lead(plan: Plan, then: str) -> str:
-    """Return the error of the goal as it is now, if there is any, and as it will be `then`."""
+    """Return in words the error of the goal now, if finite, and `then`, after the plan."""
     now = f"{plan.error:.3g} {plan.goal.unit} now, " if np.isfinite(plan.error) else ""
     unit = "" if now else f" {plan.goal.unit}"
     return f"{plan.goal.what}: {now}{plan.views[-1].error:.3g}{unit} {then}"
@@ -140,7 +140,7 @@ def plan_lead(plan: Plan, then: str) -> str:
 def plan_page(
     plan: Plan, title: str, provenance: Mapping[str, str], taken: Pixels | None = None, found: Sequence[Table] = ()
 ) -> str:
-    """Return the plan as an HTML page that needs no other file."""
+    """Return the plan as self-contained HTML."""
     facts = plan_facts(plan, found)
     return render(
         "plan.html",
@@ -155,5 +155,5 @@ def plan_page(
 
 
 def shown_views(plan: Plan, taken: Pixels | None = None) -> list[tuple[str, Any]]:
-    """Return words and drawing of each view, as the template `views.html` shows them."""
+    """Return words and drawing of each view for the template `views.html`."""
     return [(words, drawing(view_svg(plan, k, taken))) for k, words in enumerate(plan_words(plan))]

@@ -1,4 +1,4 @@
-"""A synthetic study as a page: which statements hold, the box plots, the tables."""
+"""The HTML page of a synthetic study: statements, box plots and tables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
 
 def study_page(found: StudyTable, provenance: Mapping[str, str], *, drawn: bytes | None = None) -> str:
-    """Return the study as an HTML page that needs no other file; `drawn`: its figure, where there is one as PNG."""
+    """Return the study as self-contained HTML; `drawn` is its figure as PNG, if drawn already."""
     held = sum(verdict.holds for verdict in found.verdicts)
     count = len(found.verdicts)
     headline = f"{held} of {count} statements of this study hold" if count else "A study without statements to judge"
@@ -34,7 +34,7 @@ def study_page(found: StudyTable, provenance: Mapping[str, str], *, drawn: bytes
 
 
 def study_tables(found: StudyTable) -> tuple[Table, ...]:
-    """Return a table a pose type (rows: noise and plane, columns: methods; medians and quartiles) and the verdicts."""
+    """Return one table for each pose type (medians and quartiles by noise, plane and method), and the statements."""
     study = found.study
     tables = [_median_table(found, str(pose_type)) for pose_type in study.pose_types]
     if found.verdicts:
@@ -44,7 +44,7 @@ def study_tables(found: StudyTable) -> tuple[Table, ...]:
 
 
 def cell_table(found: StudyTable) -> Table:
-    """Return every statistic of every cell, one cell a row."""
+    """Return all statistics of all cells, one row for each cell."""
     heads = columns(
         f"pose type | noise [{found.study.unit}] | method | plane | estimates .0 | missing .0 | median [deg] | "
         "lower quartile [deg] | upper quartile [deg] | lower whisker [deg] | upper whisker [deg] | mean [deg]"
@@ -81,7 +81,7 @@ def _plane(plane: int) -> str:
 
 
 def study_setup(study: Study) -> str:
-    """Return what was simulated, in words."""
+    """Return the simulated setup in words."""
     images = {"1": "image 1", "2": "image 2", "both": "both images"}[str(study.images)]
     corners = STUDY_PLANES * study.board.corner_count
     return f"noise on {study.noise} of {images}; {study.trials} trials of {corners} corners"

@@ -1,4 +1,4 @@
-"""The validation of a data set as an HTML page: verdicts first, then every pair with its pictures and 3D view."""
+"""Tables and sections of the HTML page of a validation."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SUMMARY_WORDS = (
 
 
 def summary_table(reports: Sequence[ValidationReport]) -> Table:
-    """Return one line a pair: what was measured, what came out, and whether it holds."""
+    """Return one row for each pair: errors, baseline measured and computed, and verdict."""
     heads = columns(
         "pair | pose type | estimator | points .0 | worst angle error [deg] | mean normal error [deg] | "
         "baseline measured [mm] .1 | baseline [mm] .2 | Sampson rms [px] | verdict"
@@ -48,7 +48,7 @@ def summary_table(reports: Sequence[ValidationReport]) -> Table:
 
 
 def camera_table(calibrations: Mapping[str, Calibration]) -> Table:
-    """Return one line a calibrated camera: what it rests on and how good it is."""
+    """Return one row for each calibrated camera: images, corners, errors and uncertainty."""
     heads = columns(
         "camera | model | images .0 | corners .0 | held-out RMS [px] | training RMS [px] | "
         "uncertainty, median [px] .4 | uncertainty, 95 % [px] .4 | remarks"
@@ -71,7 +71,7 @@ def camera_table(calibrations: Mapping[str, Calibration]) -> Table:
 
 
 def camera_remarks(calibrations: Mapping[str, Calibration]) -> tuple[str, ...]:
-    """Return what the calibrations' own verdicts say besides praise, each with its camera's name."""
+    """Return the calibrations' verdicts LOOK and BAD, with the camera names."""
     return tuple(
         f"camera {name}: {verdict.text}"
         for name, c in calibrations.items()
@@ -90,8 +90,8 @@ def pair_section(
 
     Parameters
     ----------
-    reconstruction : the one whose cloud is shown.
-    reports : of all estimators.
+    reconstruction : reconstruction whose cloud is shown.
+    reports : reports of all estimators.
     images : (caption, MIME type, bytes).
     extra : further tables, such as the cross-check.
     """
@@ -108,7 +108,7 @@ def pair_section(
 
 
 def crosscheck_table(reports: Sequence[CrossCheckReport]) -> Table:
-    """Return what every other method found of every pair, and whether it agrees with ours."""
+    """Return one row for each pair and independent method: its results, and what disagrees."""
     heads = columns(
         "pair | method | rotation difference [deg] .4 | direction difference [deg] .4 | baseline [mm] .2 | rms [px] | "
         "used .0 | excluded .0 | disagrees in"
@@ -129,7 +129,7 @@ def crosscheck_table(reports: Sequence[CrossCheckReport]) -> Table:
 
 
 def _by_estimator(reports: Sequence[ValidationReport]) -> Table:
-    """Return normal errors, flatness and baseline of one pair with a column an estimator: it fits a page."""
+    """Return normal errors, flatness and baseline of one pair, with one column for each estimator."""
     heads = (Column("normals"), *(Column(report.affine_method, "", 3) for report in reports))
     ids = list(dict.fromkeys(board.board.board_id for report in reports for board in report.boards))
     boards = [{board.board.board_id: board for board in report.boards} for report in reports]

@@ -1,4 +1,4 @@
-"""What a validation came to in a few sentences: for its page's first screen, and for the terminal."""
+"""The verdict of a validation in a few sentences, for the page and the terminal."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
 
 BY_OTHERS = "DISAGREES"
-"""Said of what an independent method finds otherwise."""
+"""Marks the disagreement of an independent method."""
 FINER = 4.0
-"""Where the ruler is so many times less certain than we are, it decides nothing finer."""
+"""If the measured sigma exceeds that of the reconstruction by this factor, the measurement limits the test."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FailedFact:
-    """One fact that does not hold, whoever found it: `what` happened, of which pair, by which estimators (none: by an
-    independent method), in words."""
+    """A fact that does not hold: `what` happened, the pair, the estimators (none: an independent method), and words."""
 
     what: str
     pair_id: str
@@ -29,8 +28,8 @@ class FailedFact:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ValidationVerdict:
-    """What a validation came to: whether everything holds, how well in a sentence, how fine that could be tested
-    ("" where nothing limits it), what does not hold, and probably why."""
+    """The verdict of a validation: whether everything holds, a headline, a sentence on the limit of the measurements or
+    "", the failed facts, and their probable causes."""
 
     passed: bool
     headline: str
@@ -45,7 +44,7 @@ class ValidationVerdict:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What does not hold, probably why, what other methods say of the same images, and how fine the ruler is."""
+        """Sentences on failed facts, probable causes, disagreements of other methods, and limits of measurements."""
 
         def lines_of(facts: Sequence[FailedFact]) -> list[str]:
             return [f"{fact.what.lower()}: {fact.pair_id}: {fact.words}" for fact in facts]
@@ -68,14 +67,14 @@ def verdict_of(
     *,
     complete: bool = True,
 ) -> ValidationVerdict:
-    """Return what a validation came to.
+    """Return the verdict of a validation.
 
     Parameters
     ----------
-    best : one report a pair, of the estimator shown.
-    reports : of all estimators.
-    compared, causes : comparisons with independent methods; what probably explains the failures.
-    complete : whether every pair could be reconstructed.
+    best : report of the shown estimator for each pair.
+    reports : reports of all estimators.
+    compared, causes : comparisons with independent methods; probable causes of failures.
+    complete : whether every pair was reconstructed.
     """
     failed = failed_facts(reports, compared)
     return ValidationVerdict(
@@ -90,7 +89,7 @@ def verdict_of(
 def failed_facts(
     reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport] = ()
 ) -> tuple[FailedFact, ...]:
-    """Return what failed or could not be checked; what several estimators share is one fact."""
+    """Return the failed and unchecked facts; a fact that several estimators share is listed once."""
     found: dict[tuple[str, str, str], list[str]] = {}
     for report in reports:
         for c in report.checks:
@@ -115,7 +114,7 @@ def _in_words(c: Check) -> str:
 
 
 def _headline(best: Sequence[ValidationReport]) -> str:
-    """Return how many of the facts measured agree, and by how much at most; `best`: one report a pair."""
+    """Return how many of the measured facts hold, and the largest differences, in words."""
     checks = [(report.pair_id, c) for report in best for c in report.checks]
     unchecked = sum(len(report.unchecked) for report in best)
     held = [(pair, c) for pair, c in checks if c.passed]
@@ -132,7 +131,7 @@ def _headline(best: Sequence[ValidationReport]) -> str:
 
 
 def _fineness(best: Sequence[ValidationReport]) -> str:
-    """Return where the ruler is too coarse to show what the reconstruction could."""
+    """Return a sentence if a measurement is too coarse to test the reconstruction; else ""."""
     lengths = [c for report in best for c in report.checks if c.kind in ("baseline", "distance") and c.passed]
     coarse = [c for c in lengths if c.measured_sigma > FINER * c.our_sigma]
     if not coarse:

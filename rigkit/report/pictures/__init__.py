@@ -1,1 +1,1 @@
-"""Figures, drawings over images, scenes in perspective, and boards to print."""
+"""Figures, drawings over images, 3D scenes, and boards to print."""

@@ -1,6 +1,6 @@
-"""A board to print, true to scale, with rulers that show what the printer made of it: SVG, PDF.
+"""A board to print true to scale, with rulers to measure the print, as SVG and PDF.
 
-The sheet is a list of shapes in mm with the origin at the top left; two small writers turn it into either format.
+The sheet is a list of shapes in mm with the origin at the top left.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ PAPERS = {
     "letter": (215.9, 279.4),
     "tabloid": (279.4, 431.8),
 }
-"""Width and height in mm, upright; a board that is wider than high turns the sheet."""
+"""Width and height in mm in portrait format; wide boards use landscape."""
 
 UNPRINTABLE_MM = 6.0
-"""Margin that most printers leave white."""
+"""Margin that most printers cannot print."""
 
 RULER_STRIP_MM = 14.0
-"""Room below and to the right of the board for a ruler and its words."""
+"""Space below and to the right of the board for a ruler and its text."""
 
 RULER_STEP_MM = 10.0
 TEXT_MM = 3.0
@@ -41,8 +41,8 @@ POINTS_PER_MM = 72.0 / 25.4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrintedSheet:
-    """Shapes in mm: black rectangles (x, y, w, h), circles on them (x, y, radius), black or `white_circles`, lines
-    (x1, y1, x2, y2) and texts (x, y, degrees, words)."""
+    """Shapes in mm: black rectangles (x, y, width, height), circles (x, y, radius), black or `white_circles`, lines
+    (x1, y1, x2, y2) and texts (x, y, degrees, text)."""
 
     width_mm: float
     height_mm: float
@@ -57,11 +57,11 @@ class PrintedSheet:
 
 
 def board_sheet(board: Board, paper: str) -> PrintedSheet:
-    """Lay out what is printed on the board and two rulers on a sheet of `paper`.
+    """Return the layout of the board and two rulers on a sheet of `paper`.
 
-    The top-left square of a chessboard is black. Around the pattern a margin stays white, which detectors need.
+    The top-left square of a chessboard is black. A white margin around the pattern is left for detectors.
 
-    Raises InputError where the paper is unknown or too small; the message names the paper that would do.
+    Raises InputError for an unknown paper, or one that is too small; the message names a paper that fits.
     """
     size = _sheet_size(board, paper.lower())
     if board.ink().inverted and not len(board.ink().circles):
@@ -72,7 +72,7 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
     w, h = high - low
     x0 = (size[0] - RULER_STRIP_MM - w) / 2.0
     y0 = (size[1] - RULER_STRIP_MM - h) / 2.0
-    # The rows and the columns of each marker's modules, one over the other: no hairline shows where two only touch.
+    # Rows and columns of each marker's modules overlap, so that no hairline shows between adjacent ones.
     inks = [board.ink(upright=upright) for upright in (False, True)]
     white_circles = inks[0].inverted and len(inks[0].circles) > 0
     ground = np.array([[*low, w, h]]) if white_circles else np.zeros((0, 4))
@@ -90,7 +90,7 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
     name = board.describe()
     texts = (
         (x0, bottom + 3.5, 0.0, f"Print at 100 %. This ruler should be {ruler_x:g} mm; measure it."),
-        # Of its own, from the left edge on: names may be nearly as long as a page is wide.
+        # On a separate line from the left edge: names may be nearly as long as a page is wide.
         (UNPRINTABLE_MM, bottom + 6.9, 0.0, f"rigkit: {name}"),
         (right + 2.0, y0, 90.0, f"This ruler should be {ruler_y:g} mm."),
     )
@@ -109,7 +109,7 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
 
 
 def black_squares(board: Board, ink: Ink) -> FloatArray:
-    """Return the black squares of a board that has squares, as rectangles (M, 4) of `Ink`."""
+    """Return the black squares of a board, as rectangles (M, 4) of `Ink`; (0, 4) for boards without squares."""
     if ink.first_black is None:
         return np.zeros((0, 4))
     row, column = np.mgrid[: board.rows + 1, : board.columns + 1]
@@ -188,7 +188,7 @@ def pdf_bytes(sheet: PrintedSheet) -> bytes:
 
 
 def _pdf_circle(x: float, y: float, radius: float) -> str:
-    """Return the path of a circle as four Bezier curves, which depart from it by 0.03 % of the radius at most."""
+    """Return the path of a circle as four Bezier curves, with an error of at most 0.03 % of the radius."""
     arm = 4.0 / 3.0 * (np.sqrt(2.0) - 1.0)
     turns = [(1, 0), (0, 1), (-1, 0), (0, -1), (1, 0)]
     path = [(x + radius, y)]

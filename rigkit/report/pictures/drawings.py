@@ -1,4 +1,4 @@
-"""Small drawings as SVG for the page: box plots of normal errors, residuals of the corners."""
+"""SVG drawings for the page of a validation: box plots of normal errors, residuals of the corners."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from rigkit.report.pictures.figures import board_colour
 from rigkit.validation.checks import ValidationReport
 
 WHISKER = 1.5
-"""Whiskers reach to the last value within this many interquartile ranges, as in the paper's figures."""
+"""Whiskers extend to the last value within this many interquartile ranges, as in the paper's figures."""
 
 BOXES_WIDTH, BOXES_HEIGHT = 1100.0, 300.0
 BOXES_LEFT, BOXES_BOTTOM, BOXES_TOP = 60.0, 46.0, 26.0
 
 RESIDUAL_LENGTH = 0.04
-"""The root mean square residual is drawn as long as this part of the image's width."""
+"""Drawn length of the RMS residual, as a fraction of the image's width."""
 
 
 def normal_errors_svg(reconstructions: Mapping[str, Reconstruction], reports: Sequence[ValidationReport]) -> str:
-    """Draw the angles between each normal and its plane's, a box a board and estimator."""
+    """Draw box plots of the angles between normals and their planes, by board and estimator."""
     groups: list[tuple[str, list[tuple[str, FloatArray]]]] = []
     for report in reports:
         cloud = reconstructions[report.affine_method].cloud
@@ -71,7 +71,7 @@ def boxplot_svg(groups: Sequence[tuple[str, Sequence[tuple[str, FloatArray]]]], 
 
 
 def residuals_svg(reconstruction: Reconstruction) -> str:
-    """Draw how far each corner is from where the two rays would meet, magnified, in both images."""
+    """Draw the magnified corrections of corners in both images after which their two rays intersect."""
     camera1, camera2 = reconstruction.camera1, reconstruction.camera2
     rays1, rays2, *jacobians = reconstruction.measured_rays()
     _, _, moved1, moved2 = correct_rays_px(rays1, rays2, reconstruction.E21, *jacobians)

@@ -1,6 +1,6 @@
 """Pictures of a reconstructed pair: corners, epipolar curves, and the oriented cloud with both cameras.
 
-All figures are drawn with matplotlib's object interface (no global state, no display).
+Figures use matplotlib's object interface, without global state or display.
 """
 
 from __future__ import annotations
@@ -23,40 +23,40 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BOARD_COLOURS = ("#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#d6b300", "#17becf", "#e377c2", "#7f7f7f")
-"""One colour a board, the same in every picture; readable on dark and light images."""
+"""Colours of boards in all pictures, readable on dark and light images."""
 
 MIN_SHOWN_PX = 1e-4
-"""Differences of cameras below this are drawn as none."""
+"""Smaller differences of cameras are not drawn."""
 DPI = 110
 NORMAL_LENGTH_SQUARES = 0.8
 BARE_NORMAL = 0.08
-"""Length of a drawn normal where there are no squares, relative to the median distance of the points."""
+"""Length of a drawn normal without boards, relative to the median distance of the points."""
 BARE_POINT = 1.5
 MAX_NORMALS = 300
-"""Of a cloud without boards: more are not drawn."""
+"""Maximum number of normals drawn for a cloud without boards."""
 NORMAL_COLOUR = "#1f6fd0"
 PYRAMID_DEPTH_IN_FIGURE = 0.18
 """Depth of a drawn camera pyramid, relative to the median distance of the points."""
 
 FAR = 4.0
-"""Points this many times farther than the median one do not set the limits of the picture."""
+"""Points farther than this many times the median distance are outside of the picture's limits."""
 
 FILL = 0.8
-"""Part of the picture that the box round the scene takes; the rest is for the numbers along its edges."""
+"""Fraction of the picture that the box around the scene fills; the rest is for the numbers along its edges."""
 
 SIDE_PAD, ABOVE_PAD = 10.0, 24.0
-"""Points between the axis of depth and its name, seen from the side and from above: room for the numbers between."""
+"""Typographic points between the depth axis and its name, seen from the side and from above."""
 
 CURVE_SAMPLES = 240
 JPEG_QUALITY = 85
 PAIR_RIM, PAIR_TOP = 0.005, 0.95
-"""Where two images stand in their figure; the title is above."""
+"""Margin and top of the two images in their figure; the title is above."""
 DARK_GROUND, DARK_WORDS = "#14181f", "#c8cfda"
-"""Of pages by night."""
+"""Colours of dark pages."""
 
 
 def new_figure(width: float, height: float, **options: Any) -> Figure:
-    """Return an empty figure of so many inches, without a display."""
+    """Return an empty figure of `width` x `height` inches, without a display."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -66,7 +66,7 @@ def new_figure(width: float, height: float, **options: Any) -> Figure:
 
 
 def board_colour(index: int) -> str:
-    """Return the colour of a board, the same in every picture."""
+    """Return the colour of a board in all pictures."""
     return BOARD_COLOURS[index % len(BOARD_COLOURS)]
 
 
@@ -102,7 +102,7 @@ def epipolar_figure(
         boards = reconstruction.matches.board_index[chosen]
         for board in np.unique(boards):
             on, colour = boards == board, board_colour(int(board))
-            # One line a board, with a gap after each curve: matplotlib's time goes by the number of lines.
+            # One line for each board, with gaps between curves: matplotlib is slow with many lines.
             gapped = np.pad(curves[on], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 2)
             axis.plot(gapped[:, 0], gapped[:, 1], color=colour, linewidth=0.7)
             dots = {"marker": "o", "markersize": 3.5, "markeredgecolor": "white", "markeredgewidth": 0.5}
@@ -119,8 +119,8 @@ def epipolar_figure(
 def epipolar_curves(camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3, pixels1: Pixels) -> FloatArray:
     """Return the epipolar curves of `pixels1` (N, 2) in image 2 as (N, CURVE_SAMPLES, 2), NaN where not in view.
 
-    The curve is the image of the viewing ray, from the epipole to the vanishing point: straight
-    in a perspective view, curved in a fisheye image.
+    The curve is the image of the viewing ray from the epipole to the vanishing point: straight in a perspective view,
+    curved in a fisheye image.
     """
     rays, _ = camera1.unproject(pixels1)
     towards = rays @ cam2_from_cam1.rotation.T
@@ -135,7 +135,7 @@ def epipolar_curves(camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3, pi
 
 
 def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
-    """Render the oriented cloud: points and normals by board, both cameras as pyramids, from two directions."""
+    """Draw the oriented cloud from two directions: points and normals by board, cameras as pyramids."""
     figure = new_figure(13, 6, dpi=DPI)
     figure.subplots_adjust(left=0.0, right=0.97, bottom=0.02, top=0.94, wspace=0.0)
     cloud = reconstruction.cloud
@@ -152,7 +152,7 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
                 continue
             p, n = _upright(scene[on]), _upright(cloud.normals[on]) * square * NORMAL_LENGTH_SQUARES
             if not reconstruction.boards:
-                # As photographed; thousands of normals would hide it.
+                # In the colours of the images, with few normals.
                 axis.scatter(*p.T, s=BARE_POINT, c=cloud.colours[on] / 255.0, depthshade=False, linewidths=0)
                 some = np.s_[:: max(1, len(p) // MAX_NORMALS)]
                 axis.quiver(*p[some].T, *n[some].T, color=NORMAL_COLOUR, linewidth=0.5, arrow_length_ratio=0.0)
@@ -183,7 +183,7 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
 def pair_pictures(
     r: Reconstruction, image1: NDArray[Any], image2: NDArray[Any], *, pdf: bool = False
 ) -> dict[str, bytes]:
-    """Return the pictures of a pair by relative path, as vectors too with `pdf`."""
+    """Return the pictures of a pair by relative path; with `pdf` also as PDF."""
     figures = {
         "corners": corners_figure(r, image1, image2),
         "epipolar": epipolar_figure(r, image1, image2),
@@ -198,11 +198,11 @@ def pair_pictures(
 
 
 def difference_png(difference: CameraDifference) -> bytes:
-    """Draw the difference of two cameras over the image: its length as colour, its direction as arrows."""
+    """Draw the difference of two cameras over the image, with length as colour and arrows."""
     figure = new_figure(8, 5.6, dpi=DPI)
     axis: Any = figure.subplots()
     u, v = difference.pixels[..., 0], difference.pixels[..., 1]
-    # Below this there is only rounding, which must not look like a pattern.
+    # Rounding errors must not look like a pattern.
     top = max(float(difference.max_px), MIN_SHOWN_PX)
     mesh = axis.pcolormesh(u, v, difference.map_px, shading="nearest", cmap="viridis", vmin=0.0, vmax=top)
     some = np.s_[::3, ::3]
@@ -219,7 +219,7 @@ def difference_png(difference: CameraDifference) -> bytes:
 
 
 def _upright(vectors: FloatArray) -> FloatArray:
-    """Camera axes (x right, y down, z forward) to plot axes (x right, y away, z up)."""
+    """Return vectors in plot axes (x right, y away, z up), from camera axes (x right, y down, z forward)."""
     return np.stack([vectors[..., 0], vectors[..., 2], -vectors[..., 1]], axis=-1)
 
 
@@ -233,12 +233,12 @@ def _draw_pyramid(axis: Any, cam1_from_cam: Rigid3, depth: float, name: str) -> 
     # One line through all eight edges; two of them are drawn twice.
     edges = np.stack([tip, base[0], base[1], tip, base[2], base[3], tip, base[3], base[0], base[1], base[2]])
     axis.plot(*edges.T, color="black", linewidth=0.8)
-    # Below its tip: beside it, it would lie over the numbers of an axis.
+    # Below the tip, so that it does not cover the numbers of an axis.
     axis.text(*tip, f"\n{name}", fontsize=7, horizontalalignment="center", verticalalignment="top", linespacing=0.5)
 
 
 def _fit_equal(axis: Any, reconstruction: Reconstruction, pyramids: FloatArray) -> None:
-    """Set limits around the cloud and the cameras' `pyramids` (N, 3), in plot axes, millimetres equal on all axes, and
+    """Set limits around the cloud and the cameras' `pyramids` (N, 3), in plot axes, with equal scales on all axes, and
     fill the picture with that box."""
     from mpl_toolkits.mplot3d import proj3d
 
@@ -269,7 +269,7 @@ def _draw_boards(axis: Any, reconstruction: Reconstruction, pixels: Pixels) -> N
         order = on[np.lexsort((matches.grid[on, 0], matches.grid[on, 1]))]
         p = pixels[order]
         colour = board_colour(index)
-        # A gap after every row: lines along the rows show which way the board is indexed.
+        # A gap after every row: lines along rows show the order of the corners.
         ends = np.flatnonzero(np.diff(matches.grid[order, 1])) + 1
         rows = np.insert(p, ends, np.nan, axis=0)
         axis.plot(rows[:, 0], rows[:, 1], color=colour, linewidth=0.8, alpha=0.8)
@@ -280,7 +280,7 @@ def _draw_boards(axis: Any, reconstruction: Reconstruction, pixels: Pixels) -> N
 
 
 def pair_axes(image1: NDArray[Any], image2: NDArray[Any]) -> tuple[Figure, Sequence[Any]]:
-    """Return a figure with both images side by side, and its axes, in which the images' pixels are the units."""
+    """Return a figure with both images side by side, and its axes in pixels of the images."""
     figure = new_figure(14, 7 * image1.shape[0] / image1.shape[1] + 0.35, dpi=DPI)
     axes = figure.subplots(1, 2)
     figure.subplots_adjust(left=PAIR_RIM, right=1.0 - PAIR_RIM, bottom=PAIR_RIM, top=PAIR_TOP, wspace=0.01)
@@ -293,9 +293,9 @@ def pair_axes(image1: NDArray[Any], image2: NDArray[Any]) -> tuple[Figure, Seque
 
 
 def _fitted(image: NDArray[Any], width: float, height: float) -> NDArray[np.uint8]:
-    """Return 8-bit RGB, no larger than it is drawn in a box of that many pixels: matplotlib shrinks ten times slower.
+    """Return the image as 8-bit RGB, reduced to `width` x `height` px: matplotlib is ten times slower at that.
 
-    Grey images are shown over their full contrast.
+    Grey images are stretched to full contrast.
     """
     import cv2
 
@@ -313,12 +313,12 @@ def as_png(figure: Figure) -> bytes:
     """Return a figure as PNG."""
     import cv2
 
-    # Photographs hardly get smaller by packing harder, but it takes three times as long.
+    # A higher compression hardly reduces photographs, but takes three times as long.
     return bytes(cv2.imencode(".png", _drawn(figure), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
 
 
 def drawn_dark(draw: Callable[[], bytes]) -> bytes:
-    """Return what `draw` makes of a figure, for pages on a dark ground."""
+    """Return the picture of `draw` in the colours of dark pages."""
     import matplotlib
 
     grounds = ("figure.facecolor", "axes.facecolor", "savefig.facecolor")
@@ -329,7 +329,7 @@ def drawn_dark(draw: Callable[[], bytes]) -> bytes:
 
 
 def pair_jpeg(png: bytes) -> bytes:
-    """Return a figure of `pair_axes` as JPEG without the title and the rim: a page says it below, on its own ground."""
+    """Return a figure of `pair_axes` as JPEG without title and margin: pages have captions."""
     import cv2
 
     picture = np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))
@@ -340,7 +340,7 @@ def pair_jpeg(png: bytes) -> bytes:
 
 
 def _drawn(figure: Figure) -> NDArray[np.uint8]:
-    """Draw a figure; return its pixels (H, W, 3), blue first."""
+    """Return the pixels (H, W, 3) of a figure, in BGR order."""
     import cv2
 
     canvas: Any = figure.canvas
@@ -349,7 +349,7 @@ def _drawn(figure: Figure) -> NDArray[np.uint8]:
 
 
 def as_pdf(figure: Figure) -> bytes:
-    """Return a figure as PDF for a paper: lines and text stay vectors, photographs are embedded."""
+    """Return a figure as vector PDF with embedded photographs."""
     import matplotlib
 
     buffer = io.BytesIO()

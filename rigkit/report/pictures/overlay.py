@@ -1,4 +1,4 @@
-"""The corners found, drawn over their image."""
+"""Detected corners drawn over their image."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 from rigkit.core.detections import BoardDetection
 
 OVERLAY_COLOURS = ((230, 60, 50), (40, 160, 70), (50, 90, 230), (230, 150, 20), (160, 60, 200), (20, 170, 190))
-"""Red, green, blue of the boards in turn."""
+"""RGB colours of the boards in turn."""
 
 FRACTION_BITS = 4
-"""Binary digits of the fraction of a pixel that OpenCV draws with."""
+"""Fractional bits of OpenCV's drawing coordinates."""
 
 
 def draw_boards(image: NDArray[np.generic], detections: Sequence[BoardDetection]) -> NDArray[np.uint8]:
-    """Return `image` ((H, W) or (H, W, 3) RGB, 8 or 16 bit) with the grids of `detections`, (H, W, 3) RGB uint8.
+    """Return `image` ((H, W) or (H, W, 3) RGB, 8 or 16 bits) with the grids of `detections`, as (H, W, 3) RGB uint8.
 
-    Rows are drawn thicker than columns, the first corner is a ring, an arrow runs along the first row, and each board
-    is labelled with its name (or its place in `detections`) and the number of corners.
+    Rows are thicker than columns, the first corner has a ring, an arrow points along the first row, and each board is
+    labelled with its id (or number) and its number of corners.
     """
     canvas = _canvas(image)
     width = max(1, round(min(canvas.shape[:2]) / 600))
@@ -40,7 +40,7 @@ def draw_boards(image: NDArray[np.generic], detections: Sequence[BoardDetection]
         font = (cv2.FONT_HERSHEY_SIMPLEX, 0.5 * width)
         (length, height), below = cv2.getTextSize(label, *font, width)
         corner = found.pixels.min(axis=0) - 8 * width
-        # All of it inside the image, and readable on black squares.
+        # The label is inside the image, on a white plate.
         place = (max(2, min(int(corner[0]), canvas.shape[1] - length - 2)), max(14 * width, int(corner[1])))
         plate = ((place[0] - 2, place[1] - height - 2), (place[0] + length + 2, place[1] + below))
         cv2.rectangle(canvas, *plate, (255, 255, 255), cv2.FILLED)

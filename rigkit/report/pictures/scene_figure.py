@@ -1,4 +1,4 @@
-"""Picture of a scene without boards: which correspondences agree, and the normals found there."""
+"""Picture of a scene without boards: inlier correspondences and their normals."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from rigkit.report.pictures.figures import as_png, pair_axes
 
 POINTS_PER_INCH = 72.0
 DENSE_SIDE = 4.0
-"""Of the square of a page, in its points, that a correspondence has to itself; ringed dots would cover smaller ones."""
+"""Side of the square on the page for each correspondence, in typographic points, below which the drawing is dense."""
 
 
 def normals_png(
     scene: SceneReconstruction, found: Correspondences, image1: NDArray[Any], image2: NDArray[Any]
 ) -> bytes:
-    """Draw the points over both images, coloured by their normals; grey: correspondences that do not fit.
+    """Draw the points over both images, coloured by their normals; outliers are grey.
 
-    Red, green and blue stand for the parts of the normal to the right, upwards and towards camera 1. Few points are
-    ringed dots; a dense cloud is a picture of normals, whose points touch each other.
+    Red, green and blue are the components of the normal to the right, upwards and towards camera 1. Few points are
+    drawn as ringed dots, dense clouds as adjacent squares.
     """
     figure, axes = pair_axes(image1, image2)
     on_page = POINTS_PER_INCH * figure.get_figwidth() * axes[0].get_position().width / image1.shape[1]

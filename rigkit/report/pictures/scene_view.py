@@ -1,4 +1,4 @@
-"""3D views as `viewer.js` reads them: cameras as pyramids, boards where they were held, clouds."""
+"""3D scenes for `viewer.js`: cameras as pyramids, boards, and clouds."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.reconstruct import Reconstruction
 
 MAX_BOARDS = 400
-"""More boards hide each other; of more, every second, third, ... is drawn."""
+"""Maximum number of boards drawn; more are subsampled."""
 DEPTH = 0.15
-"""Depth of a drawn camera, relative to the median distance of what it sees."""
+"""Depth of a drawn camera, relative to the median distance of boards or points."""
 SAME_PLACE = 0.01
-"""Entries of two poses that differ by less, lengths relative to the distance, are of one board seen twice."""
+"""Maximum difference of the entries of two poses (lengths relative to the distance) of one board seen twice."""
 PYRAMID = np.array([[0.0, 0.0, 0.0], [-0.6, -0.45, 1.0], [0.6, -0.45, 1.0], [0.6, 0.45, 1.0], [-0.6, 0.45, 1.0]])
 """Tip and base of a drawn camera of depth 1."""
 
@@ -43,12 +43,12 @@ def scene_of(reconstruction: Reconstruction) -> dict[str, Any]:
 
 
 def boards_scene(views: Sequence[ViewResult], boards: Sequence[BoardShape]) -> dict[str, Any]:
-    """Return the scene of one camera with every board that it saw."""
+    """Return the scene of one camera with all views of boards."""
     return _views_scene({"camera": Rigid3.identity()}, [(view, Rigid3.identity()) for view in views], boards)
 
 
 def rig_scene(rig: RigCalibration) -> dict[str, Any]:
-    """Return the scene of a rig, each board as the first camera that used it has it."""
+    """Return the scene of a rig, with each board as seen by the first camera."""
     cameras: dict[str, Rigid3] = {}
     views: list[tuple[ViewResult, Rigid3]] = []
     places: dict[str, list[FloatArray]] = {}
@@ -58,11 +58,11 @@ def rig_scene(rig: RigCalibration) -> dict[str, Any]:
         for view in camera.calibration.views:
             place = (rig_from_cam @ view.cam_from_board).matrix()[:3]
             known = places.setdefault(view.board_id, [])
-            # Cameras of a rig see one board at one place: it is drawn once.
+            # A board that several cameras see at one moment is drawn once.
             if not any(np.abs(place - other).max() < SAME_PLACE * (1.0 + np.abs(place[:, 3]).max()) for other in known):
                 known.append(place)
                 views.append((view, rig_from_cam))
-    # Boards that all cameras saw have one shape; a part of one was seen by a single camera.
+    # A board's shape is the same in all cameras; the first one that has it is used.
     boards: dict[str, BoardShape] = {}
     for camera in rig.cameras:
         boards = {board.board_id: board for board in camera.calibration.boards} | boards
@@ -87,7 +87,7 @@ def _views_scene(
 def _scene(
     cameras: Mapping[str, Rigid3], far_mm: Sequence[float] | FloatArray, boards: Sequence[str], planes: list[Any]
 ) -> dict[str, Any]:
-    """Return a scene without points, of cameras by their places in it that see what is `far_mm` away from them."""
+    """Return a scene without points of cameras (world_from_cam by name) and planes at distances `far_mm`."""
     depth = DEPTH * float(np.median(far_mm)) if len(far_mm) else 1.0
     pyramids = {name: world_from_cam.apply(depth * PYRAMID) for name, world_from_cam in cameras.items()}
     return {
@@ -102,19 +102,19 @@ def _scene(
 
 
 def _rounded(values: FloatArray, digits: int) -> list[list[float]]:
-    """Return rows of numbers as JSON has them."""
+    """Return rows of rounded numbers for JSON."""
     return [[round(float(v), digits) for v in row] for row in values]
 
 
 def _outline(points_mm: FloatArray) -> FloatArray:
-    """Return the four corners (4, 3) of a board's grid of corners, which runs along x and y."""
+    """Return the four corners (4, 3) of a board's grid, which is along x and y."""
     (x0, y0), (x1, y1) = points_mm[:, :2].min(axis=0), points_mm[:, :2].max(axis=0)
     z = float(points_mm[:, 2].mean())
     return np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
 
 
 def _box(points: FloatArray) -> FloatArray:
-    """Return the corners of the smallest box, along the principal axes, around points that lie in a plane."""
+    """Return the corners (4, 3) of the bounding box, along the principal axes, of coplanar points."""
     centre = points.mean(axis=0)
     axes = np.linalg.svd(points - centre, full_matrices=False)[2][:2]
     local = (points - centre) @ axes.T

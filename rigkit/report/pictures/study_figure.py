@@ -15,10 +15,10 @@ METHOD_COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee")
 
 
 def study_figure(table: StudyTable, file_format: str = "png") -> bytes:
-    """Return the figure as a file: one row of axes a pose type, one column a plane.
+    """Return the figure as a file, with one row of axes for each pose type and one column for each plane.
 
-    Boxes are grouped by noise level where there are several, one box a method; whiskers as in `StudyCell`.
-    A study of one pose type and one method shows all planes together.
+    Boxes are grouped by noise level, one for each method; whiskers are as in `StudyCell`. A study of one pose type
+    shows all planes together.
     """
     study = table.study
     planes = [ALL_PLANES] if len(study.pose_types) == 1 else [*range(1, STUDY_PLANES + 1)]
