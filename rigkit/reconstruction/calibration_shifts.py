@@ -1,9 +1,9 @@
-"""What the uncertainty of the calibrations does to a reconstruction.
+"""Propagate the uncertainty of the calibrations to a reconstruction.
 
-A calibration is one error for a whole pair: it tilts planes and stretches baselines without leaving any scatter behind.
-So the cameras are moved by one standard deviation along each principal axis of their covariance, and the pose, the
-scale and the points are estimated again from the same corners or correspondences. The axes are independent: the squares
-of what they change in a quantity add up to its variance.
+A calibration error is the same for a whole pair: it tilts planes and stretches baselines but does not scatter points.
+So the cameras are moved by one standard deviation along each principal axis of their covariance, and pose, scale and
+points are estimated again from the same corners or correspondences. The axes are independent: the variance of a
+quantity is the sum of its squared changes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from rigkit.affine.registry import affines_from_directions, needs_epipolar
 from rigkit.cameras.uncertain import PosedPair, UncertainCamera, UncertainPair
 from rigkit.core.arrays import BoolArray, FloatArray, Normals, RayJacobians, Rays
 from rigkit.core.errors import InputError
-from rigkit.core.matches import Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
@@ -33,10 +32,10 @@ from rigkit.relative_pose.solvers.pose import essential_from_pose
 
 @dataclass(frozen=True, eq=False)
 class CalibrationShifts:
-    """A reconstruction estimated again with the calibrations as they are, and moved along each principal axis.
+    """A reconstruction estimated again with the calibrated cameras (`base`), and with each of the `moved` ones.
 
-    `known` (N,) are the points that could be triangulated with all of these cameras. The others stay where they were,
-    and how well they are known is not known: corners at the rim of the field, and beside the epipoles.
+    `known` (N,) is the mask of the points that could be triangulated with all of these cameras. The others, at the rim
+    of the field of view and close to the epipoles, keep their place, and their uncertainty is unknown.
     """
 
     base: Reconstruction
@@ -45,20 +44,20 @@ class CalibrationShifts:
 
     @cached_property
     def rays(self) -> list[list[tuple[Rays, RayJacobians]]]:
-        """Rays (N, 3) of the corners in image 1 and in image 2, and their derivatives by the pixel (N, 3, 2), by the
-        cameras as they are and as each move has them."""
+        """Rays (N, 3) of the corners in image 1 and in image 2 with their Jacobians (N, 3, 2) by the pixel, for the
+        calibrated cameras and each of the moved ones."""
         each = [((r.camera1, r.pixels1), (r.camera2, r.pixels2)) for r in (self.base, *self.moved)]
         return [[camera.rays_and_jacobians(p)[::2] for camera, p in both] for both in each]
 
     def points(self) -> FloatArray:
-        """Return how the points move along each axis (K, N, 3), mm; NaN where that is not known."""
+        """Return the change of the points by each axis (K, N, 3), mm; NaN if unknown."""
         moves = np.array([moved.cloud.points_mm - self.base.cloud.points_mm for moved in self.moved])
         moves = moves.reshape(-1, len(self.known), 3)
         moves[:, ~self.known] = np.nan
         return moves
 
     def variance(self, quantity: Callable[[Reconstruction], float]) -> float:
-        """Return the variance of a quantity from the calibrations' uncertainty."""
+        """Return the variance of a quantity that comes from the calibrations' uncertainty."""
         at_base = quantity(self.base)
         return float(sum((quantity(moved) - at_base) ** 2 for moved in self.moved))
 
@@ -75,16 +74,16 @@ def calibration_shifts(
     Parameters
     ----------
     reconstruction : of one pair, with boards or of any scene.
-    known1 : camera 1 as it is known, or both of a rig with their pose.
-    known2 : camera 2, or None where both images are of one camera: then both move together.
-    pose_is_known : it is not estimated again: a rig's moves with its cameras, one that was measured stays as it is.
+    known1 : camera 1 with its covariance, or both cameras of a rig with that of their pose.
+    known2 : camera 2, or None if both images are of one camera; then both move together.
+    pose_is_known : do not estimate the pose again: a rig's pose moves with its cameras, a measured one is kept.
     """
     r = reconstruction
     there = PosedPair(r.camera1, r.camera2, r.cam2_from_cam1)
     calibrations = known1 if isinstance(known1, UncertainPair) else (known1, known2)
     moves = [there, *moved_pairs(there, calibrations)]
     known = (known1, known2 or known1) if isinstance(known1, UncertainCamera) else (None, None)
-    # A corner at the rim of the field can lie outside a moved camera's: then it says nothing here, of no camera.
+    # A corner outside the field of view of any moved camera is left out for all.
     seen = seen_by_all([(move.camera1, move.camera2) for move in moves], r.pixels1, r.pixels2)
     again = [_again(_seen_through(r, known, move), move, seen, pose_is_known) for move in moves]
     base, *moved = (estimated for estimated, _ in again)
@@ -92,7 +91,7 @@ def calibration_shifts(
 
 
 def _seen_through(r: Reconstruction, known: Known, there: PosedPair) -> Reconstruction:
-    """Return the reconstruction with the pixels that moved cameras have, see `moved_pixels`."""
+    """Return the reconstruction with its pixels corrected for moved cameras, see `moved_pixels`."""
     points = r.cloud.points_mm, r.cam2_from_cam1.apply(r.cloud.points_mm)
     pixels1, pixels2 = moved_pixels((r.pixels1, r.pixels2), points, known, (there.camera1, there.camera2))
     return replace(r, pixels1=pixels1, pixels2=pixels2)
@@ -101,22 +100,13 @@ def _seen_through(r: Reconstruction, known: Known, there: PosedPair) -> Reconstr
 def _again(
     r: Reconstruction, there: PosedPair, seen: BoolArray, pose_is_known: bool
 ) -> tuple[Reconstruction, BoolArray]:
-    """Estimate pose, scale and points again from the corners `seen`, and say which points (N,) could be.
+    """Estimate pose, scale and points again from the corners `seen`; return also a mask (N,) of the new points.
 
-    The other points, and all normals, stay. Without boards the baseline keeps its length.
+    The other points, and all normals, are kept. Without boards the baseline keeps its length.
     """
     camera1, camera2, given = there
-    known = r.matches.select(seen)
-    matches = Matches.from_cameras(
-        camera1,
-        camera2,
-        r.pixels1[seen],
-        r.pixels2[seen],
-        sigma1_px=known.sigma1_px,
-        sigma2_px=known.sigma2_px,
-        board_index=known.board_index,
-        grid=known.grid,
-    )
+    captured = replace(r.matches.select(seen), pixels1=r.pixels1[seen], pixels2=r.pixels2[seen])
+    matches = captured.through(camera1, camera2)
     scale = float(np.linalg.norm(given.translation_mm))
     pose = Rigid3(given.rotation, given.translation_mm / scale)
     if not pose_is_known:
@@ -142,14 +132,13 @@ def _again(
 
 
 def with_calibrations(r: Reconstruction, shifts: CalibrationShifts | None) -> Reconstruction:
-    """Return the reconstruction with the share of the calibrations in the sigmas of its cloud's points and normals; the
-    same one where nothing is known of them (None).
+    """Return the reconstruction with the calibrations' uncertainty added to the sigmas of its points and normals.
 
-    Along each axis of `shifts` a point moves, and its normal turns: by the moved point, pose and cameras, from the same
-    affinity in the image, or where affinities follow from the epipolar geometry from the same directions. Sigmas of
-    points that not all of the moved cameras see are NaN: nobody knows them.
+    Without `shifts` it is returned unchanged. Each axis of `shifts` moves a point and rotates its normal. The normal is
+    computed again from the moved point, pose and cameras, and the same affinity; if the estimator uses the epipolar
+    geometry, from the same directions. Sigmas of points that some moved camera does not see are NaN.
 
-    Raises InputError for points on fitted planes, which have that share.
+    Raises InputError for points on fitted planes, whose sigmas already include it.
     """
     if shifts is None:
         return r
@@ -161,10 +150,10 @@ def with_calibrations(r: Reconstruction, shifts: CalibrationShifts | None) -> Re
         covariance = r.geometry.points.covariance[r.kept][known] + np.einsum("kni,knj->nij", moves, moves)
         spread = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
     else:
-        # The largest axis of a sum is no longer than this.
+        # Upper bound of the largest eigenvalue of the sum.
         spread = np.sqrt(cloud.sigma_mm[known] ** 2 + np.sum(moves**2, axis=(0, 2)))
     m = r.matches.select(known)
-    # The coordinates of the affinities (rectified, or the captured pixels) move with the pixels as they did.
+    # The map from captured pixels to the affinities' coordinates (rectified or captured) is held fixed.
     by_coordinates = [
         np.linalg.pinv(camera.ray_jacobian(pixels[known])) @ by_coordinate
         for camera, pixels, by_coordinate in (
@@ -194,8 +183,8 @@ def _normals(
     one: tuple[Rays, RayJacobians],
     two: tuple[Rays, RayJacobians],
 ) -> Normals:
-    """Return the normals (n, 3) of the `known` points as moved cameras have them: their rays in image `one` and `two`,
-    with the derivatives by the coordinates of the affinities."""
+    """Return the normals (n, 3) of the `known` points for moved cameras, from the rays in image `one` and `two` and
+    their Jacobians by the affinities' coordinates."""
     (rays1, by1), (rays2, by2) = one, two
     J1, J2 = pair_projection_jacobians(moved.cloud.points_mm[known], rays1, by1, rays2, by2, moved.cam2_from_cam1)
     assert r.matches.A21 is not None

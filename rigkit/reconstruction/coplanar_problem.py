@@ -1,4 +1,4 @@
-"""Corners of two images on a few planes: their residuals, and the minimum; the problem behind `coplanar_planes`."""
+"""The least-squares problem of `coplanar_planes`: corners of two images on a few planes."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from rigkit.relative_pose.refinement.residuals import level_terms
 from rigkit.relative_pose.solvers.pose import free_directions, translation_basis
 
 STEP = 1e-6
-"""For central differences, of each parameter's unit: far above rounding, far below where anything bends."""
+"""Step of central differences, in each parameter's unit: far above rounding, far below any curvature."""
 
 
 @dataclass(frozen=True, eq=False)
 class CoplanarState:
-    """Pose of unit baseline (rotation (3, 3), direction t (3,)) and planes (K, 3): m . x = 1 on a plane."""
+    """Pose of unit baseline (rotation (3, 3), direction t (3,)) and planes m (K, 3) with m . x = 1."""
 
     rotation: FloatArray
     t: FloatArray
     planes: FloatArray
 
     def moved(self, change: FloatArray) -> CoplanarState:
-        """Return the state after (w, b, dm / |m| of every plane), (5 + 3 K,)."""
+        """Return the state after the step (rotation w, baseline b, dm / |m| of every plane), (5 + 3 K,)."""
         t = unit(self.t + change[3:5] @ translation_basis(self.t))
         size = np.linalg.norm(self.planes, axis=1, keepdims=True)
         return CoplanarState(
@@ -46,17 +46,17 @@ class CoplanarState:
 
 @dataclass(frozen=True, eq=False)
 class CoplanarProblem:
-    """Matched corners of planes, and what is known of the pose.
+    """Matched corners on planes, with the pose-type prior.
 
     With m the plane of a ray d1, R d1 + t (m . d1) is the corner's direction in camera 2: a homography of rays. The
-    residual is its offset from the corner seen there, in px, whitened by both images' noise: s2^2 + s1^2 G G^T with G
-    the derivative by the first pixel. To first order that is the reprojection error in both images at once.
+    residual is its distance, in px, to the corner seen there, whitened by s2^2 I + s1^2 G G^T with G the derivative by
+    the first pixel. To first order that is the reprojection error in both images.
 
     Attributes
     ----------
-    matches : as level cameras see them where level frames are given; `board_index` counts the planes.
+    matches : corners, in the level frames if there are any; `board_index` is the plane's index.
     bases2 : (N, 2, 3), see `point_residuals`.
-    kind, level_sigma_rad : the pose type, and how well it holds; None: exactly.
+    kind, level_sigma_rad : the pose type and the standard deviation of its prior; None: it holds exactly.
     frames : the level frames, or None.
     """
 
@@ -68,7 +68,7 @@ class CoplanarProblem:
 
     @classmethod
     def of(cls, matches: Matches, decision: PoseTypeDecision) -> CoplanarProblem:
-        """Return the problem of captured matches as a pose type was decided on."""
+        """Return the problem of captured matches under a pose type."""
         frames = decision.level_frames
         seen = matches if frames is None else frames.matches(matches)
         bases = np.linalg.pinv(seen.jacobians2)
@@ -78,7 +78,7 @@ class CoplanarProblem:
         return replace(self, matches=self.matches.select(which), bases2=self.bases2[which])
 
     def through(self, cameras: tuple[Camera, Camera], pixels: tuple[Pixels, Pixels]) -> CoplanarProblem:
-        """Return the same corners by other cameras, at these pixels."""
+        """Return the same corners, at new pixels, for other cameras."""
         seen = replace(self.matches, pixels1=pixels[0], pixels2=pixels[1]).through(*cameras)
         seen = seen if self.frames is None else self.frames.matches(seen)
         return replace(self, matches=seen, bases2=np.asarray(np.linalg.pinv(seen.jacobians2)))
@@ -98,20 +98,19 @@ class CoplanarProblem:
         return CoplanarState(rotation, t, planes if self.frames is None else planes @ self.frames.level1_from_cam1.T)
 
     def free(self, state: CoplanarState) -> BoolArray:
-        """Return which (5 + 3 K,) of the parameters may move."""
+        """Return a mask (5 + 3 K,) of the free parameters."""
         kind = PoseType.GENERAL if self.level_sigma_rad is not None else self.kind
         free = np.ones(5 + state.planes.size, dtype=bool)
         free[:5] = np.isin(np.arange(5), free_directions(kind))
         return free
 
     def corners(self, state: CoplanarState) -> tuple[FloatArray, FloatArray]:
-        """Return whitened residuals (N, 2) and their derivatives (N, 2, 5 + 3 K), the whitening held."""
-        residual, by, slope, whiten = self._unwhitened(state)
-        del slope
+        """Return the whitened residuals (N, 2) and their Jacobian (N, 2, 5 + 3 K) with the whitening held fixed."""
+        residual, by, _, whiten = self._unwhitened(state)
         return (whiten @ residual[..., None])[..., 0], whiten @ by
 
     def _unwhitened(self, state: CoplanarState) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return residuals (N, 2), px, derivatives by the state and by the first pixel, and what whitens (N, 2, 2)."""
+        """Return residuals (N, 2) px, Jacobians by the state and by the first pixel, and whitening (N, 2, 2)."""
         m = self.matches
         plane = state.planes[m.board_index]
         inverse_depth = np.sum(plane * m.rays1, axis=1)
@@ -129,7 +128,7 @@ class CoplanarProblem:
         return residual, by, slope, whiten
 
     def linearise(self, state: CoplanarState) -> DenseProblem:
-        """Return all residuals in sigmas, those of the level last, with their derivatives by what is free."""
+        """Return all whitened residuals, those of the pose-type prior last, with their Jacobian by free parameters."""
         residual, by = self.corners(state)
         rows, jacobian = [residual.ravel()], [by.reshape(-1, by.shape[-1])]
         if self.level_sigma_rad is not None:
@@ -143,9 +142,9 @@ class CoplanarProblem:
         return likeliest(state, self.linearise, CoplanarState.moved, self.free(state))
 
     def points(self, state: CoplanarState) -> tuple[Points, FloatArray]:
-        """Return the likeliest points (N, 3) on the planes, and their covariances (N, 3, 3) for this state.
+        """Return the maximum-likelihood points (N, 3) on the planes, and their covariances (N, 3, 3) for this state.
 
-        Both images say where on its plane a point is: the first pixel is corrected by what the second one adds.
+        Both images are used: the first pixel is corrected by the residual of the second.
         """
         m = self.matches
         residual, _, slope, _ = self._unwhitened(state)
@@ -160,7 +159,7 @@ class CoplanarProblem:
         return depth * rays, by_pixel @ spread @ np.swapaxes(by_pixel, 1, 2)
 
     def motions(self, state: CoplanarState) -> FloatArray:
-        """Return the derivatives (F, N, 3) of the points by what is free, by central differences."""
+        """Return the derivatives (F, N, 3) of the points by the free parameters, by central differences."""
         out = []
         for one in np.eye(5 + state.planes.size)[self.free(state)]:
             ahead, back = (self.points(state.moved(sign * STEP * one))[0] for sign in (1.0, -1.0))
@@ -168,7 +167,7 @@ class CoplanarProblem:
         return np.array(out)
 
     def in_camera(self, state: CoplanarState) -> tuple[Rigid3, FloatArray, FloatArray]:
-        """Return cam2_from_cam1 of unit baseline, the planes' normals (K, 3) that face camera 1, and offsets (K,)."""
+        """Return cam2_from_cam1 of unit baseline, and the planes' normals (K, 3), facing camera 1, and offsets (K,)."""
         pose = Rigid3(state.rotation, state.t)
         size = np.linalg.norm(state.planes, axis=1)
         # m . x = 1 > 0 in front: m points away from the camera.
@@ -176,7 +175,7 @@ class CoplanarProblem:
         return pose if self.frames is None else self.frames.camera_pose(pose), normals, -1.0 / size
 
     def parameter_changes(self, state: CoplanarState) -> FloatArray:
-        """Return the derivatives (6 + 6 K, F) of the parameters of `BoardPlanes`, of unit baseline, by what is free."""
+        """Return the derivatives (6 + 6 K, F) of the `BoardPlanes` parameters at unit baseline by the free ones."""
         count = len(state.planes)
         out = np.zeros((6 + 6 * count, 5 + 3 * count))
         out[:3, :3] = np.eye(3)
@@ -184,7 +183,7 @@ class CoplanarProblem:
         for k, plane in enumerate(state.planes):
             size = np.linalg.norm(plane)
             normal, own = -plane / size, slice(5 + 3 * k, 8 + 3 * k)
-            # dn = -dm / |m| across m, and it is the turn n x dn; the offset is -1 / |m|.
+            # dn = -dm / |m| perpendicular to m is the rotation n x dn; the offset is -1 / |m|.
             out[6 + 6 * k : 9 + 6 * k, own] = -skew(normal)
             out[9 + 6 * k : 12 + 6 * k, own] = np.outer(normal, -normal) / size
         if self.frames is not None:
@@ -194,7 +193,7 @@ class CoplanarProblem:
         return np.asarray(out[:, self.free(state)])
 
     def lengths(self, state: CoplanarState, scale: float) -> tuple[FloatArray, FloatArray]:
-        """Return the factors (6 + 6 K,) of these parameters in mm, and their derivatives by the scale."""
+        """Return the factors (6 + 6 K,) that convert these parameters to mm, and their derivatives by the scale."""
         pose, normals, offsets = self.in_camera(state)
         is_length = np.tile(np.repeat([False, True], 3), 1 + len(offsets))
         by_scale = np.zeros(len(is_length))
@@ -203,5 +202,5 @@ class CoplanarProblem:
         return np.where(is_length, scale, 1.0), by_scale
 
     def turned_back(self, vectors: FloatArray) -> FloatArray:
-        """Return vectors (..., 3) of the level frame of camera 1 in that camera's own."""
+        """Return vectors (..., 3) of the level frame of camera 1 in the camera's frame."""
         return vectors if self.frames is None else np.asarray(vectors @ self.frames.level1_from_cam1)

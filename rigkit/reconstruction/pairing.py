@@ -1,4 +1,4 @@
-"""From the boards found in two images to matched corners and directions in the coordinates the pipeline works in."""
+"""Match the corners of boards that were detected in two images, and estimate directions at them."""
 
 from __future__ import annotations
 
@@ -29,8 +29,7 @@ from rigkit.identification.pair_identity import PairIdentity
 Chain = Literal["raw", "rectified"]
 
 MAX_RECTIFIED_RAD = np.deg2rad(75.0)
-"""A perspective view along the camera's axis stretches a pixel there by 1 / cos^2 = 15; beyond it the raw chain is the
-only sensible one."""
+"""Here a perspective view along the camera's axis stretches a pixel by 1 / cos^2 = 15; beyond, use raw pixels."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -40,15 +39,16 @@ class MatchedPair:
     Attributes
     ----------
     pair_id : name of the pair.
-    camera1, camera2 : calibrated cameras of the images as captured, central: where the pupil of one moves, all corners
-        are `as_with_fixed_pupil`.
+    camera1, camera2 : calibrated central cameras of the captured images. If a lens has a moving entrance pupil, its
+        corners are corrected by `as_with_fixed_pupil`.
     boards : boards seen in both images, in the order of `matches.board_index`.
-    identity : which board and which corner is which.
+    identity : identities of the boards and their corners.
     chain : "raw": `matches` are in captured pixels; "rectified": in perspective views along each camera's axis.
-    captured : the corners in captured pixels, where their noise is the same in all directions.
+    captured : the corners in captured pixels, where their noise is isotropic.
     matches : the corners in the coordinates of `chain`.
     directions : at the same corners, in the coordinates of `chain`.
     noise : predicted covariance of the directions.
+    notes : warnings.
     """
 
     pair_id: str
@@ -74,10 +74,9 @@ class MatchedPair:
         noise = DirectionNoise(self.noise.covariance1 * factor**2, self.noise.covariance2 * factor**2)
         return replace(self, captured=scaled(self.captured), matches=scaled(self.matches), noise=noise)
 
-    def in_chain(self, chain: Chain, *, support: Support = "patch", window: int | None = 2) -> MatchedPair:
-        """Return the same corners, identified as they are, in the coordinates of another chain; see `match_pair`."""
-        both = (self.camera1, self.camera2)
-        return _matched(self.pair_id, *both, self.boards, self.identity, chain, support, window)
+    def in_chain(self, chain: Chain, *, support: Support = "patch") -> MatchedPair:
+        """Return the same identified corners in the coordinates of another chain; see `match_pair`."""
+        return _matched(self.pair_id, self.camera1, self.camera2, self.boards, self.identity, chain, support, 2)
 
 
 def match_pair(
@@ -94,22 +93,22 @@ def match_pair(
     support: Support = "patch",
     window: int | None = 2,
 ) -> MatchedPair:
-    """Identify the boards, match their corners, and take directions.
+    """Identify the boards, match their corners, and estimate directions.
 
-    Raises InputError: no board is seen in both images; DegenerateError: `chain` is "rectified" and a corner lies too
+    Raises InputError if no board is seen in both images; DegenerateError if `chain` is "rectified" and a corner is too
     far off the axis.
 
     Parameters
     ----------
     pair_id : for messages.
-    camera1, camera2 : the cameras; one object twice where one camera was moved. Those whose pupil moves, `NearCamera`,
-        take that out of the corners: the boards' squares say how far away these are.
-    detections1, detections2 : all boards found in either image.
-    boards : the boards that stand there.
-    layout : board id -> "left", "right", "floor", "ceiling" or "back" where a person said so.
-    angles : between boards, as measured: they identify boards that look alike where no layout does.
-    chain : coordinates to work in.
-    support, window : what a direction is estimated from, see `direction_field`.
+    camera1, camera2 : the cameras; the same object twice if one camera was moved. For a lens with a moving entrance
+        pupil (`NearCamera`) the corners are corrected for it, at the distances that the boards' squares give.
+    detections1, detections2 : all boards found in each image.
+    boards : the boards in the scene.
+    layout : board id -> "left", "right", "floor", "ceiling" or "back", if declared.
+    angles : measured angles between boards; they identify boards of the same pattern if there is no layout.
+    chain : coordinates of the matches.
+    support, window : pixels that a direction is estimated from, see `direction_field`.
     """
     _check_sizes(pair_id, (*detections1, *detections2), boards)
 
@@ -129,7 +128,7 @@ def match_pair(
 def _with_fixed_pupil(
     detections: Sequence[BoardDetection], boards: Sequence[Board], camera: Camera, image: str
 ) -> tuple[Sequence[BoardDetection], list[str]]:
-    """Return known boards as a camera whose pupil did not move would have seen them, and what to say of that."""
+    """Return identified boards, corrected for a moving entrance pupil, and notes about the correction."""
     if not isinstance(camera, NearCamera):
         return detections, []
     by_id = {board.board_id: board for board in boards}
@@ -154,7 +153,7 @@ def _matched(
     support: Support,
     window: int | None,
 ) -> MatchedPair:
-    """Match the corners of identified boards, and take directions; else as `match_pair`."""
+    """Match the corners of identified boards, and estimate directions; see `match_pair`."""
     pairs, unseen = _with_rays(identity.pairs(), camera1, camera2)
     if not pairs:
         reasons = "; ".join(f"{name}: {why}" for name, why in identity.missing.items())
@@ -189,10 +188,9 @@ def _matched(
 
 
 def _check_sizes(pair_id: str, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> None:
-    """Refuse boards of another size than declared.
+    """Raise InputError if no detection has a declared size and two complete grids have the same other size.
 
-    A part of a larger board may be seen; but where nothing has a declared size, and complete grids of one other size
-    come again and again, the boards are of that size.
+    A single odd grid may be a part of a larger board.
     """
     declared = {frozenset(board.size) for board in boards}
     sizes = Counter(f"{d.columns}x{d.rows}" for d in detections if d.complete)
@@ -210,7 +208,7 @@ def _check_sizes(pair_id: str, detections: Sequence[BoardDetection], boards: Seq
 def _with_rays(
     pairs: Sequence[tuple[BoardDetection, BoardDetection]], camera1: Camera, camera2: Camera
 ) -> tuple[tuple[tuple[BoardDetection, BoardDetection], ...], int]:
-    """Leave out corners that have no ray in their camera; return the pairs and how many were left out."""
+    """Return the pairs without corners outside their camera's field of view, and the number of such corners."""
     out = []
     dropped = 0
     for pair in pairs:
@@ -225,17 +223,17 @@ def _with_rays(
 
 
 def _gather(camera1: Camera, camera2: Camera, pairs: Sequence[tuple[BoardDetection, BoardDetection]]) -> Matches:
-    """Return the corners that both images share, board after board."""
-    common = [common_corners(a, b) for a, b in pairs]
+    """Return the corners seen in both images, board after board."""
+    common = [(a, b, *common_corners(a, b)) for a, b in pairs]
     return Matches.from_cameras(
         camera1,
         camera2,
-        np.concatenate([a.pixels[i] for (a, _), (_, i, _) in zip(pairs, common, strict=True)]),
-        np.concatenate([b.pixels[j] for (_, b), (_, _, j) in zip(pairs, common, strict=True)]),
-        sigma1_px=np.concatenate([a.sigma_px[i] for (a, _), (_, i, _) in zip(pairs, common, strict=True)]),
-        sigma2_px=np.concatenate([b.sigma_px[j] for (_, b), (_, _, j) in zip(pairs, common, strict=True)]),
-        board_index=np.repeat(np.arange(len(pairs)), [len(grid) for grid, _, _ in common]),
-        grid=np.concatenate([grid for grid, _, _ in common]),
+        np.concatenate([a.pixels[i] for a, _, _, i, _ in common]),
+        np.concatenate([b.pixels[j] for _, b, _, _, j in common]),
+        sigma1_px=np.concatenate([a.sigma_px[i] for a, _, _, i, _ in common]),
+        sigma2_px=np.concatenate([b.sigma_px[j] for _, b, _, _, j in common]),
+        board_index=np.repeat(np.arange(len(pairs)), [len(grid) for _, _, grid, _, _ in common]),
+        grid=np.concatenate([grid for _, _, grid, _, _ in common]),
     )
 
 
@@ -248,32 +246,22 @@ def _directions(
     window: int | None,
     matches: Matches,
 ) -> tuple[DirectionPairs, DirectionNoise]:
-    vectors: tuple[list[FloatArray], list[FloatArray]] = ([], [])
-    covariances: tuple[list[FloatArray], list[FloatArray]] = ([], [])
-    shared: tuple[list[FloatArray], list[FloatArray]] = ([], [])
-    valid = []
+    parts = []
     for (first, second), pattern in zip(pairs, patterns, strict=True):
         _, i, j = common_corners(first, second)
-        field1 = direction_field(first, view1, support=support, window=window, pattern=pattern)
-        field2 = direction_field(second, view2, support=support, window=window, pattern=pattern)
-        for k, (field, index) in enumerate(((field1, i), (field2, j))):
-            vectors[k].append(field.vectors[index])
-            covariances[k].append(field.covariance[index])
-            shared[k].append(field.shared[index])
-        valid.append(field1.valid[i] & field2.valid[j])
+        one = direction_field(first, view1, support=support, window=window, pattern=pattern)
+        two = direction_field(second, view2, support=support, window=window, pattern=pattern)
+        noise = one.covariance[i], two.covariance[j], one.shared[i], two.shared[j]
+        parts.append((one.vectors[i], two.vectors[j], one.valid[i] & two.valid[j], *noise))
+    vectors1, vectors2, valid, *of_noise = (np.concatenate(part) for part in zip(*parts, strict=True))
     directions = DirectionPairs(
-        image1=np.concatenate(vectors[0]),
-        image2=np.concatenate(vectors[1]),
-        valid=np.concatenate(valid),
-        pixels1=matches.pixels1,
-        pixels2=matches.pixels2,
+        image1=vectors1, image2=vectors2, valid=valid, pixels1=matches.pixels1, pixels2=matches.pixels2
     )
-    noise = DirectionNoise.of_board(*(np.concatenate(parts) for parts in (*covariances, *shared)))
-    return directions, noise
+    return directions, DirectionNoise.of_board(*of_noise)
 
 
 def _axis_view(camera: Camera, rays: FloatArray, pair_id: str) -> Pinhole:
-    """Return the perspective view along the camera's own axis, at the scale of its centre; unbounded in size."""
+    """Return the pinhole camera along the camera's axis with its focal length; pixels may be outside of its image."""
     widest = float(np.arccos(np.clip(rays[:, 2].min(), -1.0, 1.0)))
     if widest > MAX_RECTIFIED_RAD:
         raise DegenerateError(
@@ -284,7 +272,7 @@ def _axis_view(camera: Camera, rays: FloatArray, pair_id: str) -> Pinhole:
 
 
 def _in_view(detection: BoardDetection, camera: Camera, view: Pinhole) -> BoardDetection:
-    """Return the detection in a perspective view; sigmas grow with the local magnification."""
+    """Return the detection in a perspective view, with sigmas scaled by the local magnification."""
     rays, _ = camera.unproject(detection.pixels)
     pixels, _, d_pixels_d_point, _ = view.project_with_jacobians(rays)
     if not np.isfinite(pixels).all():

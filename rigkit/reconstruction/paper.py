@@ -1,13 +1,13 @@
-"""The paper's own pipeline, beside the one that rigkit uses: for comparison with what was published.
+"""The pipeline of the paper, to compare rigkit's own with what was published.
 
-L. Hajder, "Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations". Points give F; chords to the
-neighbouring corners and F give an affinity at every corner; points and affinities, all rows with equal weights, give F
-again by a linear solver that the pose type constrains; rays are intersected and the squares give the scale. There is no
-refinement, no weight by noise and no predicted uncertainty. Formulas are the corrected ones (`Erratum:` where they
-stand).
+L. Hajder, "Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations". Points give F. Chords to the
+neighbouring corners and F give an affinity at every corner. Points and affinities, equally weighted, give F again by a
+linear solver that is constrained by the pose type. The points are triangulated, and the squares give the scale. Nothing
+is refined or weighted by noise, and no uncertainty is predicted. The formulas are the corrected ones, marked `Erratum:`
+where they are implemented.
 
-The paper runs the planar solver on standard and forward pairs too (`MOTIONS`); `OWN_MOTIONS` has those pose types'
-own constrained solvers.
+The paper uses the planar solver for standard and forward pairs too (`MOTIONS`). `OWN_MOTIONS` uses the solvers that are
+constrained to these pose types.
 """
 
 from __future__ import annotations
@@ -18,10 +18,7 @@ import numpy as np
 
 from rigkit.affine.affinities import Affinities, EpipolarNormals
 from rigkit.affine.registry import affines_from_directions, needs_epipolar
-from rigkit.core.arrays import BoolArray
-from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
@@ -37,27 +34,27 @@ MOTIONS: Mapping[PoseType, str] = {
     PoseType.STANDARD: "planar",
     PoseType.FORWARD: "planar",
 }
-"""Solver by pose type, as in the paper."""
+"""The paper's solver for each pose type."""
 OWN_MOTIONS: Mapping[PoseType, str] = {**MOTIONS, PoseType.STANDARD: "standard-rows", PoseType.FORWARD: "forward-roll"}
-"""Solver by pose type, each constrained as far as the type goes."""
+"""The most constrained solver for each pose type."""
 PAPER_SCALE = "sqmean"
-"""The paper's scale of DET3UDIR."""
+"""The scale that the paper uses in DET3UDIR."""
 
 
 def reconstruct_as_paper(
     pair: MatchedPair, *, pose_type: PoseType | str, affine_method: str, motions: Mapping[PoseType, str] = MOTIONS
 ) -> Reconstruction:
-    """Return what the paper's pipeline makes of a pair with one affine estimator.
+    """Reconstruct a pair by the paper's pipeline with one affine estimator.
 
-    Raises InputError: pose type AUTO; DegenerateError: the geometry does not determine the pose, or no corner has both
-    a point and a normal.
+    Raises InputError for pose type AUTO; DegenerateError if the geometry does not determine the pose, or no corner has
+    both a point and a normal.
 
     Parameters
     ----------
-    pair : matched corners; their directions are taken anew, as chords to the neighbours.
+    pair : matched corners; their directions are estimated again, as chords to the neighbours.
     pose_type : as declared; the paper has no way to choose one.
     affine_method : see `rigkit.affine.registry.AFFINE_METHODS`.
-    motions : which solver re-estimates the epipolar geometry, by pose type.
+    motions : solver that re-estimates the epipolar geometry, by pose type.
     """
     kind = PoseType(pose_type)
     if kind not in motions:
@@ -71,7 +68,16 @@ def reconstruct_as_paper(
         allowed = PoseType.PLANAR if motions[kind] == "planar" else kind
         pose = choose_pose(estimate.E21, m.rays1, m.rays2, allowed)
         metric = _in_mm(pair, pose)
-        cloud, kept = _cloud(pair, m, metric, affinities)
+        # The pipeline predicts no covariance of the pose: sigmas are those of the corners alone.
+        cloud, kept = oriented_cloud(
+            triangulate_matches(pair.captured, metric),
+            m,
+            metric,
+            np.zeros((6, 6)),
+            affinities,
+            colours=colours_at(None, pair.captured.pixels1),
+            board_ids=tuple(board.board_id for board in pair.boards),
+        )
     except DegenerateError as error:
         raise DegenerateError(f"pair '{pair.pair_id}', {affine_method}: {error}") from error
     return Reconstruction(
@@ -95,42 +101,26 @@ def reconstruct_as_paper(
     )
 
 
-def _cloud(
-    pair: MatchedPair, matches: Matches, pose: Rigid3, affinities: Affinities
-) -> tuple[OrientedCloud, BoolArray]:
-    """Return points and normals; their sigmas are the corners' alone, for the pipeline predicts none of the pose."""
-    return oriented_cloud(
-        triangulate_matches(pair.captured, pose),
-        matches,
-        pose,
-        np.zeros((6, 6)),
-        affinities,
-        colours=colours_at(None, pair.captured.pixels1),
-        board_ids=tuple(board.board_id for board in pair.boards),
-    )
-
-
 def _in_mm(pair: MatchedPair, pose: Rigid3) -> Rigid3:
-    """Return a pose of unit baseline with the scale of the boards' squares, all corners alike."""
+    """Return a pose of unit baseline in mm, scaled by the boards' squares with equal weights."""
     points = triangulate_matches(pair.captured, pose).points
     scale, _ = metric_scale(points, pair.captured.board_index, pair.captured.grid, pair.boards)
     return Rigid3(pose.rotation, scale * pose.translation_mm)
 
 
 def _affinities(chords: MatchedPair, method: str) -> Affinities:
-    """Return the affinities at the corners; no direction is left out for lying along its epipolar line.
+    """Return the affinities at the corners; directions along their epipolar lines are kept.
 
     Notes
     -----
-    The first F is of general motion whatever the pose type. F2UDIR and F3UDIR fulfil the geometry that they were made
-    with, so that re-estimation with the same solver would give it back: circular, whatever the paper hopes of it.
-    F3UDIR stacks its epipolar rows with the directions in least squares, as printed.
+    The first F is that of general motion, whatever the pose type. Affinities of F2UDIR and F3UDIR fulfil the geometry
+    that they were computed with, so re-estimation with the same solver only returns it, contrary to what the paper
+    hopes. F3UDIR stacks its epipolar rows with the directions in least squares, as printed.
     """
-    m = chords.matches
     epipolar = None
     if needs_epipolar(method):
-        E21 = fundamental_for("general").solve(m, "equal").E21
-        epipolar = EpipolarNormals.of_matches(m, E21)
+        E21 = fundamental_for("general").solve(chords.matches, "equal").E21
+        epipolar = EpipolarNormals.of_matches(chords.matches, E21)
     return affines_from_directions(
         chords.directions, method, epipolar=epipolar, scale=PAPER_SCALE, epipolar_rows="soft", min_conditioning=0.0
     )

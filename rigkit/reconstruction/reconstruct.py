@@ -1,7 +1,7 @@
-"""From matched corners of a pair to an oriented cloud in millimetres: the pose-type-aware pipeline.
+"""Reconstruct an oriented point cloud, in mm, from the matched board corners of an image pair.
 
-Points give the epipolar geometry; directions (and, for F2UDIR and F3UDIR, that geometry) give an affinity at every
-corner; affinities and epipolar geometry give normals.
+Points give the epipolar geometry. Directions give an affinity at every corner; F2UDIR and F3UDIR use the epipolar
+geometry as well. Affinities and epipolar geometry give the surface normals.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ GREY = 160
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Reconstruction:
-    """What the pipeline found for one pair with one affine estimator.
+    """The reconstruction of one pair with one affine estimator.
 
     Attributes
     ----------
@@ -53,19 +53,19 @@ class Reconstruction:
     pose_type : the pose type used (never AUTO).
     affine_method : "F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR" or "3SDIR".
     camera1, camera2 : the calibrated cameras of the two images.
-    boards : the boards reconstructed, in the order of `matches.board_index`.
-    matches : points and affinities in the coordinates that the pipeline worked in (rectified views or raw pixels).
-    pixels1, pixels2 : (N, 2) the same corners in the two images as captured.
+    boards : the reconstructed boards, in the order of `matches.board_index`.
+    matches : points and affinities, in rectified views or raw pixels.
+    pixels1, pixels2 : (N, 2) the same corners in the captured images.
     cam2_from_cam1 : relative pose, metric.
     pose_covariance : (6, 6) of (left rotation perturbation rad, translation mm), or None.
     E21 : (3, 3) essential matrix, unit Frobenius norm.
     cloud : points and normals in the frame of camera 1; row n belongs to match n.
     baseline_mm, baseline_sigma_mm : length of the translation and its predicted standard deviation.
-    sampson_rms_px : rms Sampson distance of the corners from the epipolar geometry.
-    notes : what was dropped, assumed or contradicted, in words.
-    level_sigma_rad : how well the pose type was taken to hold in the refinement; None: exactly, or it is general.
-    geometry, kept : of a pair with boards: what all its estimators share, and which (M,) of its corners have a normal
-        by this one. None for other scenes.
+    sampson_rms_px : RMS Sampson distance of the corners.
+    notes : warnings: what was left out, assumed or contradicted.
+    level_sigma_rad : standard deviation of the pose-type prior; None: the type holds exactly, or is general.
+    geometry, kept : for a pair with boards: the geometry that all estimators share, and a mask (M,) of its corners
+        that have a normal by this estimator. None for other scenes.
     """
 
     pair_id: str
@@ -93,13 +93,13 @@ class Reconstruction:
     _repr_html_ = drawn
 
     def measured_rays(self) -> tuple[Rays, Rays, RayJacobians, RayJacobians]:
-        """Return the rays of `pixels1` and of `pixels2`, and their derivatives by the pixels."""
+        """Return the rays (N, 3) of `pixels1` and of `pixels2`, and their Jacobians (N, 3, 2) by the pixels."""
         rays1, _, jacobians1 = self.camera1.rays_and_jacobians(self.pixels1)
         rays2, _, jacobians2 = self.camera2.rays_and_jacobians(self.pixels2)
         return rays1, rays2, jacobians1, jacobians2
 
     def same_points(self, other: Reconstruction) -> bool:
-        """Return whether both have the very same points: of one geometry, and the same corners."""
+        """Return whether both share one geometry and the same corners, and so the same points."""
         if self.geometry is None or self.kept is None or other.kept is None:
             return self is other
         return self.geometry is other.geometry and np.array_equal(self.kept, other.kept)
@@ -117,8 +117,9 @@ def reconstruct_pair(
 ) -> Reconstruction:
     """Reconstruct one pair with one affine estimator: `pair_geometry`, then `reconstruct_from`.
 
-    Parameters, errors : of those two. For several estimators compute the geometry once. With other `planes`
-    than "free" the points and normals are those of the boards' planes (`on_planes`), the intrinsics exact.
+    See these two for parameters and errors. To compare several estimators, compute the geometry once. With `planes`
+    "coplanar" or "lattice", points and normals are those of planes fitted to the boards (`on_planes`), with exact
+    intrinsics.
     """
     if planes not in PLANE_CHOICES:
         raise InputError(f"planes: '{planes}' is unknown; known: {', '.join(PLANE_CHOICES)}")
@@ -136,17 +137,20 @@ def reconstruct_from(
 ) -> Reconstruction:
     """Return the oriented cloud of a pair by one affine estimator.
 
-    Raises DegenerateError: no corner has both a point and a normal.
+    Raises DegenerateError if no corner has both a point and a normal.
 
     Parameters
     ----------
     geometry : pose and points, from `pair_geometry`.
     affine_method : see `rigkit.affine.registry.AFFINE_METHODS`.
-    scale : of DET3UDIR, see `affines_from_directions`.
-    image1 : image of camera 1, (H, W) or (H, W, 3) RGB, uint8 or uint16: colours of the cloud.
+    scale : scale estimate of DET3UDIR, see `affines_from_directions`.
+    image1 : image of camera 1, (H, W) or (H, W, 3) RGB, uint8 or uint16, for the colours of the cloud.
     """
     pair, metric = geometry.pair, geometry.metric
-    affinities = _affinities(pair, affine_method, geometry.E21, scale)
+    epipolar = EpipolarNormals.of_matches(pair.matches, geometry.E21) if needs_epipolar(affine_method) else None
+    affinities = affines_from_directions(
+        pair.directions, affine_method, epipolar=epipolar, scale=scale, noise=pair.noise
+    )
     matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
     cloud, kept = _cloud(geometry, affinities, affine_method, image1)
     notes = geometry.notes
@@ -180,7 +184,7 @@ def reconstruct_from(
 def _cloud(
     geometry: PairGeometry, affinities: Affinities, affine_method: str, image1: NDArray[np.generic] | None
 ) -> tuple[OrientedCloud, BoolArray]:
-    """Return the oriented cloud and which corners are in it. Raises DegenerateError where it would be empty."""
+    """Return the oriented cloud and a mask of the corners in it. Raises DegenerateError if it would be empty."""
     pair = geometry.pair
     affines: Callable[[EpipolarNormals], Affines] | None = None
     if needs_epipolar(affine_method):
@@ -211,7 +215,7 @@ def fit_planes(
     *,
     one_camera: bool = False,
 ) -> BoardPlanes:
-    """Return the boards' planes, "coplanar" or "lattice"; parameters and errors as of `lattice_planes`."""
+    """Fit the boards' planes by `coplanar_planes` or `lattice_planes`; see the latter for parameters and errors."""
     if planes not in ("coplanar", "lattice"):
         raise InputError(f"planes: '{planes}' are not fitted to both images; coplanar and lattice are")
     fit = lattice_planes if planes == "lattice" else coplanar_planes
@@ -219,13 +223,13 @@ def fit_planes(
 
 
 def on_planes(reconstruction: Reconstruction, planes: BoardPlanes) -> Reconstruction:
-    """Return the reconstruction with the points, normals and pose that planes fitted to both images give.
+    """Return the reconstruction with the points, normals and pose of planes that were fitted to both images.
 
-    Points of one board share the errors of its pose: their sigmas are each point's own, and planes fitted to them look
-    more certain than they are. `planes` says how certain the boards' planes are. Points that are not on `planes` are
-    left out, and a note says so.
+    Errors of points on one board are correlated through its pose, but a point's sigma is only its own. So take the
+    uncertainty of a plane from `planes`, not from a fit to these points. Points that are not on `planes` are left out,
+    with a note.
 
-    Raises DegenerateError: no point is on a board of `planes`.
+    Raises DegenerateError if no point is on a board of `planes`.
     """
     cloud = reconstruction.cloud
     placed = np.zeros(len(cloud), dtype=bool)
@@ -264,7 +268,7 @@ def on_planes(reconstruction: Reconstruction, planes: BoardPlanes) -> Reconstruc
 
 
 def _cloud_on_planes(reconstruction: Reconstruction, planes: BoardPlanes, placed: BoolArray) -> OrientedCloud:
-    """Return the points `placed` (N,) as the boards' planes have them."""
+    """Return the cloud of the points `placed` (mask (N,)), moved onto the boards' planes."""
     cloud = reconstruction.cloud
     points_mm, normals = np.array(cloud.points_mm), np.array(cloud.normals)
     sigma_mm, normal_sigma_rad = np.array(cloud.sigma_mm), np.array(cloud.normal_sigma_rad)
@@ -286,14 +290,6 @@ def _cloud_on_planes(reconstruction: Reconstruction, planes: BoardPlanes, placed
     return moved.select(placed)
 
 
-def _affinities(pair: MatchedPair, method: str, E21: Mat3, scale: str) -> Affinities:
-    m = pair.matches
-    epipolar = None
-    if needs_epipolar(method):
-        epipolar = EpipolarNormals.of_matches(m, E21)
-    return affines_from_directions(pair.directions, method, epipolar=epipolar, scale=scale, noise=pair.noise)
-
-
 def oriented_cloud(
     triangulated: TriangulatedPoints,
     matches: Matches,
@@ -305,17 +301,18 @@ def oriented_cloud(
     colours: NDArray[np.uint8],
     board_ids: tuple[str, ...] = (),
 ) -> tuple[OrientedCloud, BoolArray]:
-    """Return the oriented cloud, and which (N,) of the matches are in it: those with a point and a normal.
+    """Return the oriented cloud, and a mask (N,) of the matches in it: those with a point and a normal.
 
-    Raises DegenerateError: no match has both a point and a normal.
+    Raises DegenerateError if no match has both.
 
     Parameters
     ----------
     triangulated : the points, with their covariances.
     matches : the same points in the coordinates of the affinities.
-    cam2_from_cam1, pose_covariance : the cloud has the unit of its translation.
+    cam2_from_cam1, pose_covariance : the pose; the cloud has the unit of its translation.
     affinities : of the points.
-    affines : affinities for an epipolar geometry, where they follow from it and so move with it.
+    affines : for estimators that use the epipolar geometry: function that returns the affinities for a given one, so
+        that the pose's uncertainty propagates through them.
     colours : (N, 3) of the points.
     """
     points, covariance, seen = triangulated
@@ -340,7 +337,7 @@ def oriented_cloud(
 
 
 def colours_at(image: NDArray[np.generic] | None, pixels: Pixels) -> NDArray[np.uint8]:
-    """Return the colours at the nearest pixels, (N, 3); grey where there is no image."""
+    """Return the colours (N, 3) of the nearest pixels; grey if there is no image."""
     if image is None:
         return np.full((len(pixels), 3), GREY, dtype=np.uint8)
     column, row = np.rint(pixels).astype(np.int64).T

@@ -1,4 +1,4 @@
-"""The pose of contaminated correspondences: a robust search, then the likelihood of those that agree."""
+"""Estimate the pose from correspondences with outliers: robust search, then maximum likelihood on the inliers."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from rigkit.relative_pose.solvers.registry import fundamental_for
 from rigkit.relative_pose.solvers.weights import affinity_distances, affinity_residuals, usable_affinities
 
 MIN_MATCHES = 8
-"""Fewer that agree are chance among many that do not."""
+"""Fewer inliers can agree by chance."""
 MAX_NOISE = 6.0
-"""Noise of points, in their stated sigmas, up to which they can agree with a pose."""
+"""Largest noise of inliers, in their stated sigmas."""
 GATE = 3.3
-"""In standard deviations: one good point in a thousand is lost."""
+"""Inlier threshold in standard deviations: one inlier in a thousand is lost."""
 AFFINITY_GATE = 3.7
-"""The same for the length of two residuals."""
+"""The same for the norm of an affinity's two residuals."""
 SCENE_ROUNDS = 4
 CONTRADICTION = 1.5
-"""Times as many matches agree with another pose as with the measured one: that is wrong."""
+"""Ratio of another pose's inliers to the measured pose's from which the measured one is wrong."""
 MAX_FALSE_ALARMS = 1e-2
 SAMPLE_KINDS: tuple[Sample, ...] = ("points", "affine")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ScenePose:
-    """The pose of contaminated matches; `matches` are all of them, with the sigmas that the inliers show."""
+    """The pose of matches with outliers; `matches` are all, with sigmas scaled to the inliers' residuals."""
 
     matches: Matches
     refined: RefinedPose
@@ -60,10 +60,10 @@ class KnownPose:
 
     Attributes
     ----------
-    cam2_from_cam1 : it is used as it is.
-    covariance : (6, 6) of (left rotation perturbation rad, translation mm), exact where none is given.
-    moved : the cameras and the pose moved by one standard deviation along each axis of what is not known of them:
-        matches may be as far from their epipolar lines.
+    cam2_from_cam1 : used without refinement.
+    covariance : (6, 6) of (left rotation perturbation rad, translation mm); exact by default.
+    moved : cameras and pose moved by one standard deviation along each principal axis of their covariance, which widens
+        the inlier threshold.
     """
 
     cam2_from_cam1: Rigid3
@@ -76,8 +76,8 @@ class KnownPose:
         return float(np.linalg.norm(self.cam2_from_cam1.translation_mm))
 
     def open_px(self, matches: Matches) -> FloatArray:
-        """Return how far from their epipolar lines (N,) what is not known puts exact matches, px: one standard
-        deviation."""
+        """Return the standard deviation (N,) px of exact matches' epipolar distances by the uncertainty of the pose and
+        the cameras."""
         here = sampson_of_matches(essential_from_pose(self.cam2_from_cam1), matches)
         squares = np.zeros(len(matches))
         for camera1, camera2, pose in self.moved:
@@ -88,9 +88,9 @@ class KnownPose:
 
 
 def known_scene_pose(matches: Matches, known: KnownPose) -> ScenePose:
-    """Return a measured pose, which is not estimated again, with the matches that agree and the noise they show.
+    """Return a measured pose, not refined, with its inliers and their noise.
 
-    Raises DegenerateError: too few agree: it is not the pose of these images, or not of these cameras.
+    Raises DegenerateError for too few inliers: the pose, or a camera, is not that of these images.
     """
     length = known.baseline_mm
     pose = Rigid3(known.cam2_from_cam1.rotation, known.cam2_from_cam1.translation_mm / length)
@@ -119,11 +119,11 @@ def known_scene_pose(matches: Matches, known: KnownPose) -> ScenePose:
 
 
 def _refuse_contradiction(matches: Matches, pose: Rigid3, near: BoolArray) -> None:
-    """Raise DegenerateError where another pose explains far more of the matches than the measured one."""
+    """Raise DegenerateError if another pose explains many more of the matches than the measured one."""
     try:
         other = _search(matches, PoseType.GENERAL, np.random.default_rng(0)).refined.cam2_from_cam1
     except (InputError, DegenerateError):
-        # The matches alone do not determine a pose; nothing speaks against the measured one.
+        # The matches do not determine a pose, so they cannot contradict the measured one.
         return
     better = np.abs(_in_sigmas(matches, other)) < QUANTILE * MAX_NOISE
     if better.sum() > CONTRADICTION * near.sum():
@@ -142,10 +142,10 @@ def fit_scene_pose(
     rng: np.random.Generator,
     start: Rigid3 | None = None,
 ) -> ScenePose:
-    """Return the pose that most matches agree with, refined on those by points and affinities.
+    """Return the pose with most inliers, refined on these by points and affinities.
 
-    From `start`, where one is known that most of the matches were found with, nothing is searched for.
-    Raises DegenerateError: no pose, or none of the type `declared`, though there is another.
+    With `start`, a pose that the matches were found with, there is no robust search.
+    Raises DegenerateError without a pose, or if the pose is not of the type `declared`.
     """
     try:
         return _fitted(matches, declared, level_sigma_rad, rng, start)
@@ -197,7 +197,7 @@ def _fitted(
 def _search(matches: Matches, kind: PoseType, rng: np.random.Generator) -> RobustPose:
     """Return the better of the poses found from samples of points and from samples of affine correspondences.
 
-    Points lead to the optimum surely where most matches are right; where few are, the small samples still find it.
+    With few outliers, point samples find the optimum reliably; with many, the smaller affine samples still do.
     """
     best: tuple[float, RobustPose] | None = None
     failure: RigkitError | None = None
@@ -214,7 +214,7 @@ def _search(matches: Matches, kind: PoseType, rng: np.random.Generator) -> Robus
         if best is None or quality > best[0]:
             best = quality, found
     if best is None:
-        # Of a camera that did not move at all every sample fails: the reason is worth more than that.
+        # If the camera did not move every sample fails; this error names the reason.
         check_baseline(matches)
         raise failure or DegenerateError("no pose found")
     return best[1]
@@ -229,8 +229,8 @@ def _require(inliers: BoolArray) -> None:
 
 
 def _a_contrario_test(matches: Matches, pose: Rigid3, inliers: BoolArray, freedom: int) -> None:
-    """Raise DegenerateError where as many of so many wrong matches would be expected to agree with some pose."""
-    affinity = _affinity_in_sigmas(matches, pose)
+    """Raise DegenerateError if as many random matches would be expected to agree with some pose."""
+    affinity = affinity_distances(matches, essential_from_pose(pose))
     # A match without an affinity always passes that test.
     fits = ~(np.nan_to_num(affinity) >= AFFINITY_GATE)
     if log_false_alarms(matches, pose, inliers, fits, freedom, GATE) > np.log(MAX_FALSE_ALARMS):
@@ -245,23 +245,19 @@ def _in_sigmas(matches: Matches, pose: Rigid3) -> FloatArray:
 
 
 def _agreeing(matches: Matches, pose: Rigid3) -> BoolArray:
-    """Return which matches fit by their point, and by their affinity where they have one.
+    """Return a mask of the matches that fit by their point, and by their affinity if they have one.
 
-    A wrong partner that lies on the epipolar line by chance can turn the pose; its affinity gives it away.
+    The affinity reveals a wrong match that is close to its epipolar line by chance.
     """
-    doubt = _affinity_in_sigmas(matches, pose)
+    affinity = affinity_distances(matches, essential_from_pose(pose))
     good = np.abs(_in_sigmas(matches, pose)) < GATE
-    return np.asarray(good & ~(np.nan_to_num(doubt) >= AFFINITY_GATE))
-
-
-def _affinity_in_sigmas(matches: Matches, pose: Rigid3) -> FloatArray:
-    return affinity_distances(matches, essential_from_pose(pose))
+    return np.asarray(good & ~(np.nan_to_num(affinity) >= AFFINITY_GATE))
 
 
 def _with_shown_noise(matches: Matches, pose: Rigid3, inliers: BoolArray) -> Matches:
-    """Return the matches with sigmas as large as the residuals of the inliers from `pose` show them to be."""
+    """Return the matches with sigmas scaled to the residuals of the inliers of `pose`."""
     m = matches
-    # The pose's five degrees of freedom were fitted to the residuals.
+    # The pose has five degrees of freedom.
     few = np.sqrt(inliers.sum() / (inliers.sum() - 5.0))
     factor = max(float(np.median(np.abs(_in_sigmas(m, pose)[inliers]))) / MEDIAN_OF_NORMAL * few, 1e-6)
     return replace(
@@ -273,9 +269,9 @@ def _with_shown_noise(matches: Matches, pose: Rigid3, inliers: BoolArray) -> Mat
 
 
 def _shown_sigma_A(matches: Matches, pose: Rigid3, inliers: BoolArray) -> FloatArray:
-    """Return sigma_A (N,): that which the residuals show, for all the same or in proportion to what was stated.
+    """Return sigma_A (N,) from the residuals: equal for all, or proportional to the stated sigma_A or its square root.
 
-    The more likely of the two is taken; a stated sigma_A knows the image's noise, but not how flat the surface is.
+    The likeliest is returned. A stated sigma_A contains the image noise but not the curvature of the surface.
     """
     size = np.linalg.norm(affinity_residuals(matches, essential_from_pose(pose)), axis=1)
     of = inliers & np.isfinite(size)
@@ -285,12 +281,7 @@ def _shown_sigma_A(matches: Matches, pose: Rigid3, inliers: BoolArray) -> FloatA
     stated = matches.sigma_A
     if stated is not None and (stated[of] > 0.0).all() and np.isfinite(stated[of]).all():
         shapes += [np.sqrt(stated), np.asarray(stated)]
-    best = None
-    for shape in shapes:
-        with np.errstate(invalid="ignore"):
-            factor = max(float(np.median(size[of] / shape[of])) / MEDIAN_OF_RAYLEIGH, 1e-6)
-        cost = float(np.sum(np.log(factor * shape[of])))
-        if best is None or cost < best[0]:
-            best = cost, factor * shape
-    assert best is not None
-    return best[1]
+    with np.errstate(invalid="ignore"):
+        factors = [max(float(np.median(size[of] / shape[of])) / MEDIAN_OF_RAYLEIGH, 1e-6) for shape in shapes]
+    found = [factor * shape for factor, shape in zip(factors, shapes, strict=True)]
+    return min(found, key=lambda sigma: float(np.sum(np.log(sigma[of]))))

@@ -40,6 +40,11 @@ VIEW_RADIUS = (0.0, 0.45, 0.62)
 """Distances of calibration boards from the image's centre, over half the image height."""
 VIEWS = 10
 TARGET_TRIES = 300
+SESSION_TOML = """schema = "rigkit.session/1"
+images = "images/*.png"
+board = "../../boards/target.toml"
+model = "scaramuzza"
+"""
 OPTICS = Optics(0.6, field_deg=FIELD_DEG)
 PHOTOMETRY = Photometry(exposure=0.95, vignetting=0.3, gradient=(0.1, -0.06), noise_levels=1.5)
 
@@ -101,7 +106,7 @@ def _build(root: Path, rng: np.random.Generator, progress: Progress) -> None:
         scenes[name] = scene
     for board in (*DEMO_PLANES, TARGET):
         _write_text(root / f"boards/{board.board_id}.toml", _board_toml(board))
-    _write_text(root / "cameras/fisheye/session.toml", _session_toml())
+    _write_text(root / "cameras/fisheye/session.toml", SESSION_TOML)
     _write_text(root / "truth.json", json.dumps(_truth(camera, targets, scenes), indent=1))
     _write_text(root / "dataset.toml", _manifest_toml(scenes))
 
@@ -137,11 +142,6 @@ def _board_toml(board: Board) -> str:
         f'schema = "rigkit.board/1"\nid = "{board.board_id}"\n'
         f"columns = {board.columns}   # inner corners\nrows = {board.rows}\nsquare_mm = {board.square_x_mm:g}\n"
     )
-
-
-def _session_toml() -> str:
-    lines = ('schema = "rigkit.session/1"', 'images = "images/*.png"', 'board = "../../boards/target.toml"')
-    return "\n".join((*lines, 'model = "scaramuzza"', ""))
 
 
 def _manifest_toml(scenes: dict[str, StereoScene]) -> str:

@@ -1,4 +1,4 @@
-"""A stereo pair in front of boards, with every quantity that a reconstruction estimates known exactly."""
+"""Generate stereo pairs in front of boards, with exact truth for every quantity that a reconstruction estimates."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class StereoScene:
-    """Boards, what stands behind them, and two cameras.
+    """Boards, panels behind them, and two cameras.
 
     Attributes
     ----------
     boards, panels : in the world.
     camera1, camera2 : any models.
     cam1_from_world, cam2_from_world : poses.
-    pose_type : what a person would have declared.
+    pose_type : type of the relative pose.
     """
 
     boards: tuple[PlacedBoard, ...]
@@ -71,10 +71,10 @@ class StereoScene:
             normals.append(-np.sign(normal @ points[0]) * normal)
         return np.array(normals)
 
-    def detections(self, *, sigma_px: float = 0.01) -> tuple[tuple[BoardDetection, ...], tuple[BoardDetection, ...]]:
-        """Return what a perfect detector finds in image 1 and in image 2; the same corner has the same index."""
-        first = tuple(exact_detection(b, self.camera1, self.cam1_from_world, sigma_px=sigma_px) for b in self.boards)
-        second = tuple(exact_detection(b, self.camera2, self.cam2_from_world, sigma_px=sigma_px) for b in self.boards)
+    def detections(self) -> tuple[tuple[BoardDetection, ...], tuple[BoardDetection, ...]]:
+        """Return the exact detections in image 1 and in image 2, with corners in the same order."""
+        first = tuple(exact_detection(b, self.camera1, self.cam1_from_world) for b in self.boards)
+        second = tuple(exact_detection(b, self.camera2, self.cam2_from_world) for b in self.boards)
         return first, second
 
     def images(
@@ -98,7 +98,7 @@ def relative_pose(
 ) -> Rigid3:
     """Return cam2_from_cam1 of a planar, standard or forward pair; raises InputError for the other types.
 
-    `level_sigma_deg` is how well the spirit level held: the second camera is tilted by that much about x and about z.
+    `level_sigma_deg` is the standard deviation of the second camera's tilt about x and about z.
     """
     heading, yaw = -np.pi / 2.0, 0.0
     if pose_type is PoseType.PLANAR:
@@ -129,16 +129,16 @@ def trihedral_pair(
 ) -> StereoScene:
     """Return a random pair that sees all corners of three boards in the corner of a room.
 
-    Raises DegenerateError: no such view was found: the lens is too narrow, or the baseline too long.
+    Raises DegenerateError if no such view was found: the lens is too narrow, or the baseline too long.
 
     Parameters
     ----------
     boards : three boards of any sizes.
-    pose_type : GENERAL draws two free views `parallax_deg` apart as seen from the boards; the others move the second
-        camera by `baseline_mm`.
-    distance : range of the cameras' distance, as a multiple of the shortest at which the boards fill the image.
+    pose_type : GENERAL draws two independent views with a parallax in `parallax_deg`; the others move the second camera
+        by `baseline_mm`.
+    distance : range of the cameras' distance, as a multiple of that at which the boards fill the image.
     level_sigma_deg : spirit-level error of all but general pairs.
-    walls : whether walls and a floor stand behind the boards.
+    walls : whether to add walls and a floor behind the boards.
     """
     placed = trihedral(boards, angles_deg=angles_deg)
     return random_pair(
@@ -168,9 +168,9 @@ def random_pair(
     distance: tuple[float, float] = (0.9, 1.5),
     level_sigma_deg: float = 0.0,
 ) -> StereoScene:
-    """Return a random pair that sees all corners of boards that stand in the room x, y, z < 0; see `trihedral_pair`.
+    """Return a random pair that sees all corners of boards in the room x, y, z < 0; see `trihedral_pair`.
 
-    `panels` makes what stands behind the boards, given the radius (mm) of the ball round them.
+    `panels` returns the panels behind the boards for the radius (mm) of their bounding sphere.
     """
     second_camera = camera if camera2 is None else camera2
     corners = np.concatenate([b.points() for b in placed])
@@ -207,7 +207,7 @@ def random_pair(
 
 
 def _fill_factor(camera: Camera) -> float:
-    """Return the distance, in radii of a ball, at which the ball fills the shorter side of the image."""
+    """Return the distance, in radii of a sphere, at which it fills the shorter side of the image."""
     width, height = camera.size_px
     half_angle = min(0.5 * min(width, height) / camera.focal_px, np.radians(75.0))
     return float(1.0 / np.sin(half_angle))
@@ -216,7 +216,7 @@ def _fill_factor(camera: Camera) -> float:
 def _random_view(
     middle: FloatArray, scale_mm: float, distance: tuple[float, float], rng: np.random.Generator
 ) -> Callable[[], Rigid3]:
-    """Return a source of cam_from_world: in the room, looking at the boards, rolled up to 30 degrees."""
+    """Return a function that draws cam_from_world: in the room, looking at the boards, rolled up to 30 degrees."""
 
     def view() -> Rigid3:
         direction = unit(-np.abs(rng.standard_normal(3)))

@@ -1,6 +1,6 @@
-"""Many random pairs of views of three boards at once: the geometry of the synthetic study.
+"""Generate batches of random pairs of views of three boards, for the synthetic study.
 
-Everything is batched over trials. Lengths are mm; camera 1 is the world.
+Everything is batched over trials. Lengths are in mm, in the frame of camera 1.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from rigkit.core.arrays import FloatArray, IntArray, Mat3, Normals, Points, keep
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.posetype import PoseType
-from rigkit.geometry.rotation import exp_so3, unit
+from rigkit.geometry.rotation import exp_so3, skew, unit
 from rigkit.synthetic.pairs import PLANAR_YAW_DEG
 
 CAMERA_RANGE_MM = (900.0, 1300.0)
@@ -23,9 +23,9 @@ MIN_INCIDENCE = 0.35
 ROLL_DEG = 30.0
 AIM_JITTER_DEG = 8.0
 MARGIN_SQUARES = 0.5
-"""Of white round the squares of a board."""
+"""White margin around the squares of a board."""
 DRAWS = 4000
-"""Candidates drawn at a time by rejection sampling."""
+"""Candidates of each draw of rejection sampling."""
 MAX_DRAWS = 200
 
 SPECIAL_PLANES = (
@@ -43,10 +43,10 @@ class PairBatch:
     Attributes
     ----------
     points_mm : (T, N, 3) in the frame of camera 1.
-    normals : (T, B, 3) unit, one a board, facing camera 1.
+    normals : (T, B, 3) unit normal of each board, facing camera 1.
     rotation21, translation21_mm : (T, 3, 3), (T, 3): x_in_2 = R x_in_1 + t.
     board_index : (N,) int.
-    board : the board, the same for all B planes; corners are sorted board by board, row by row.
+    board : the same for all B planes; corners are sorted board by board, row by row.
     """
 
     points_mm: Points
@@ -70,8 +70,6 @@ class PairBatch:
 
     def essential(self) -> Mat3:
         """Return the essential matrices, (T, 3, 3), of unit Frobenius norm."""
-        from rigkit.geometry.rotation import skew
-
         e = skew(self.translation21_mm) @ self.rotation21
         return np.asarray(e / np.linalg.norm(e, axis=(1, 2), keepdims=True))
 
@@ -79,16 +77,16 @@ class PairBatch:
 def general_pairs(
     board: Board, trials: int, rng: np.random.Generator, *, parallax_deg: tuple[float, float] = (40.0, 70.0)
 ) -> PairBatch:
-    """Return pairs of free views of three boards in the corner of a room.
+    """Return pairs of independent views of three boards in the corner of a room.
 
-    Both cameras are 0.9 to 1.3 m from the corner, look at it within 8 degrees, roll by up to 30, and see every board
-    corner at no more than 69 degrees from its normal.
+    Both cameras are 0.9 to 1.3 m from the corner, look at it within 8 degrees, roll by up to 30 degrees, and see every
+    board corner at no more than 69 degrees from its normal.
 
-    Raises DegenerateError: no such pair exists, or next to none.
+    Raises DegenerateError if too few such pairs were found.
 
     Parameters
     ----------
-    parallax_deg : range of the angle between the two cameras as seen from the corner.
+    parallax_deg : range of the angle between the two cameras at the corner.
     """
     corners, facing = _corner_boards(board)
     n = board.corner_count
@@ -126,17 +124,17 @@ def special_pairs(
     baseline_mm: float = 300.0,
     in_plane_deg: float = 25.0,
 ) -> PairBatch:
-    """Return planar, standard or forward pairs before three planes: in front, below and to the right of camera 1.
+    """Return planar, standard or forward pairs with three planes: in front, below and to the right of camera 1.
 
     Parameters
     ----------
-    in_plane_deg : how far the boards are turned in their planes, counter-clockwise as seen. At 0 their edges run along
-        the camera's axes, where directions along the baseline tell nothing.
+    in_plane_deg : rotation of the boards in their planes, counter-clockwise in the image. At 0 their edges are parallel
+        to the camera's axes, and directions along the baseline have no information.
 
     Notes
     -----
-    Planar: yaw uniform within 10 degrees, direction of motion uniform. Standard and forward pairs are all alike: only
-    noise differs between trials.
+    Planar: yaw uniform within 10 degrees, direction of motion uniform. Standard and forward pairs are the same in all
+    trials: only noise differs.
     """
     n = board.corner_count
     flat = board.points() - board.points().mean(axis=0)
@@ -166,10 +164,10 @@ def special_pairs(
 
 
 def _corner_boards(board: Board) -> tuple[Points, Normals]:
-    """Return the corners of three boards (3 N, 3) whose first corners lie nearest to the origin, and their normals.
+    """Return the corners of three boards (3 N, 3) whose first corners are nearest to the origin, and their normals.
 
-    Rows and columns lead away from the corner of the room on all three, so that their diagonals do, too: the estimators
-    that use the diagonal then treat the planes alike.
+    Rows, columns and so diagonals lead away from the corner of the room on all three boards, so that estimators that
+    use the diagonal treat the planes alike.
     """
     away = -np.eye(3)
     flat = board.points()[:, :2] + (1.0 + MARGIN_SQUARES) * np.array([board.square_x_mm, board.square_y_mm])
@@ -178,7 +176,7 @@ def _corner_boards(board: Board) -> tuple[Points, Normals]:
 
 
 def _octant_eyes(corners: Points, facing: Normals, board: Board, rng: np.random.Generator) -> Points:
-    """Return random camera centres (M, 3) in the room from which every corner is seen well enough."""
+    """Return random camera centres (M, 3) in the room with sufficient incidence at every corner."""
     direction = unit(-np.abs(rng.standard_normal((DRAWS, 3))))
     eyes = direction * rng.uniform(*CAMERA_RANGE_MM, (DRAWS, 1))
     good = np.ones(DRAWS, dtype=bool)
@@ -191,7 +189,7 @@ def _octant_eyes(corners: Points, facing: Normals, board: Board, rng: np.random.
 
 
 def _look_at_origin(eyes: Points, rng: np.random.Generator) -> Mat3:
-    """Return cam_from_world rotations (T, 3, 3) that look at the origin, with roll and a jitter of the aim."""
+    """Return cam_from_world rotations (T, 3, 3) that look at the origin, with random roll and aim."""
     z = unit(-eyes)
     x = unit(np.cross(np.array([0.0, 1.0, 0.0]), z))
     rotation = np.stack([x, np.cross(z, x), z], axis=1)

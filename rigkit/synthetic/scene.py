@@ -1,8 +1,8 @@
-"""Boards and plain panels in space, and the exact image of their corners through any camera.
+"""Place boards and plain panels in space, and project their corners exactly through any camera.
 
-The world frame of a trihedral capture has its origin where the three planes meet, x to the right, y down, z away from
-the viewer. Plane 1 is the wall in front (normal z), plane 2 the floor (normal y), plane 3 the wall on the right (normal
-x); cameras stand at x, y, z < 0.
+The world frame of a trihedral capture has its origin at the intersection of the three planes, x to the right, y down, z
+away from the viewer. Plane 1 is the wall in front (normal z), plane 2 the floor (normal y), plane 3 the wall on the
+right (normal x); cameras are at x, y, z < 0.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from rigkit.geometry.rotation import exp_so3, unit
 WALLS = (0.34, 0.42, 0.28)
 """Reflectances of the walls and the floor of a room."""
 BOARD_CLEARANCE_MM = 3.0
-"""Gap between the paper's edge and the edge where two walls meet: boards that touch would hide each other's edge."""
+"""Gap between the paper's edge and the edge of two walls: boards that touch would hide each other's edge."""
 SEAM_ROUNDING_MM = 1e-6
-"""In a room of right angles a board's edge lies at the clearance to rounding, and stays there."""
+"""Overlaps below this are rounding: in a room of right angles boards are not moved."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -53,7 +53,7 @@ class PlacedBoard:
     ----------
     board : the board.
     world_from_board : board frame (origin at the first inner corner, z into the board) to world.
-    margin_squares : width of the white margin round the squares, in squares; 0 cuts the paper at the outer squares.
+    margin_squares : width of the white margin around the squares, in squares.
     white, black : reflectances.
     first_black : whether the square whose lower right corner is the first inner corner is black.
     """
@@ -70,11 +70,11 @@ class PlacedBoard:
         return self.world_from_board.apply(self.board.points())
 
     def normal(self) -> FloatArray:
-        """Return the unit normal in the world that faces the viewer of the board."""
+        """Return the unit normal (3,) in the world, on the printed side."""
         return np.asarray(-self.world_from_board.rotation[:, 2])
 
     def edge_squares(self) -> tuple[FloatArray, FloatArray]:
-        """Return the lower and the upper edge of the paper along x and y, in squares from the first inner corner."""
+        """Return the lower and upper ends (2,) of the paper along x and y, in squares from the first inner corner."""
         low, high = self.board.pattern.outline(*self.board.size)
         return low - self.margin_squares, high + self.margin_squares
 
@@ -86,7 +86,7 @@ class PlacedBoard:
         return self.world_from_board.apply(np.concatenate([xy * side, np.zeros((4, 1))], axis=1))
 
     def see(self, camera: Camera, cam_from_world: Rigid3) -> tuple[Pixels, BoolArray]:
-        """Return the exact pixels (N, 2) of all corners and which of them are in the image and seen from the front."""
+        """Return the exact pixels (N, 2) of all corners, and a mask (N,) of those in the image, seen from the front."""
         points = cam_from_world.apply(self.points())
         pixels, valid = camera.project(points)
         width, height = camera.size_px
@@ -96,26 +96,17 @@ class PlacedBoard:
         return pixels, valid & inside & facing
 
 
-def exact_detection(
-    placed: PlacedBoard, camera: Camera, cam_from_world: Rigid3, *, sigma_px: float = 0.01
-) -> BoardDetection:
-    """Return what a perfect detector would find of `placed`; corners outside the image are left out."""
+def exact_detection(placed: PlacedBoard, camera: Camera, cam_from_world: Rigid3) -> BoardDetection:
+    """Return the exact detection of `placed`, without corners outside the image; its sigmas are 0.01 px."""
     pixels, valid = placed.see(camera, cam_from_world)
-    board = placed.board
-    return BoardDetection(
-        board.board_id,
-        board.columns,
-        board.rows,
-        board.grid()[valid],
-        pixels[valid],
-        np.full(int(valid.sum()), sigma_px),
-    )
+    board, sigma_px = placed.board, np.full(int(valid.sum()), 0.01)
+    return BoardDetection(board.board_id, *board.size, board.grid()[valid], pixels[valid], sigma_px)
 
 
 def wall_axes(angles_deg: tuple[float, float, float]) -> tuple[Mat3, Mat3, Mat3]:
     """Return world_from_board rotations of three planes at the angles (1-2, 1-3, 2-3), in degrees.
 
-    Raises InputError where no three planes stand at those angles.
+    Raises InputError if no three planes have those angles.
     """
     a12, a13, a23 = np.radians(as_array(angles_deg, (3,), "angles_deg"))
     n1 = np.array([0.0, 0.0, 1.0])
@@ -142,21 +133,21 @@ def trihedral(
 ) -> tuple[PlacedBoard, PlacedBoard, PlacedBoard]:
     """Return three boards pushed into the corner of a room: front wall, floor, right wall.
 
-    Each lies against one edge; where the edges meet at less than a right angle it is moved along it until no part of it
-    sticks through the third plane.
+    Each board is parallel to an edge of the room. If edges meet at less than a right angle, it is moved along its edge
+    until it does not intersect the third plane.
 
     Parameters
     ----------
     boards : three boards of any sizes.
     angles_deg : angles between planes 1-2, 1-3 and 2-3.
-    clearance_mm : from the paper's edges to those where walls meet.
+    clearance_mm : from the paper's edges to the edges of the room.
     """
     if len(boards) != 3:
         raise InputError(f"trihedral: three boards expected, got {len(boards)}")
-    # Which corner of the paper points into the corner of the room, in board axes (+1: the far end, -1: the near end).
+    # The paper's corner in the corner of the room, in board axes (+1: the far end, -1: the near end).
     corner_side = ((1, 1), (1, -1), (-1, 1))
     walls = wall_axes(angles_deg)
-    # The board axis along the edge that it lies against, and the plane at the end of that.
+    # The board axis parallel to the edge of the room, and the plane at the end of that edge.
     along_seam = ((0, 2), (0, 2), (1, 1))
     out = []
     for board, axes, side, (axis, end) in zip(boards, walls, corner_side, along_seam, strict=True):
@@ -189,11 +180,11 @@ def room_walls(
 def place_board(
     board: Board, camera: Camera, target_px: FloatArray, square_px: float, max_tilt_deg: float, rng: np.random.Generator
 ) -> PlacedBoard | None:
-    """Return the board with its centre seen at `target_px`, or None where the lens does not see there."""
+    """Return the board with its centre at `target_px`, randomly tilted, or None outside of the field of view."""
     ray, valid = camera.unproject(target_px)
     if not valid:
         return None
-    # Pixels per radian at the target: the board's distance follows from the size of a square.
+    # Pixels per radian at the target, which gives the distance for the size of a square.
     scale = 1.0 / np.linalg.svd(camera.ray_jacobian(target_px), compute_uv=False)[0]
     depth = board.square_x_mm * scale / square_px
     facing = _rotation_to(ray)
@@ -216,7 +207,7 @@ def _rotation_to(ray: FloatArray) -> FloatArray:
 def sees_paper(
     placed: PlacedBoard, camera: Camera, low: FloatArray | tuple[float, float], high: FloatArray | tuple[int, int]
 ) -> bool:
-    """Say whether the whole paper is seen between two image corners."""
+    """Return whether the whole paper is visible inside the image rectangle from `low` to `high`."""
     pixels, valid = camera.project(placed.outline())
     corners, seen = placed.see(camera, Rigid3.identity())
     if not (valid.all() and seen.all()):

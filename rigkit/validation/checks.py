@@ -1,8 +1,8 @@
-"""A reconstruction against what a person measured: each quantity with both uncertainties and a verdict.
+"""Validate a reconstruction against measured baselines, angles and distances.
 
-A check passes where |ours - measured| <= k sqrt(sigma_ours^2 + sigma_measured^2). k = 2 is the usual coverage factor of
-a stated measurement (about 95 %, JCGM 100 "GUM", section 6). A correct result fails one check in twenty if every sigma
-is honest, and fewer where people state theirs generously.
+A check passes if |ours - measured| <= k sqrt(sigma_ours^2 + sigma_measured^2). k = 2 is the usual coverage factor of a
+stated measurement (about 95 %, JCGM 100 "GUM", section 6). If all sigmas are right, a correct result fails one check in
+twenty.
 """
 
 from __future__ import annotations
@@ -35,21 +35,23 @@ ANGLE_ERRORS = ("error_deg", "coplanar_error_deg", "lattice_error_deg")
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ValidationReport:
-    """The verdict on one pair with one affine estimator. It cannot be built without a check.
+    """The validation of one pair with one affine estimator.
+
+    Raises InputError if it has no check of a measured quantity.
 
     Attributes
     ----------
-    pair_id, pose_type, affine_method : what was judged.
+    pair_id, pose_type, affine_method : of the validated reconstruction.
     checks : every measured quantity that could be compared.
-    unchecked : measured quantities that could not be, and why: the report does not pass then.
-    boards : plane, normal errors and frame of each board.
-    angles : between each two boards.
+    unchecked : measured quantities that could not be compared, and why; the report does not pass with any.
+    boards : plane, normal errors and lattice of each board.
+    angles : between every two boards.
     baseline_mm, baseline_sigma_mm, sampson_rms_px, count : of the reconstruction.
-    notes : the reconstruction's notes, and boards with gross outliers.
-    planes : what is known of the boards' points by which angles, normals and the baseline are judged.
-    judged_normals : of the boards, where they are not those of the planes through the points.
-    coplanar_normal_errors, lattice_normal_errors : of the estimated normals against the planes that were fitted to both
-        images, by board.
+    notes : the reconstruction's notes, and boards with outliers.
+    planes : which kind of planes the checks of angles, normals and baseline use.
+    judged_normals : normals of the boards, unless they are those of planes through the points.
+    coplanar_normal_errors, lattice_normal_errors : errors of the estimated normals against the planes that were fitted
+        to both images, by board.
     """
 
     pair_id: str
@@ -81,11 +83,11 @@ class ValidationReport:
 
     @property
     def passed(self) -> bool:
-        """Whether everything that was measured was checked, and every check passed."""
+        """Whether every measured quantity was checked, and every check passed."""
         return not self.unchecked and all(check.passed for check in self.checks)
 
     def check(self, name: str) -> Check:
-        """Return the check of that name; raises InputError that lists the known ones."""
+        """Return the check of that name; raises InputError if there is none."""
         for check in self.checks:
             if check.name == name:
                 return check
@@ -146,19 +148,19 @@ def validate(
     coverage: float = COVERAGE,
     weighted: bool = True,
 ) -> ValidationReport:
-    """Judge a reconstruction against measured truth.
+    """Validate a reconstruction against measured truth.
 
-    Raises InputError: nothing was measured, or nothing that was measured is about a board that was reconstructed;
-    DegenerateError: a board has too few points for a plane.
+    Raises InputError if nothing was measured, or nothing of a reconstructed board; DegenerateError if a board has too
+    few points for a plane.
 
     Parameters
     ----------
     reconstruction : of one pair.
-    truth : what a person measured of that pair; None, as of a pair of which nothing was measured, is refused.
-    shifts : from `calibration_shifts`: what the calibrations' uncertainty adds to every sigma; None: exact intrinsics.
-    fitted : planes fitted to both images, to stand beside those of the points, or to be judged in their place.
+    truth : measurements of that pair; None raises InputError.
+    shifts : from `calibration_shifts`: adds the calibrations' uncertainty to every sigma; None: exact intrinsics.
+    fitted : planes fitted to both images, to compare with those of the points, or to check instead of them.
     coverage : largest |difference| / combined sigma that passes.
-    weighted : planes by what is known of each point's noise; else by principal components of the points, all alike.
+    weighted : fit planes with the points' covariances; else by unweighted principal component analysis.
     """
     if truth is None:
         raise InputError("validate: nothing was measured of this pair, so nothing can be checked; give its PairTruth")
@@ -173,10 +175,10 @@ def validate_each(
     fitted: FittedPlanes | None = None,
     layout: Mapping[str, str] | None = None,
 ) -> tuple[ValidationReport, ...]:
-    """Return `validate` of reconstructions of one pair by several estimators, each with its shifts.
+    """Validate reconstructions of one pair by several estimators, each with its shifts.
 
-    Estimators that kept the same corners have the same points, whose planes are fitted once. `layout` says on which
-    side boards were declared to hang.
+    Estimators that kept the same corners have the same points, whose planes are fitted once. `layout` gives the
+    declared side of boards.
     """
     known: list[tuple[Reconstruction, CalibrationShifts | None, Measured]] = []
     reports = []
@@ -241,7 +243,7 @@ def _checks_of_boards(
     fitted: FittedPlanes,
     coverage: float,
 ) -> tuple[list[Check], list[str]]:
-    """Return the checks of measured angles and distances, and in words which could not be made."""
+    """Return the checks of measured angles and distances, and which quantities could not be checked, and why."""
     checks: list[Check] = []
     unchecked: list[str] = []
     for angle in truth.angles:
@@ -266,7 +268,7 @@ def _checks_of_boards(
 def _baseline(
     reconstruction: Reconstruction, shifts: CalibrationShifts | None, fitted: FittedPlanes
 ) -> tuple[float, float]:
-    """Return the baseline that is judged, and its sigma with the calibrations' share, mm."""
+    """Return the baseline to check and its sigma, including the calibrations' uncertainty, mm."""
     if fitted.judge is not None:
         return fitted.judge.baseline_mm()
     sigma = reconstruction.baseline_sigma_mm
@@ -275,11 +277,11 @@ def _baseline(
 
 
 def _outlier_notes(boards: Iterable[BoardResult]) -> list[str]:
-    lost = {b.board.board_id: b.plane.gross for b in boards}
     return [
-        f"board '{name}': {count} corners lie far off its plane and were left out of it; is something in front of it?"
-        for name, count in lost.items()
-        if count
+        f"board '{b.board.board_id}': {b.plane.gross} corners lie far off its plane and were left out of it; is "
+        "something in front of it?"
+        for b in boards
+        if b.plane.gross
     ]
 
 

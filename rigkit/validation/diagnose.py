@@ -1,4 +1,4 @@
-"""What a failed check most probably comes from, in words: a wrong square, a wrong rule, the wrong calibration."""
+"""Find the probable causes of failed checks: wrong square size, misread length, wrong calibration."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ from rigkit.validation.check import Check
 from rigkit.validation.checks import ValidationReport
 
 CLEARLY_BETTER = 4.0
-"""Another calibration fits clearly better if it leaves this many times less. Two calibrations of one lens differ by far
+"""Ratio of residuals from which another calibration fits clearly better. Two calibrations of one lens differ by far
 less, two lenses by far more."""
 LARGE_RESIDUAL_PX = 0.5
-"""Below this no calibration is called wrong: corners of a blurred or bent board leave as much."""
+"""Smaller residuals are not blamed on the calibration: corners of a blurred or bent board have as much."""
 SAME_RATIO = 0.005
-"""Baselines that are off by one factor, to half a percent, share a cause."""
+"""Lengths that are wrong by the same factor within half a percent have the same cause."""
 ODD_BOARD = 0.003
-"""A board whose squares come out of this much another size than those of the other boards was measured wrongly."""
+"""Relative difference to the other boards' squares from which a board was measured wrongly."""
 NO_BOARD = 0.2
-"""Logarithm of width over height: nobody measures a square this wrongly, so it is no square of the board."""
+"""|log(width / height)| from which it is not the board's square: no one measures squares this wrongly."""
 UNITS = {"m": 1000.0, "cm": 10.0, "inches": 25.4}
 UNIT_RATIO = 0.05
-"""A length that is off by the factor of a unit, to five percent, was written in that unit."""
+"""Relative tolerance for a length that is wrong by the factor of a unit."""
 MIN_CORNERS_TO_DIAGNOSE = 12
 MEASURE_SIDES, OR_ASPECT = "measure square_x_mm and square_y_mm", ", or look at the calibration's aspect"
 
 
 def camera_fit(camera: Camera, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> float:
-    """Return the root mean square misfit (px, 2-D) of boards of known shape seen through a camera.
+    """Return the RMS reprojection error (px, 2-D) of boards of known shape with each board's own pose.
 
-    Nothing but the boards' shape is used: no epipolar geometry, no identity, no scale. NaN where no board of a known
-    size has enough corners; infinite where the camera cannot see the corners at all.
+    Only the boards' shape is used: no epipolar geometry, identity or scale. NaN if no board of a known size has enough
+    corners; infinite if a corner is outside the camera's field of view.
     """
     square, count = 0.0, 0
     for detection in detections:
         board = _of_that_shape(detection, boards)
         if board is None or len(detection.grid) < MIN_CORNERS_TO_DIAGNOSE:
             continue
-        # A quarter turn where the board's columns are the image's rows; which way round does not matter to its shape.
+        # A quarter turn if the board's columns are the image's rows; its sense does not matter to the shape.
         seen = detection if board.size == (detection.columns, detection.rows) else detection.turned(1)
         rays, valid = camera.unproject(seen.pixels)
         if not valid.all():
@@ -68,16 +68,15 @@ def diagnose_cameras(
     boards: Sequence[Board],
     cameras: Mapping[str, Camera],
 ) -> tuple[str, ...]:
-    """Return what is wrong with the calibrations that a pair declares; empty where they fit.
+    """Return messages about wrong calibrations of a pair; empty if they fit.
 
     Parameters
     ----------
     pair_id : for the message.
     declared : names of the cameras of image 1 and image 2.
     detections : boards found in image 1 and image 2; names are not needed.
-    boards : that may be there.
-    cameras : all calibrated cameras of the data set, by name; those of another image size than the declared one
-        cannot have taken the image.
+    boards : that may be in the images.
+    cameras : all calibrated cameras of the data set, by name; only those of the declared one's image size are tried.
     """
     fits = []
     for found, own in zip(detections, declared, strict=True):
@@ -113,8 +112,7 @@ def diagnose_cameras(
 
 
 def _best_stretch(camera: Camera, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> tuple[float, float]:
-    """Return which width over height, against what is declared, squares of all boards have best, and the misfit then,
-    px."""
+    """Return the width over height of all squares, relative to the declared, that fits best, and the RMS error, px."""
     # Imported here: only where an image does not fit.
     from scipy.optimize import minimize_scalar
 
@@ -127,7 +125,7 @@ def _best_stretch(camera: Camera, detections: Sequence[BoardDetection], boards: 
 
 
 def diagnose_squares(fitting: Sequence[FittingSquares]) -> tuple[str, ...]:
-    """Return which board of a pair, which fitted nowhere as declared, has squares of another size; empty for none."""
+    """Return a message about a board that was not identified because its squares have another size; empty if none."""
     sizes = []
     for one in fitting:
         ids, declared_mm = [f"'{board.board_id}'" for board in one.boards], one.boards[0].square_x_mm
@@ -139,10 +137,10 @@ def diagnose_squares(fitting: Sequence[FittingSquares]) -> tuple[str, ...]:
 
 
 def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
-    """Return the probable causes of the checks that failed in a data set; give one report a pair."""
+    """Return the probable causes of failed checks in a data set, from one report for each pair."""
     if all(report.passed for report in reports):
         return ()
-    # A prior that does not hold bends all that is found with it: there nothing else is to be suspected.
+    # A wrong prior changes the whole result: it explains all other failures of that pair.
     free = [report for report in reports if not _contradicted(report)]
     out = [f"pair '{r.pair_id}': {_contradicted(r)}" for r in reports if _contradicted(r)]
     out += [] if all(report.passed for report in free) else _diagnose_free(free)
@@ -150,18 +148,18 @@ def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
 
 
 def _contradicted(report: ValidationReport) -> str:
-    """Return in words which declarations of the pose the images contradict; "" where none."""
+    """Return a message about the declarations of the pose that the images contradict; "" if none."""
     off = [check.name for check in report.checks if check.kind in ("pose type", "level") and not check.passed]
     remedy = "declare what they speak for, or a level as good as it was; what else fails there may come of it"
     return f"the images contradict the declared {' and '.join(off)}: {remedy}" if off else ""
 
 
 def _diagnose_free(reports: Sequence[ValidationReport]) -> list[str]:
-    """Return the probable causes of checks that failed where no declaration of the pose is contradicted."""
+    """Return the probable causes of failed checks in pairs whose declared pose is not contradicted."""
     out = _diagnose_boards(reports)
     odd = _longest_by_boards(reports)
     failed = [(r.pair_id, c) for r in reports for c in r.checks if c.kind in ("baseline", "distance") and not c.passed]
-    # What boards that are odd cannot explain has another cause, which comes first.
+    # Lengths that wrong boards cannot explain have another cause, which comes first.
     failed = [(pair, c) for pair, c in failed if abs(c.difference) > c.measured * odd + c.limit_k * c.combined_sigma]
     if failed:
         out = [*_diagnose_lengths(failed, reports), *out]
@@ -171,11 +169,8 @@ def _diagnose_free(reports: Sequence[ValidationReport]) -> list[str]:
 
 
 def _of_that_shape(detection: BoardDetection, boards: Sequence[Board]) -> Board | None:
-    for size in ((detection.columns, detection.rows), (detection.rows, detection.columns)):
-        for board in boards:
-            if board.size == size:
-                return board
-    return None
+    sizes = (detection.columns, detection.rows), (detection.rows, detection.columns)
+    return next((board for size in sizes for board in boards if board.size == size), None)
 
 
 def _clearly_better(fit: Mapping[str, float], declared: str) -> str | None:
@@ -189,8 +184,8 @@ def _clearly_better(fit: Mapping[str, float], declared: str) -> str | None:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _SquareSizes:
-    """How a board's squares come out in some pairs (medians): as parts of what is declared, their size against that of
-    the other boards (1 where fewer than three tell), and width over height."""
+    """Reconstructed over declared squares of a board (medians over pairs): their size relative to that of the other
+    boards (1 if there are fewer than three boards), and their width over height."""
 
     board: Board
     size: float
@@ -214,8 +209,7 @@ class _SquareSizes:
 
 
 def _diagnose_boards(reports: Sequence[ValidationReport]) -> list[str]:
-    """Return boards whose squares do not agree with those of the others, or that are mirrored: each once, whatever the
-    number of pairs."""
+    """Return messages about boards whose squares disagree with those of the others, or that are mirrored: one each."""
     found = _squares(reports)
     mirrored = [b.board.board_id for r in reports for b in r.boards if not b.right_handed]
     out = [f"board '{i}' comes out mirrored: its corners are numbered the wrong way round" for i in mirrored]
@@ -247,7 +241,7 @@ def _diagnose_boards(reports: Sequence[ValidationReport]) -> list[str]:
 
 
 def _longest_by_boards(reports: Sequence[ValidationReport]) -> float:
-    """Return by which part boards that are odd may make lengths wrong; infinite where they are no boards as listed."""
+    """Return the largest relative length error that wrong boards can explain; infinite for boards not as listed."""
     found = _squares(reports).values()
     if any(squares.no_board for squares in found) or not all(b.right_handed for r in reports for b in r.boards):
         return float("inf")
@@ -256,7 +250,7 @@ def _longest_by_boards(reports: Sequence[ValidationReport]) -> float:
 
 
 def _squares(reports: Sequence[ValidationReport]) -> dict[str, _SquareSizes]:
-    """Return how the squares of each board come out, by its id."""
+    """Return the reconstructed sizes of the squares of each board, by its id."""
     seen: dict[str, list[tuple[Board, float, float]]] = {}
     for report in reports:
         middle = float(np.median([b.size_ratio for b in report.boards])) if len(report.boards) >= 3 else None
@@ -277,11 +271,11 @@ def _stretch(aspect: float) -> str:
 
 
 def _diagnose_lengths(failed: Sequence[tuple[str, Check]], reports: Sequence[ValidationReport]) -> list[str]:
-    """Return whether the squares or the rule are to blame: wrong squares change every length by one factor."""
+    """Return messages about wrong lengths: wrong squares change all by one factor, else single ones were misread."""
     ratios = np.array([check.ours / check.measured for _, check in failed])
     lengths = [c for r in reports for c in r.checks if c.kind in ("baseline", "distance")]
     common = float(np.average(ratios, weights=[check.measured**2 for _, check in failed]))
-    # What passed must not contradict the factor: a length that would be off by it and is not clears the squares.
+    # A length that passed but would not with other squares shows that the squares are right.
     agree = [abs(c.ours / c.measured - common) * c.measured <= c.limit_k * c.combined_sigma for c in lengths]
     board = reports[0].boards[0].board
     squares = f"{board.square_x_mm / common:.2f} mm instead of {board.square_x_mm:g}"
@@ -344,7 +338,7 @@ def _diagnose_angles(report: ValidationReport) -> list[str]:
 
 
 def _lone_angle(report: ValidationReport, check: Check) -> str:
-    """Return what one angle that fails most probably comes from: what was written, if all else speaks for ours."""
+    """Return the probable cause of a single failed angle: misread, if all other evidence supports ours."""
     angle = next(a for a in report.angles if check.name == f"angle {a.a}-{a.b}" or check.name == f"angle {a.b}-{a.a}")
     if angle.lattice_deg is not None and abs(angle.lattice_deg - check.ours) > 0.5 * abs(check.difference):
         return (

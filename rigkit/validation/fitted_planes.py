@@ -1,4 +1,4 @@
-"""Planes fitted to both images at once, beside those through the points: angles, normals, and which of them judges."""
+"""Angles and normals of planes fitted to both images, and the choice of the planes that checks use."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rigkit.validation.planes import NormalErrors, normal_errors
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AngleResult:
-    """The angle between two boards' faces, degrees, its sigma, and the measured angle where there is one.
+    """The angle between two boards' faces, its standard deviation, and the measured angle or None, degrees.
 
-    `angle_deg` is that of planes through the triangulated points; `coplanar_deg` of planes of maximum likelihood on
-    which the points of a board lie, `lattice_deg` where they lie on its known lattice; None where not computed.
+    `angle_deg` is that of planes through the triangulated points. `coplanar_deg` and `lattice_deg` are those of
+    maximum-likelihood planes with coplanar points and with the known lattice; None if not computed.
     """
 
     a: str
@@ -32,17 +32,17 @@ class AngleResult:
 
     @property
     def error_deg(self) -> float | None:
-        """|angle - measured|: the orthogonality error where a right angle was measured; None where nothing was."""
+        """|angle - measured|, the orthogonality error if a right angle was measured; None without a measurement."""
         return self._error(self.angle_deg)
 
     @property
     def coplanar_error_deg(self) -> float | None:
-        """|angle of coplanar points' planes - measured|; None where one of them is not known."""
+        """|coplanar angle - measured|; None if one of them is not known."""
         return self._error(self.coplanar_deg)
 
     @property
     def lattice_error_deg(self) -> float | None:
-        """|lattice angle - measured|; None where one of them is not known."""
+        """|lattice angle - measured|; None if one of them is not known."""
         return self._error(self.lattice_deg)
 
     def _error(self, angle_deg: float | None) -> float | None:
@@ -51,9 +51,9 @@ class AngleResult:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FittedPlanes:
-    """The boards' planes by what is known of their points, None where not fitted, and which of them judges.
+    """The boards' planes fitted to both images, None if not fitted, and `planes`: which of them the checks use.
 
-    Raises InputError where the one that judges was not fitted.
+    Raises InputError if those were not fitted.
     """
 
     coplanar: BoardPlanes | None = None
@@ -66,12 +66,12 @@ class FittedPlanes:
 
     @property
     def judge(self) -> BoardPlanes | None:
-        """The planes that angles, normals and the baseline are judged by; None: those through the points."""
+        """The planes that the checks of angles, normals and baseline use; None: those through the points."""
         return {"free": None, "coplanar": self.coplanar, "lattice": self.lattice}[self.planes]
 
     def angle(self, a: str, b: str, free: tuple[float, float], measured_deg: float | None) -> AngleResult:
-        """Return the angle of two boards by all planes; `free` is that of those through the points, with its sigma."""
-        coplanar, lattice = (_angle(planes, a, b) for planes in (self.coplanar, self.lattice))
+        """Return the angle of two boards by all planes; `free` is that of planes through the points, with its sigma."""
+        coplanar, lattice = (_angle(planes, a, b) or (None, None) for planes in (self.coplanar, self.lattice))
         return AngleResult(
             a=a,
             b=b,
@@ -85,23 +85,20 @@ class FittedPlanes:
         )
 
     def judged_angle(self, a: str, b: str, free: tuple[float, float]) -> tuple[float, float] | None:
-        """Return the angle that is judged, and its sigma; None where the planes that judge have none."""
-        if self.judge is None:
-            return free
-        return self.judge.angle_deg(a, b) if {a, b} <= set(self.judge.board_ids) else None
+        """Return the angle to check and its sigma; None if one of the boards has no such plane."""
+        return free if self.judge is None else _angle(self.judge, a, b)
 
     def judged_normals(self) -> dict[str, FloatArray]:
-        """Return the normals that estimated ones are judged by where they are not those through the points."""
+        """Return the boards' normals to check against, by id; empty for planes through the points."""
         return {} if self.judge is None else {name: self.judge.normal(name) for name in self.judge.board_ids}
 
 
-def _angle(planes: BoardPlanes | None, a: str, b: str) -> tuple[float | None, float | None]:
-    known = planes is not None and {a, b} <= set(planes.board_ids)
-    return planes.angle_deg(a, b) if known and planes is not None else (None, None)
+def _angle(planes: BoardPlanes | None, a: str, b: str) -> tuple[float, float] | None:
+    return planes.angle_deg(a, b) if planes is not None and {a, b} <= set(planes.board_ids) else None
 
 
 def normal_errors_against(reconstruction: Reconstruction, planes: BoardPlanes | None) -> dict[str, NormalErrors]:
-    """Return the errors of a cloud's normals against those of the boards' planes, by board; none without planes."""
+    """Return the errors of a cloud's normals against those of the boards' planes, by board; empty without planes."""
     cloud = reconstruction.cloud
     if planes is None:
         return {}

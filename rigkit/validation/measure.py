@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.core.arrays import FloatArray
-from rigkit.core.truth import MeasuredDistance
+from rigkit.core.truth import Feature, MeasuredDistance
 from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.triangulation import point_uncertainty
 from rigkit.reconstruction.calibration_shifts import CalibrationShifts
@@ -68,10 +68,10 @@ class Measured:
 
     def distance_mm(self, distance: MeasuredDistance) -> tuple[float, float]:
         """Return a distance between features and its sigma, mm."""
-        scatter = _distance_scatter(self.boards, distance)
-        common = _common_variance(_distance(self.boards, self.moved, distance))
-        found = _distance(self.boards, {name: board.placed for name, board in self.boards.items()}, distance)
-        return float(found), float(np.sqrt(scatter + common))
+        a, b = (distance.b, distance.a) if distance.a.is_plane else (distance.a, distance.b)
+        common = _common_variance(_distance(self.boards, self.moved, a, b))
+        found = _distance(self.boards, {name: board.placed for name, board in self.boards.items()}, a, b)
+        return float(found), float(np.sqrt(_distance_scatter(self.boards, a, b) + common))
 
 
 def _common_variance(moved: FloatArray) -> float:
@@ -113,22 +113,16 @@ def measure(
     return Measured(boards, moved)
 
 
-def _distance(boards: Boards, placed: Mapping[str, BoardPlace], distance: MeasuredDistance) -> FloatArray:
-    """Return a distance (...), mm, between features of `boards` with planes and lattices `placed`."""
-    a, b = distance.a, distance.b
-    if a.is_plane:
-        a, b = b, a
+def _distance(boards: Boards, placed: Mapping[str, BoardPlace], a: Feature, b: Feature) -> FloatArray:
+    """Return the distance (...), mm, of a point `a` to a point or plane `b`, for planes and lattices `placed`."""
     point = placed[a.board_id].at(boards[a.board_id].place(a))
     if b.is_plane:
         return np.abs(placed[b.board_id].distances(point))
     return np.asarray(np.linalg.norm(point - placed[b.board_id].at(boards[b.board_id].place(b)), axis=-1))
 
 
-def _distance_scatter(boards: Boards, distance: MeasuredDistance) -> float:
-    """Return the variance of a distance that comes from the corners' scatter, mm^2."""
-    a, b = distance.a, distance.b
-    if a.is_plane:
-        a, b = b, a
+def _distance_scatter(boards: Boards, a: Feature, b: Feature) -> float:
+    """Return the variance of such a distance by the corners' scatter, mm^2."""
     point, covariance = boards[a.board_id].feature(a)
     if b.is_plane:
         plane = boards[b.board_id].plane

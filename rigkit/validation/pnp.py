@@ -1,9 +1,10 @@
-"""The relative pose without any epipolar geometry: from every board's own pose in each view."""
+"""Estimate the relative pose from the pose of every board in each view, without epipolar geometry."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -23,16 +24,16 @@ AnglesDeg = dict[tuple[str, str], tuple[float, float]]
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PnpResult:
-    """What the boards' own poses say.
+    """The result of planar PnP.
 
     Attributes
     ----------
     cam2_from_cam1 : mean over the boards, weighted by their covariances, mm.
     covariance : (6, 6) of (left rotation perturbation rad, translation mm).
     angles_deg : (a, b) -> (angle between the faces, sigma), mean of both views.
-    rms_rad : root mean square angle between rays and corners, over all boards and both views.
-    variance_factor : observed over predicted variance of the corners. The residuals of a board of known shape show
-        errors along epipolar lines too, which epipolar geometry cannot see: 1 where the corners' sigmas are honest.
+    rms_rad : RMS angle between rays and corners, over all boards and both views.
+    variance_factor : observed over predicted variance of the corners; 1 if their sigmas are right. Residuals of a known
+        board shape include errors along epipolar lines, which epipolar geometry does not see.
     count : corners used.
     """
 
@@ -45,9 +46,9 @@ class PnpResult:
 
 
 def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
-    """Return relative pose and face angles from planar PnP of each board in each view; any field of view.
+    """Return relative pose and face angles from planar PnP of each board in each view, for any field of view.
 
-    Raises DegenerateError where no board has eight corners.
+    Raises DegenerateError if no board has eight corners.
     """
     seen = _board_rays([reconstruction])
     if not seen:
@@ -74,9 +75,9 @@ def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
 
 
 def moved_pnp(moved: Sequence[Reconstruction]) -> tuple[tuple[Rigid3, AnglesDeg], ...]:
-    """Return relative pose and face angles as `planar_pnp` does, for one pair with cameras that differ a little.
+    """Return relative pose and face angles of `planar_pnp` for one pair with slightly different cameras.
 
-    Corners count that all the cameras see.
+    Only corners in the field of view of all cameras are used.
     """
     ones: dict[str, tuple[BoardPose, ...]] = {}
     twos: dict[str, tuple[BoardPose, ...]] = {}
@@ -95,7 +96,7 @@ def moved_pnp(moved: Sequence[Reconstruction]) -> tuple[tuple[Rigid3, AnglesDeg]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _BoardRays:
-    """A board's corners (N, 3), mm, and the rays to them in M cameras of either view, (M, N, 3)."""
+    """A board's corners (N, 3), mm, and their rays in M cameras of each view, (M, N, 3)."""
 
     points: Points
     rays1: Rays
@@ -103,7 +104,7 @@ class _BoardRays:
 
 
 def _board_rays(reconstructions: Sequence[Reconstruction]) -> dict[str, _BoardRays]:
-    """Return by id the boards with enough corners that every camera of these reconstructions of one pair sees."""
+    """Return, by id, the boards with enough corners that all cameras of these reconstructions of one pair see."""
     first = reconstructions[0]
     rays1, seen1 = zip(*(r.camera1.unproject(r.pixels1) for r in reconstructions), strict=True)
     rays2, seen2 = zip(*(r.camera2.unproject(r.pixels2) for r in reconstructions), strict=True)
@@ -118,7 +119,7 @@ def _board_rays(reconstructions: Sequence[Reconstruction]) -> dict[str, _BoardRa
 
 
 def _predicted_square(reconstruction: Reconstruction, board_ids: list[str]) -> float:
-    """Return the mean square angle between rays and corners that the corners' sigmas predict."""
+    """Return the mean square angle between rays and corners, predicted from the corners' sigmas."""
     m = reconstruction.matches
     names = np.array([board.board_id for board in reconstruction.boards])[reconstruction.cloud.board_index]
     on = np.isin(names, board_ids)
@@ -148,19 +149,16 @@ def _mean_pose(found: list[tuple[Rigid3, FloatArray]], near: Rigid3) -> tuple[Ri
 def _angles(poses: Mapping[str, tuple[BoardPose, BoardPose]]) -> AnglesDeg:
     """Return face angles, the mean of both views weighted by variance."""
     out = {}
-    ids = list(poses)
-    for i, a in enumerate(ids):
-        for b in ids[i + 1 :]:
-            weights, values = [], []
-            for view in (0, 1):
-                one, two = poses[a][view], poses[b][view]
-                normals = (-one.cam_from_board.rotation[:, 2], -two.cam_from_board.rotation[:, 2])
-                variance = 0.0
-                for slope, normal, pose in zip(angle_jacobian(*normals), normals, (one, two), strict=True):
-                    by_turn = slope @ -skew(normal)
-                    variance += float(by_turn @ pose.covariance[:3, :3] @ by_turn)
-                values.append(face_angle(*normals))
-                weights.append(1.0 / variance)
-            mean = float(np.average(values, weights=weights))
-            out[a, b] = (float(np.rad2deg(mean)), float(np.rad2deg(1.0 / np.sqrt(sum(weights)))))
+    for a, b in combinations(poses, 2):
+        weights, values = [], []
+        for both in zip(poses[a], poses[b], strict=True):
+            one, two = (-pose.cam_from_board.rotation[:, 2] for pose in both)
+            variance = 0.0
+            for slope, normal, pose in zip(angle_jacobian(one, two), (one, two), both, strict=True):
+                by_rotation = slope @ -skew(normal)
+                variance += float(by_rotation @ pose.covariance[:3, :3] @ by_rotation)
+            values.append(face_angle(one, two))
+            weights.append(1.0 / variance)
+        mean = float(np.average(values, weights=weights))
+        out[a, b] = (float(np.rad2deg(mean)), float(np.rad2deg(1.0 / np.sqrt(sum(weights)))))
     return out

@@ -1,7 +1,7 @@
-"""The tables of a validation as plain data, in the layout of the paper's, with the paper's own numbers beside ours.
+"""Build the tables of a validation in the paper's layout, with the printed numbers next to ours.
 
 L. Hajder, "Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations", tables 1 (orthogonality and
-normal errors) and 2 (baselines by estimator). How a table looks as text is the business of `rigkit.report.tables`.
+normal errors) and 2 (baselines by estimator). `rigkit.report.tables` formats tables as text.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell
 from rigkit.validation.checks import ValidationReport
 
 TIE_MM = 1e-3
-"""Baselines closer than this are the same: less than the table shows."""
+"""Baselines that differ by less are equal: the table does not show it."""
 
 TIE_DEG = 1e-6
-"""Estimators whose normal errors differ by less find the same normals: rounding must not choose between them."""
+"""Estimators whose normal errors differ by less have the same normals: rounding must not choose between them."""
 
 RIGHT_ANGLE_ERROR, ANGLE_ERROR = "orthogonality error", "angle error"
-"""The paper's word where every angle measured is a right one, and ours for others."""
+"""The paper's term, for right angles, and ours for others."""
 
 Printed = Mapping[str, Mapping[str, str]]
 
 
 @dataclass(frozen=True, slots=True)
 class PaperTables:
-    """The paper's numbers as printed (strings, with the digits they have).
+    """The paper's numbers as printed (strings, to keep their digits).
 
     Attributes
     ----------
@@ -53,8 +53,7 @@ def build_tables(
 ) -> tuple[Table, ...]:
     """Return all tables of reports (pairs x estimators): planes, baselines, averages, checks, estimators.
 
-    `images` says whether they are "real" or "rendered", None where nobody did.
-    Tables that would be empty are left out; raises InputError where there is no report.
+    `images` are "real" or "rendered", None if not stated. Empty tables are left out. Raises InputError without reports.
     """
     if not reports:
         raise InputError("tables: no report; nothing was validated")
@@ -75,21 +74,18 @@ def build_tables(
 def best_method(reports: Sequence[ValidationReport]) -> str:
     """Return the estimator with the smallest mean normal error over all pairs that every estimator solved.
 
-    Nothing that a person measured enters: the choice cannot flatter the comparison with it.
+    The choice uses no measured quantity, so that it does not bias the comparison with these.
     """
     methods = list(dict.fromkeys(report.affine_method for report in reports))
     pairs = {m: {r.pair_id for r in reports if r.affine_method == m} for m in methods}
     common = set.intersection(*pairs.values()) or {r.pair_id for r in reports}
     return best_of(
-        {
-            method: mean_normal_error([r for r in reports if r.affine_method == method and r.pair_id in common])
-            for method in methods
-        }
+        {m: mean_normal_error([r for r in reports if r.affine_method == m and r.pair_id in common]) for m in methods}
     )
 
 
 def best_report(reports: Sequence[ValidationReport]) -> ValidationReport:
-    """Return the report with the smallest mean normal error, of the reports of one pair by several estimators."""
+    """Return the report with the smallest mean normal error among those of one pair by several estimators."""
     by_method = {report.affine_method: report for report in reports}
     return by_method[best_of({method: mean_normal_error([report]) for method, report in by_method.items()})]
 
@@ -101,13 +97,13 @@ def mean_normal_error(reports: Sequence[ValidationReport]) -> float:
 
 
 def best_of(score: Mapping[str, float]) -> str:
-    """Return the name with the smallest score; of several within a tie the last, which is no worse and uses most."""
+    """Return the name with the smallest score; among ties the last, whose estimator uses most information."""
     least = min(score.values())
     return [method for method, value in score.items() if value <= least + TIE_DEG][-1]
 
 
 def plane_table(reports: Sequence[ValidationReport], method: str, paper: PaperTables) -> Table:
-    """Return the layout of the paper's table 1 for one estimator: orthogonality, mean and median normal errors."""
+    """Return the paper's table 1 for one estimator: orthogonality, mean and median normal errors."""
     chosen = {r.pair_id: r for r in reports if r.affine_method == method}
     ids = _board_ids(reports)
     number = {board_id: i + 1 for i, board_id in enumerate(ids)}
@@ -126,10 +122,9 @@ def plane_table(reports: Sequence[ValidationReport], method: str, paper: PaperTa
 
 
 def angle_table(reports: Sequence[ValidationReport]) -> Table | None:
-    """Return the angles between boards by planes through the points and by those fitted to both images, one report a
-    pair.
+    """Return the angles between boards by planes through the points and by those fitted to both images.
 
-    None where no planes were fitted to both images.
+    `reports` has one report for each pair. Returns None if no planes were fitted to both images.
     """
     rows: list[tuple[Cell, ...]] = []
     for report in reports:
@@ -159,7 +154,7 @@ def angle_table(reports: Sequence[ValidationReport]) -> Table | None:
 
 
 def baseline_table(reports: Sequence[ValidationReport], paper: PaperTables) -> Table:
-    """Return the layout of the paper's table 2: measured baseline and that of every estimator, the nearest marked.
+    """Return the paper's table 2: measured baseline and that of every estimator, the nearest marked.
 
     Pairs without a measured baseline are left out.
     """
@@ -171,7 +166,7 @@ def baseline_table(reports: Sequence[ValidationReport], paper: PaperTables) -> T
         if known is None:
             continue
         off = {method: abs(report.baseline_mm - known[0]) for method, report in found.items()}
-        # Estimators that end in the same pose are all the nearest; where all do, there is nothing to mark.
+        # Estimators with the same pose are all the nearest; if all are, none is marked.
         nearest = [m for m in off if off[m] <= min(off.values()) + TIE_MM]
         row = [Cell(pair_id), Cell(known[0], paper.baseline(pair_id, "measured"), known[1])]
         for method in methods:
@@ -192,9 +187,9 @@ def baseline_table(reports: Sequence[ValidationReport], paper: PaperTables) -> T
 def average_table(
     reports: Sequence[ValidationReport], method: str, paper: PaperTables, images: str | None, mode: str
 ) -> Table | None:
-    """Return the averages over all cells that the paper has too, and how many times smaller ours are; None without.
+    """Return the averages over all cells that the paper has too, and the ratio of the paper's to ours; None if empty.
 
-    Beside every ratio stand what `images` it is of, the paper's being real, and the `mode` of the pipeline.
+    Every row states the kind of `images` (the paper's are real) and the `mode` of the pipeline.
     """
     rows = []
     known_cells = [(row[0], cell) for row in plane_table(reports, method, paper).rows for cell in row[1:]]
@@ -217,9 +212,9 @@ def average_table(
 
 
 def check_table(reports: Sequence[ValidationReport]) -> Table:
-    """Return every measured quantity beside ours with its verdict; what could not be checked is a row that failed.
+    """Return all checks with their verdicts; a quantity that could not be checked is a failed row.
 
-    One row a fact: what estimators of a pair have in common, as all do that kept the same points, is said once.
+    Estimators with equal results, as those of the same points have, share a row.
     """
     found: dict[tuple[str, tuple[Cell, ...]], list[str]] = {}
     for report in reports:
@@ -246,7 +241,7 @@ def check_table(reports: Sequence[ValidationReport]) -> Table:
 
 
 def estimator_table(reports: Sequence[ValidationReport]) -> Table:
-    """Return one row a pair and estimator: angles, normal errors, flatness, baseline, verdict."""
+    """Return a row for each pair and estimator: angles, normal errors, flatness, baseline, verdict."""
     ids = _board_ids(reports)
     heads = [*columns("pair | estimator | points .0")]
     heads += [Column(f"angle {a}, {b}", "deg") for a, b in combinations(ids, 2)]

@@ -150,8 +150,7 @@ def grow_scene(
     by_pose = _moved_planes(rays, pose, covariance)
     moves = _moves(even, r, moved, pose_is_known=pose_is_known)
     covariance = covariance + sum((np.outer(m.change, m.change) for m in moves), np.zeros((6, 6)))
-    uncertain = _UncertainPlanes(surface, by_pose, _planes_of_moves(rays, pose, moves))
-    cloud, nodes, of_calibrations = _cloud(grown, uncertain, image1)
+    cloud, nodes, of_calibrations = _cloud(grown, surface, by_pose, _planes_of_moves(rays, pose, moves), image1)
     cloud = replace(cloud, calibration_in_sigmas=calibrations is not None)
     scene = _scene(sparse, grown, cloud, nodes, known, pose, covariance)
     return DenseScene(scene=scene, grown=grown, surface=surface, nodes=nodes, of_calibrations=of_calibrations)
@@ -324,21 +323,18 @@ def _planes_of_moves(rays: PairRays, pose: Rigid3, moves: list[_Moved]) -> Float
     return planes
 
 
-class _UncertainPlanes(NamedTuple):
-    """Planes at nodes, and their changes by each axis of the pose's covariance (R, C, 3, K) and by each move of the
-    calibrations (R, C, 3, M)."""
-
-    surface: GrownSurface
-    by_pose: FloatArray
-    by_calibrations: FloatArray
-
-
 def _cloud(
-    grown: GrownPatches, planes: _UncertainPlanes, image1: NDArray[np.generic]
+    grown: GrownPatches,
+    surface: GrownSurface,
+    by_pose: FloatArray,
+    by_calibrations: FloatArray,
+    image1: NDArray[np.generic],
 ) -> tuple[OrientedCloud, NDArray[np.int64], tuple[FloatArray, FloatArray]]:
     """Return the cloud of the planes with a certain range, their nodes, and the part of its sigmas (mm, rad) by the
-    calibrations."""
-    surface = planes.surface
+    calibrations.
+
+    `by_pose` (R, C, 3, K) and `by_calibrations` (R, C, 3, M) are changes of the planes by one standard deviation.
+    """
     at = np.flatnonzero(surface.valid.ravel())
 
     def flat(values: FloatArray) -> FloatArray:
@@ -347,7 +343,7 @@ def _cloud(
     points, normals, plane, covariance = (
         flat(v) for v in (surface.points, surface.normals, surface.plane, surface.covariance)
     )
-    by_pose, moves = flat(planes.by_pose), flat(planes.by_calibrations)
+    by_pose, moves = flat(by_pose), flat(by_calibrations)
     of_calibrations = moves @ np.swapaxes(moves, 1, 2)
     covariance = covariance + by_pose @ np.swapaxes(by_pose, 1, 2) + of_calibrations
     size = np.linalg.norm(points, axis=1)

@@ -1,14 +1,15 @@
-"""Affine correspondences that grow over surfaces: each predicts its neighbours, which the images then correct.
+"""Grow affine correspondences over surfaces: each predicts its neighbours, which are then aligned in the images.
 
-Best first (M. Lhuillier and L. Quan, "Match Propagation for Image-Based Modeling and Rendering", PAMI 2002), here with
-the affinity, so that slanted and turned surfaces are followed: from a pair (q1, q2, A) the neighbour q1 + d is expected
-at q2 + A d, with the same A. The images may be of any central cameras: the epipolar geometry is asked for pixel by
-pixel, and nothing is rectified.
+Best-first match propagation (M. Lhuillier and L. Quan, "Match Propagation for Image-Based Modeling and Rendering", PAMI
+2002), extended by the affinity to follow slanted and rotated surfaces: from a pair (q1, q2, A) the neighbour q1 + d is
+predicted at q2 + A d with the same A. It works with any central cameras: epipolar lines are computed for each pixel,
+and images are not rectified.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,32 +21,32 @@ from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels
 from rigkit.kernels.patches import EpipolarKnowledge, Pyramid, grown, starts_of
 
 HALF_WIDTH = 7
-"""Half side of a patch in px: larger ones reach over edges of surfaces, smaller ones have too little texture."""
+"""Half side of a patch in px: larger ones cross edges of surfaces, smaller ones have too little texture."""
 COARSEST = 2
-"""Levels up to which patches of little texture grow: of four times the half side."""
+"""Coarsest pyramid level for patches with little texture: four times the half side."""
 MIN_CORRELATION = 0.9
 MAX_GROWTH_MOVE_PX = 2.0
-"""From where a neighbour predicts a patch."""
+"""Largest distance of a patch from its prediction."""
 MAX_SIGMA_PX = 0.15
-"""Along the axis of which least is known; beyond, a patch slides along an edge."""
+"""Largest standard deviation along any direction; beyond, a patch slides along an edge."""
 MAX_SIGMA_ON_LINE_PX = 0.3
-"""The same where the epipolar line is known, on which alone it slides; beyond, a sweep knows the surface better."""
+"""The same if a patch can only move along its epipolar line; beyond, a sweep is more accurate."""
 GROWN_SETTLED_PX = 0.03
-"""Move of a patch's border at which it is done: less than what interpolation leaves open (`FLOOR_PX`), and the next one
+"""Step of a patch's border at which the alignment ends: below the interpolation error (`FLOOR_PX`), and the next step
 would be several times smaller."""
 RETURN_SETTLED_PX = 0.1
-"""The same of one that grows back: a tenth of MAX_RETURN_PX."""
+"""The same for growing back: a tenth of MAX_RETURN_PX."""
 MAX_TRIES = 3
-"""Of a node, from different neighbours."""
+"""Attempts at each node, from different neighbours."""
 MAX_RETURN_PX = 1.0
-"""By which a pair may miss where it began when it is grown back from the other image: the usual check of stereo."""
+"""Largest distance to its start of a pair that is grown back from image 2: the left-right check of stereo."""
 RAY_SPACING_PX = 8.0
-"""Rays are interpolated in between by cubics: to 1e-4 px even for strong fisheyes."""
+"""Spacing of the ray grid; bicubic interpolation is accurate to 1e-4 px even for strong fisheye lenses."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class GrowingView:
-    """An image as growing sees it: the camera, grey levels, the pyramid, and the rays on a coarse grid."""
+    """An image to grow in: the camera, grey levels, the pyramid, and the rays on a coarse grid."""
 
     camera: Camera
     grey: NDArray[np.generic]
@@ -57,7 +58,7 @@ class GrowingView:
     def of(cls, grey: NDArray[np.generic], camera: Camera) -> GrowingView:
         """Return the view of an image (H, W), grey levels 0 to 255."""
         height, width = grey.shape
-        # One node more on every side than the image needs: the interpolation reads four.
+        # One node more on every side: bicubic interpolation reads four.
         counts = int(np.ceil(width / RAY_SPACING_PX)) + 2, int(np.ceil(height / RAY_SPACING_PX)) + 2
         at = np.stack(np.meshgrid(*(RAY_SPACING_PX * np.arange(n) for n in counts)), axis=-1)
         rays, valid = camera.unproject(at)
@@ -71,14 +72,14 @@ class GrowingView:
 
 @dataclass(frozen=True, slots=True)
 class LineKnowledge:
-    """What an epipolar geometry says of pairs.
+    """The epipolar constraint on pairs.
 
     Attributes
     ----------
     E21 : essential matrix.
-    sigma_px, sigma_A : how well places and affinities are known to agree with it; infinite: they are found from the
-        images alone.
-    max_distance_px : from its epipolar line at which a pair is refused.
+    max_distance_px : largest epipolar distance of a pair.
+    sigma_px, sigma_A : standard deviations of pixels and affinities about the constraint; infinite: it is not used for
+        the alignment.
     """
 
     E21: Mat3
@@ -87,7 +88,7 @@ class LineKnowledge:
     sigma_A: float = np.inf
 
     def swapped(self) -> LineKnowledge:
-        """Return the same of the images in the other order."""
+        """Return the constraint for the images in reverse order."""
         return replace(self, E21=self.E21.T)
 
 
@@ -98,15 +99,15 @@ def only(keep: BoolArray, values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class GrownPatches:
-    """Pairs on a grid of nodes in image 1, NaN where there is none, at its node or near it.
+    """Pairs on a grid of nodes in image 1, each at or close to its node; NaN without a pair.
 
     Attributes
     ----------
     step : px between nodes.
     pixels1, pixels2 : (R, C, 2); A21 : (R, C, 2, 2).
-    correlation, coarser : (R, C) of the patches; levels by which they were aligned more coarsely for want of texture.
-        Pairs of a sweep have none: zero.
-    covariance : (R, C, 6, 6) of (u2, v2, a11, a12, a21, a22), as the patches alone show it.
+    correlation, coarser : (R, C) correlation of the patches, and pyramid level of their alignment; both zero for pairs
+        of a sweep.
+    covariance : (R, C, 6, 6) of (u2, v2, a11, a12, a21, a22), from the patches only.
     """
 
     step: int
@@ -119,26 +120,26 @@ class GrownPatches:
 
     @property
     def valid(self) -> BoolArray:
-        """Which nodes (R, C) have a pair."""
+        """Mask (R, C) of the nodes with a pair."""
         return np.isfinite(self.correlation)
 
     @property
     def swept(self) -> BoolArray:
-        """Which nodes (R, C) have a pair that no patch was aligned for."""
+        """Mask (R, C) of the nodes whose pair is from a sweep."""
         return np.asarray(self.correlation == 0.0)
 
     def __len__(self) -> int:
         return int(self.valid.sum())
 
     def centred(self) -> GrownPatches:
-        """Return the pairs each at the place of its patch that it knows best, instead of at its node.
+        """Return the pairs, each moved from its node to the point of its patch with the least variance.
 
-        A patch measures the surface where its texture is. Beside an edge of a near surface that is the edge, and not
-        the far surface at the node.
+        A patch measures the surface at its texture. Close to the edge of a near surface that is the edge, not the far
+        surface at the node.
         """
         at = self.valid
         covariance, A21 = self.covariance[at], self.A21[at]
-        # The place q2 + A d of least variance, both coordinates together.
+        # The point q2 + A d with the least trace of its covariance.
         of_A = covariance[:, 2:4, 2:4] + covariance[:, 4:6, 4:6]
         with_place = covariance[:, 2:4, 0] + covariance[:, 4:6, 1]
         move = -np.linalg.solve(of_A, with_place[..., None])[..., 0]
@@ -154,16 +155,10 @@ class GrownPatches:
         return replace(self, pixels1=pixels1, pixels2=pixels2, covariance=spread)
 
     def where(self, keep: BoolArray) -> GrownPatches:
-        """Return the pairs of the nodes `keep` (R, C) alone."""
-
-        return replace(
-            self,
-            pixels2=only(keep, self.pixels2),
-            A21=only(keep, self.A21),
-            correlation=only(keep, self.correlation),
-            coarser=only(keep, self.coarser),
-            covariance=only(keep, self.covariance),
-        )
+        """Return only the pairs of the nodes `keep` (R, C)."""
+        names = ("pixels2", "A21", "correlation", "coarser", "covariance")
+        known: dict[str, Any] = {name: only(keep, getattr(self, name)) for name in names}
+        return replace(self, **known)
 
     def correspondences(self) -> Correspondences:
         """Return the pairs in the order of their nodes, row by row."""
@@ -185,8 +180,8 @@ def grow(
 ) -> GrownPatches:
     """Return the pairs that grow from `seeds`, which have affinities, on a grid every `step` px of image 1.
 
-    They are done when their borders move by less than `settled_px`. Where only some of its nodes (R, C) are `wanted`,
-    none grows elsewhere.
+    Alignment ends when a patch's border moves by less than `settled_px`. With `wanted` (mask (R, C)) pairs grow only at
+    these nodes.
     """
     at = view1.nodes(step)
     rays, seen = view1.camera.unproject(at)
@@ -228,9 +223,9 @@ def grow(
 def grow_in_both_directions(
     view1: GrowingView, view2: GrowingView, seeds: Correspondences, *, step: int, known: LineKnowledge
 ) -> GrownPatches:
-    """Return the pairs that grow from `seeds`, which lead back to their nodes when they are grown from image 2.
+    """Return the pairs that grow from `seeds` and lead back to their nodes when grown from image 2.
 
-    What image 2 does not see, and what looks the same in several places, mostly leads elsewhere, or nowhere.
+    Occluded pixels and repeated texture mostly lead elsewhere, or nowhere.
     """
     there = grow(view1, view2, seeds, step=step, known=known)
     at = there.valid
@@ -245,6 +240,6 @@ def grow_in_both_directions(
     back = grow(view2, view1, ends, step=step, known=known.swapped(), settled_px=RETURN_SETTLED_PX, wanted=wanted)
     found = back.pixels2[node] + np.einsum("nij,nj->ni", back.A21[node], pixels2 - back.pixels1[node])
     keep = at.copy()
-    # Where nothing grows back that distance is NaN, and no return.
+    # Pairs that do not grow back have a NaN distance.
     keep[at] = np.linalg.norm(found - there.pixels1[at], axis=1) < MAX_RETURN_PX
     return there.where(keep)

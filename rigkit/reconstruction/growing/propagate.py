@@ -31,13 +31,6 @@ SAME_PLANE_PX = 0.5
 """Largest difference along the epipolar line of planes that agree: finer than the sweep's samples."""
 
 
-class WholeSurface(NamedTuple):
-    """Planes at nodes, and the pairs of the same nodes."""
-
-    surface: GrownSurface
-    grown: GrownPatches
-
-
 def kept(surface: GrownSurface, grown: GrownPatches, slope: FloatArray, sweep: Sweep, view1: GrowingView) -> BoolArray:
     """Return a mask (R, C) of the nodes whose plane fits the images better than any parallel one, both at the node and
     at the pixel that its patch measured, which may be beyond an edge."""
@@ -56,7 +49,7 @@ def propagated(
     view1: GrowingView,
     view2: GrowingView,
     cam2_from_cam1: Rigid3,
-) -> WholeSurface:
+) -> tuple[GrownSurface, GrownPatches]:
     """Return the surface with its holes filled by planes of neighbours, and the pairs with those of these planes.
 
     `slope` (R, C) is the derivative, in px along the epipolar line, by the inverse range.
@@ -99,7 +92,7 @@ def propagated(
         points = np.where(new[..., None], rays / inverse[..., None], surface.points)
         normals = np.where(new[..., None], -plane / np.linalg.norm(plane, axis=-1, keepdims=True), surface.normals)
     whole = replace(surface, points=points, normals=normals, plane=plane, covariance=covariance, support=support)
-    return WholeSurface(whole.where(known), grown)
+    return whole.where(known), grown
 
 
 def _around(nodes: IntArray, shape: tuple[int, ...]) -> IntArray:

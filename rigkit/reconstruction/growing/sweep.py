@@ -1,16 +1,15 @@
-"""Surfaces where patches say too little: semi-global matching of a sweep through the ranges, of any central cameras.
+"""Find surfaces where patches do not grow: semi-global matching of a range sweep, for any central cameras.
 
-At a range every ray of image 1 is seen somewhere in image 2. Read there, image 2 is image 1 where that is the range of
-the surface (R. T. Collins, "A Space-Sweep Approach to True Multi-Image Matching", CVPR 1996). Both are compared by
-their census (R. Zabih and J. Woodfill, ECCV 1994), and neighbours are asked to lie on one surface along eight paths
-(H. Hirschmueller, "Stereo Processing by Semiglobal Matching and Mutual Information", PAMI 2008). Levels of a sweep are
-equally spaced in inverse range, so that a plane rises evenly through them; nothing is rectified.
+Each level of the sweep maps every ray of image 1, at one range, to a pixel of image 2. Both images agree there if the
+surface has that range (R. T. Collins, "A Space-Sweep Approach to True Multi-Image Matching", CVPR 1996). They are
+compared by the census transform (R. Zabih and J. Woodfill, ECCV 1994), and smoothness is enforced along eight paths (H.
+Hirschmueller, "Stereo Processing by Semiglobal Matching and Mutual Information", PAMI 2008). Levels are equally spaced
+in inverse range, in which planes are linear. Images are not rectified.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,65 +25,66 @@ from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrowingView, GrownPat
 from rigkit.reconstruction.growing.surface import NodeMeasurements
 
 SAMPLES_A_NODE = 2
-"""From node to node, along either axis."""
+"""Samples of the sweep for each node, along each axis."""
 MAX_SWEEP_LEVELS = 160
 FARTHER, NEARER = 0.1, 0.5
-"""Of the range of inverse ranges that grew, to either side: what is before all of it, with too little texture to grow,
-seems to be anywhere else where its texture repeats."""
+"""Extension of the interval of grown inverse ranges to each side. A nearer object with too little texture to grow, but
+outside of the sweep, would match wrongly wherever its texture repeats."""
 CURVATURE_COST = CENSUS_BITS // 6
-"""Of a step to the next level, in bits of the census."""
+"""Cost, in bits of the census, of a step to the next level."""
 JUMP_COST = 2 * CENSUS_BITS
-"""Of any larger step, where the brightness is even; less where it changes."""
+"""Cost of any larger step in uniform brightness; less at brightness edges."""
 EVEN_LEVELS = 8.0
-"""Grey levels from sample to sample by which a jump becomes half as dear."""
+"""Grey-level difference between samples that halves the jump cost."""
 SMOOTHED = 0.4
-"""Standard deviation by which the images are smoothed, in samples: finer detail than samples show disturbs."""
+"""Standard deviation, in samples, of the smoothing of the images against aliasing."""
 TABLE_SPACING = 8
-"""Samples between those that are projected; in between the places are interpolated."""
+"""Spacing, in samples, of projected rays; pixels in between are interpolated."""
 SMALLEST = 60
-"""Samples of a surface; smaller ones are chance."""
+"""Least number of samples of a surface; smaller ones are chance."""
 LARGE = 1000
-"""Samples of a surface that is no chance, though no patch agrees with it. Of 820 surfaces through two images that have
-nothing in common the largest has 976 (SIMULATED: 30 to 150 levels, noise and textures of falling spectra)."""
+"""Samples from which a surface without any agreeing patch is no chance. Of 820 surfaces through two unrelated images
+the largest has 976 (SIMULATED: 30 to 150 levels, noise and textures of falling spectra)."""
 MAX_OF_SHIFTED = 0.4
-"""Costs of a smaller one over those of the same surface at any other ranges. Three of those 820 have less, most 0.5 to
-0.6: the cheapest of all surfaces is half as dear as others by choice alone."""
+"""Largest cost of a smaller surface over that of the same surface at any other range. Three of those 820 have less,
+most 0.5 to 0.6: the cheapest of all surfaces costs half as much as others by selection alone."""
 SHIFTED_LEVELS = 3
-"""From which on a range is another one: blurred detail is alike over two levels."""
+"""Least shift of such another range: blurred detail is similar over two levels."""
 MAX_RESIDUAL_LEVELS = 1.0
-"""By which the sweep disagrees with the grown pairs, as a standard deviation, for it to be believed elsewhere."""
+"""Largest standard deviation of the difference to the grown pairs for which the sweep is used."""
 UNLIT_LEVELS = 8.0
-"""Grey levels where no light falls: noise and compression."""
+"""Largest grey level of pixels without light: noise and compression."""
 RIVAL_RADIUS = 5.0
-"""Samples: the reach of a patch."""
+"""Window radius, in samples: the reach of a patch."""
 ALIKE_LEVELS = 10.0
-"""Grey levels that brightness varies by on a surface rather than from one to the next."""
+"""Grey-level variation within a surface."""
 MAX_OF_RIVAL = 2.2
-"""Costs of a plane over those of any other, by the share of the nodes around that lies in it: what few agree with must
-explain the pixels better. The quotient tells planes that are over a pixel off from others better than either does alone
-and than whether the surface ends nearby; at 2.2 as many remain as with those (REAL motorcycle and RENDERED cards)."""
+"""Largest cost of a plane over that of any parallel one, over the plane's support: planes with little support must fit
+the pixels better. This quotient separates planes that are wrong by more than a pixel better than either part alone, and
+than a test for a nearby end of the surface; 2.2 keeps as many as these (REAL motorcycle and RENDERED cards)."""
 MAX_FROM_WINNER_PX = 1.5
-"""Along the epipolar line, from the sweep's own surface: of planes further away than 2.5 px 93 to 100 % are wrong, of
-those nearer than 1 px 1 to 8 % (REAL motorcycle, RENDERED cards)."""
+"""Largest distance from the sweep's surface, along the epipolar line: of planes further than 2.5 px 93 to 100 % are
+wrong, of those closer than 1 px 1 to 8 % (REAL motorcycle, RENDERED cards)."""
 MIN_SWEPT_CONTRAST = 1.0
-"""Grey levels, standard deviation over a patch, of what the sweep fills: half of what patches need, as many samples
-agree. Even areas cost nothing at any range; with less than the noise nothing is told apart."""
+"""Least standard deviation of grey levels over a patch to use the sweep: half of what patches need, because many
+samples agree. Uniform areas cost nothing at any range."""
 SIGMA_A = 0.3
-"""Of an affinity that only says that the surface is seen at all: the sweep does not measure slants."""
+"""Standard deviation of affinities of swept pairs: the sweep does not measure slants."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Sweep:
-    """What two images differ by at each of K levels of inverse range.
+    """The differences of two images at K levels of inverse range.
 
     Attributes
     ----------
-    inverse : (K,), equally spaced.
+    inverse : (K,) levels, equally spaced.
     step_px : px between samples.
-    pixels1, rays1, samples1 : (R, C, 2), (R, C, 3), (R, C) samples of image 1 with their rays and brightness; NaN where
-        there is none.
-    costs : (R, C, K or more) bits of the census.
-    winners : (R, C) levels of the surface of least cost; seen : where image 2 sees it, and nothing before it.
+    pixels1, rays1, samples1 : (R, C, 2), (R, C, 3), (R, C) samples of image 1 with their rays and brightness; NaN
+        without a ray.
+    costs : (R, C, K or more) differing bits of the census.
+    winners : (R, C) levels of the surface of least cost.
+    seen : (R, C) mask of the samples whose surface is visible in image 2, and not hidden by another.
     """
 
     inverse: FloatArray
@@ -97,38 +97,38 @@ class Sweep:
     seen: BoolArray
 
     def nearest(self, pixels1: Pixels) -> tuple[IntArray, IntArray]:
-        """Return row and column (...) of the samples nearest to pixels (..., 2) that have one below and one beside."""
+        """Return row and column (...) of the samples nearest to pixels (..., 2), except the last row and column."""
         rows, columns = self.samples1.shape
         at = np.clip(np.rint(pixels1 / self.step_px).astype(np.int64), 0, np.array([columns - 2, rows - 2]))
         return at[..., 1], at[..., 0]
 
     def near_winner(self, level: FloatArray, at: tuple[IntArray, IntArray], slope: FloatArray) -> BoolArray:
-        """Return which levels (...) at samples (...) are beside the sweep's own surface.
+        """Return a mask (...) of the levels (...) at samples (...) that are close to the sweep's own surface.
 
-        `slope` (...) is by how many px along the epipolar line a place moves with the inverse range.
+        `slope` (...) is the derivative, in px along the epipolar line, by the inverse range.
         """
         spacing_px = (self.inverse[1] - self.inverse[0]) * slope
         return np.asarray(~(np.abs(level - self.winners[at]) * spacing_px > np.maximum(MAX_FROM_WINNER_PX, spacing_px)))
 
     def distinct(self, pixels1: Pixels, plane: FloatArray, slope: FloatArray, support: FloatArray) -> BoolArray:
-        """Return which planes m . X = 1 (N, 3) explain what is seen at pixels (N, 2) better than any other does.
+        """Return a mask (N,) of the planes m . X = 1 (N, 3) that fit pixels (N, 2) better than all parallel planes.
 
-        `slope` (N,) is by how many px along the epipolar line a place moves with the inverse range, `support` (N,) the
-        share of the nodes around that lie in the plane. Where the sweep cannot tell, another is taken for as good.
+        `slope` (N,) is the derivative, in px along the epipolar line, by the inverse range, `support` as in
+        `GrownSurface`.
         """
         return np.asarray(self.of_rivals(pixels1, plane, slope) < MAX_OF_RIVAL * support)
 
     def of_rivals(self, pixels1: Pixels, plane: FloatArray, slope: FloatArray) -> FloatArray:
-        """Return the costs (N,) of planes over those of any other of the same slant; arguments as of `distinct`.
+        """Return the cost (N,) of each plane over the least of any parallel plane; see `distinct` for the arguments.
 
-        Infinite for planes away from the sweep's own surface; 1 where the sweep cannot tell.
+        Infinite for planes far from the sweep's own surface; 1 if the sweep cannot distinguish them.
 
         Notes
         -----
-        Beside an edge of depth a window shows both surfaces, and the edge itself, which belongs to the near one. So the
-        far one seems as near, as wide as windows reach. Samples as bright as the point are rather of its own surface
-        (K.-J. Yoon and I. S. Kweon, "Adaptive Support-Weight Approach for Correspondence Search", PAMI 2006): a plane
-        that is right costs these less than any other of the same slant does.
+        A window at a depth edge contains both surfaces, and the edge, which belongs to the near one. So the far surface
+        seems near as far as windows reach. Samples as bright as the point are more likely on its own surface (K.-J.
+        Yoon and I. S. Kweon, "Adaptive Support-Weight Approach for Correspondence Search", PAMI 2006): for these the
+        true plane costs less than any parallel one.
         """
         spacing = self.inverse[1] - self.inverse[0]
         row, column = at = self.nearest(pixels1)
@@ -136,7 +136,7 @@ class Sweep:
             (np.einsum("ni,ni->n", plane, self.rays1[row + dr, column + dc]) - self.inverse[0]) / spacing
             for dr, dc in ((0, 0), (1, 0), (0, 1))
         )
-        # The census tells no surfaces apart that are less than a sample apart.
+        # The census cannot distinguish surfaces that are closer than a sample.
         step_levels = np.maximum(self.step_px / (slope * spacing), 1.0)
         surfaces = np.stack([level, below - level, right - level, step_levels], axis=1)
         out, beside = np.full(len(plane), np.inf), self.near_winner(level, at, slope)
@@ -154,24 +154,16 @@ class Sweep:
         return out
 
 
-class FilledPairs(NamedTuple):
-    """Pairs with those of a sweep, and the sweep; None where it was not believed."""
-
-    grown: GrownPatches
-    sweep: Sweep | None
-
-
 def filled(
     grown: GrownPatches, measured: NodeMeasurements, view1: GrowingView, view2: GrowingView, cam2_from_cam1: Rigid3
-) -> FilledPairs:
-    """Return the pairs with those of a sweep at nodes where none grew; as they were where it disagrees with most.
+) -> tuple[GrownPatches, Sweep | None]:
+    """Return the pairs, completed by those of a sweep at nodes where none grew, and the sweep.
 
-    Where it disagrees with few, beside edges of depth that windows reach over, its own take the place of these.
-
-    The sigma of the sweep's ranges is what they are off by where both say something.
+    If the sweep disagrees with most grown pairs it is not used, and None. If it disagrees with few, as at depth edges
+    inside windows, its pairs replace these. The sigma of the sweep's ranges comes from the differences to grown pairs.
     """
     if not np.isfinite(measured.z).any():
-        return FilledPairs(grown, None)
+        return grown, None
     sweep = _swept(grown, measured, view1, view2, cam2_from_cam1)
     best, around = swept_surfaces(
         sweep.costs, len(sweep.inverse), sweep.samples1, bend=CURVATURE_COST, jump=JUMP_COST, even=EVEN_LEVELS
@@ -187,11 +179,11 @@ def filled(
     off = np.abs(level - of_grown)[good & np.isfinite(of_grown)]
     residual = SIGMA_OF_MEDIAN * float(np.median(off)) if off.size else np.inf
     if not residual < MAX_RESIDUAL_LEVELS:
-        return FilledPairs(grown, None)
+        return grown, None
     at = sweep.nearest(grown.pixels1)
     grown = grown.where(grown.valid & (sweep.near_winner(at_nodes, at, measured.slope) | ~good[at]))
     inverse = np.where(good, sweep.inverse[0] + spacing * level, np.nan)[::SAMPLES_A_NODE, ::SAMPLES_A_NODE]
-    return FilledPairs(_with(grown, inverse, residual * spacing, view1, view2, cam2_from_cam1), sweep)
+    return _with(grown, inverse, residual * spacing, view1, view2, cam2_from_cam1), sweep
 
 
 def _swept(
@@ -200,7 +192,7 @@ def _swept(
     inverse = measured.z[..., 0]
     low, high = np.nanquantile(inverse, [0.001, 0.999])
     pixel = 1.0 / float(np.nanquantile(measured.slope, 0.9))
-    # A wall that faces the camera is all at one range.
+    # A wall that faces the camera has a single range.
     farther, nearer = (max(share * (high - low), 2.0 * pixel) for share in (FARTHER, NEARER))
     low, high = max(low - farther, 0.0), high + nearer
     count = int(np.clip(np.ceil((high - low) / pixel) + 1, 3, MAX_SWEEP_LEVELS))
@@ -229,20 +221,19 @@ def _swept(
 
 
 def _turned(rays: FloatArray, inverse: FloatArray, cam2_from_cam1: Rigid3) -> FloatArray:
-    """Return points at inverse ranges on rays (..., 3) in the frame of camera 2, over their ranges."""
+    """Return the directions, in the frame of camera 2, of points at inverse ranges on rays (..., 3)."""
     return np.asarray(rays @ cam2_from_cam1.rotation.T + inverse[..., None] * cam2_from_cam1.translation_mm)
 
 
 def _at(image: NDArray[np.float32], places: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the image at places (R, C, 2); NaN outside."""
+    """Return the image at pixels (R, C, 2), interpolated; NaN outside."""
     u, v = (np.ascontiguousarray(places[..., k]) for k in (0, 1))
-    nan = float("nan")
-    read = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=nan)
+    read = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
     return np.asarray(read, np.float32)
 
 
 def _smooth(view: GrowingView, step_px: float) -> NDArray[np.float32]:
-    """Return the image as sharp as samples `step_px` apart can show it."""
+    """Return the image smoothed for samples `step_px` apart."""
     return np.asarray(cv2.GaussianBlur(np.asarray(view.grey, np.float32), (0, 0), SMOOTHED * step_px), np.float32)
 
 
@@ -254,7 +245,7 @@ def _contrast(view: GrowingView) -> NDArray[np.float32]:
 
 
 def _lit(view: GrowingView) -> NDArray[np.float32]:
-    """Return 1 at the pixels that the lens reaches and 0 at those as dark as the sensor's border around its circle."""
+    """Return 1 inside the image circle of the lens and 0 in the dark border around it."""
     dark = np.asarray(view.grey) <= UNLIT_LEVELS
     _, label = cv2.connectedComponents(dark.astype(np.uint8))
     border = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
@@ -264,7 +255,7 @@ def _lit(view: GrowingView) -> NDArray[np.float32]:
 def _winners(
     best: NDArray[np.int32], around: NDArray[np.int32], sweep: Sweep, view2: GrowingView, cam2_from_cam1: Rigid3
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the levels (R, C), between the `best` by a parabola, and where image 2 sees that surface."""
+    """Return the levels (R, C), refined from `best` by a parabola, and a mask (R, C) of those visible in image 2."""
     count = len(sweep.inverse)
     inner = np.clip(best, 1, count - 2)
     left, middle, right = np.moveaxis(around[..., 1:].astype(np.float64), -1, 0)
@@ -272,7 +263,7 @@ def _winners(
     with np.errstate(divide="ignore", invalid="ignore"):
         part = np.where(bend > 0.0, 0.5 * (left - right) / bend, 0.0)
     level = np.asarray(np.clip(inner + part, 0.0, count - 1.0), np.float64)
-    # At either end the surface may be beyond.
+    # At the first and last level the surface may be beyond the sweep.
     inside = (best > 0) & (best < count - 1)
     place, seen = view2.camera.project(_turned(sweep.rays1, sweep.inverse[best], cam2_from_cam1))
     inside &= seen
@@ -281,15 +272,15 @@ def _winners(
         inside &= ((place >= 0.0) & (place <= np.array([width - 1, height - 1]))).all(axis=-1)
     place = np.where(inside[..., None], place, 0.0)
     cost = np.where(inside, around[..., 0], np.iinfo(np.int32).max)
-    good = inside & _foremost(place, best, cost, sweep.step_px, view2)
-    return level, good
+    return level, inside & _foremost(place, best, cost, sweep.step_px, view2)
 
 
 def _reliable(sweep: Sweep, good: BoolArray, grown: FloatArray) -> BoolArray:
-    """Return which `good` samples (R, C) are on surfaces that are no chance.
+    """Return a mask (R, C) of the `good` samples on reliable surfaces.
 
-    A surface goes on where neighbours are no more than a level apart; `grown` are the levels (R, C) of patches. One
-    that no patch agrees with, as beside many edges of depth, is to be large, or cheap beside itself at other ranges.
+    A surface is a connected set of samples whose levels differ by one at most between neighbours; `grown` are the
+    levels (R, C) of patches. A surface without any agreeing patch, as at many depth edges, must be large, or cost much
+    less than the same surface at other ranges.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -313,9 +304,10 @@ def _reliable(sweep: Sweep, good: BoolArray, grown: FloatArray) -> BoolArray:
 
 
 def _of_shifted(sweep: Sweep, samples: IntArray, label: IntArray, count: int) -> FloatArray:
-    """Return the costs of surfaces over the least that they have at other ranges, (count,); NaN of those not asked for.
+    """Return the cost (count,) of each surface over its least cost at other ranges; NaN for those without samples.
 
-    `samples` (M,) are theirs, `label` (M,) says of which. Ranges at which half of one is beyond the sweep do not count.
+    `samples` (M,) are indices of samples, `label` (M,) their surfaces. Ranges with half of a surface beyond the sweep
+    do not count.
     """
     levels = len(sweep.inverse)
     at = np.rint(sweep.winners.ravel()[samples]).astype(np.int64)
@@ -337,7 +329,7 @@ def _of_shifted(sweep: Sweep, samples: IntArray, label: IntArray, count: int) ->
 def _foremost(
     place: Pixels, best: NDArray[np.int32], cost: NDArray[np.int32], step_px: float, view2: GrowingView
 ) -> BoolArray:
-    """Return which samples (R, C) agree with the cheapest that claims the same place of image 2."""
+    """Return a mask (R, C) of the samples that agree with the one of least cost at the same pixel of image 2."""
     columns = int(view2.size_px[0] // step_px) + 2
     cell = np.rint(place / step_px).astype(np.int64)
     cell = (cell[..., 1] * columns + cell[..., 0]).ravel()
@@ -355,9 +347,9 @@ def _with(
     view2: GrowingView,
     cam2_from_cam1: Rigid3,
 ) -> GrownPatches:
-    """Return the pairs, at nodes without one with those of the inverse ranges (R, C; NaN: unknown) instead."""
+    """Return the pairs, with those of the inverse ranges (R, C; NaN: unknown) at nodes that have none."""
     at = np.isfinite(inverse) & (inverse > 0.0) & ~grown.valid
-    # The surface that faces the camera.
+    # The gradient is unknown: assume a surface that faces the camera.
     z = np.pad(inverse[at][:, None], ((0, 0), (0, 2)))
     return with_pairs(grown, at, z, np.full(len(z), sigma), view1, view2, cam2_from_cam1)
 
@@ -371,9 +363,9 @@ def with_pairs(
     view2: GrowingView,
     cam2_from_cam1: Rigid3,
 ) -> GrownPatches:
-    """Return the pairs, at the nodes `at` (R, C) with those of N inverse ranges and their gradients z (N, 3) instead.
+    """Return the pairs, with those at the nodes `at` (mask (R, C)) replaced by those of N inverse ranges and gradients.
 
-    `sigma` (N,) is of the inverse ranges. No pair is where image 2 does not see the surface.
+    `z` (N, 3) is as in `NodeMeasurements`, `sigma` (N,) of the inverse ranges. Surfaces outside of image 2 get no pair.
     """
     pixels1, inverse = view1.nodes(grown.step)[at], z[:, 0]
     rays, _ = view1.camera.unproject(pixels1)

@@ -47,7 +47,6 @@ def measured_points(rays: Rays, task: Task, is_rig: bool) -> tuple[Points, Float
     level /= np.linalg.norm(level, axis=-1, keepdims=True)
     upright = np.cross(rays, level)
     middle, half = task.distance_mm * rays, 0.5 * task.size_mm
-    zero = np.zeros_like(rays)
     if task.quantity is Quantity.DEPTH:
         points = np.stack([middle - half * rays, middle + half * rays], axis=1)
         return points, np.stack([-rays, rays], axis=1)[:, None]
@@ -66,22 +65,18 @@ def measured_points(rays: Rays, task: Task, is_rig: bool) -> tuple[Points, Float
     points = np.stack(
         [middle + sign * half * direction for direction in (level, upright) for sign in (-1.0, 1.0)], axis=1
     )
-    if is_rig:
-        ends = np.stack([-level, level, zero, zero], axis=1), np.stack([zero, zero, -upright, upright], axis=1)
-    else:
-        # length = 2 D tan(angle / 2): moving an end by s perpendicular to its ray changes the angle by s / range.
-        opening = task.distance_mm * (1.0 + (half / task.distance_mm) ** 2) / np.hypot(task.distance_mm, half)
-        across = []
-        for direction, pair in ((level, points[:, :2]), (upright, points[:, 2:])):
-            away = np.stack([-direction, direction], axis=1)
-            sight = pair / np.linalg.norm(pair, axis=-1, keepdims=True)
-            away = away - np.sum(away * sight, axis=-1, keepdims=True) * sight
-            across.append(opening * away / np.linalg.norm(away, axis=-1, keepdims=True))
-        ends = (
-            np.concatenate([across[0], np.zeros_like(across[0])], axis=1),
-            np.concatenate([np.zeros_like(across[1]), across[1]], axis=1),
-        )
-    return points, np.stack(ends, axis=1)
+    by_points = np.zeros((len(rays), 2, 4, 3))
+    for k, direction in enumerate((level, upright)):
+        own = slice(2 * k, 2 * k + 2)
+        by_ends = np.stack([-direction, direction], axis=1)
+        if not is_rig:
+            # length = 2 D tan(angle / 2): moving an end by s perpendicular to its ray changes the angle by s / range.
+            opening = task.distance_mm * (1.0 + (half / task.distance_mm) ** 2) / np.hypot(task.distance_mm, half)
+            sight = points[:, own] / np.linalg.norm(points[:, own], axis=-1, keepdims=True)
+            by_ends = by_ends - np.sum(by_ends * sight, axis=-1, keepdims=True) * sight
+            by_ends = opening * by_ends / np.linalg.norm(by_ends, axis=-1, keepdims=True)
+        by_points[:, k, own] = by_ends
+    return points, by_points
 
 
 def hessians(points: Points, quantity: Quantity) -> FloatArray:
