@@ -114,7 +114,7 @@ def _again(
         pose = refine_pose(matches, pose, r.pose_type, r.level_sigma_rad, level_frames=frames).cam2_from_cam1
     points, covariance, valid = triangulate_matches(matches, pose)
     if r.boards:
-        scale, _ = metric_scale(points, matches.board_index, matches.grid, r.boards, covariance)
+        scale, _, _ = metric_scale(points, matches.board_index, matches.grid, r.boards, covariance)
     found = np.zeros(len(seen), dtype=bool)
     found[np.flatnonzero(seen)[valid]] = True
     again = np.array(r.cloud.points_mm)

@@ -15,7 +15,7 @@ from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import unit
 from rigkit.geometry.triangulation import point_uncertainty, triangulate_rays
-from rigkit.reconstruction.scale import scale_and_gradient
+from rigkit.reconstruction.scale import metric_scale
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -87,7 +87,7 @@ def metric_pose(
     """
     R, t = cam2_from_cam1.rotation, unit(cam2_from_cam1.translation_mm)
     points, _, covariance, by_pose = _uncertain_points(matches, Rigid3(R, t))
-    scale, sigma, d_scale_d_points = scale_and_gradient(points, matches.board_index, matches.grid, boards, covariance)
+    scale, sigma, d_scale_d_points = metric_scale(points, matches.board_index, matches.grid, boards, covariance)
     # Points that could not be triangulated have a zero gradient.
     gradient = np.einsum("ni,nip->p", d_scale_d_points, np.nan_to_num(by_pose))
     full = covariance_in_mm(t, pose_covariance, scale, sigma, gradient)

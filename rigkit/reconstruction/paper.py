@@ -104,7 +104,7 @@ def reconstruct_as_paper(
 def _in_mm(pair: MatchedPair, pose: Rigid3) -> Rigid3:
     """Return a pose of unit baseline in mm, scaled by the boards' squares with equal weights."""
     points = triangulate_matches(pair.captured, pose).points
-    scale, _ = metric_scale(points, pair.captured.board_index, pair.captured.grid, pair.boards)
+    scale, _, _ = metric_scale(points, pair.captured.board_index, pair.captured.grid, pair.boards)
     return Rigid3(pose.rotation, scale * pose.translation_mm)
 
 

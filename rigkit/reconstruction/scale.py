@@ -29,8 +29,8 @@ def metric_scale(
     grid: IntArray,
     boards: Sequence[Board],
     covariances: FloatArray | None = None,
-) -> tuple[float, float]:
-    """Return the factor from the reconstruction's unit to mm and its standard deviation.
+) -> tuple[float, float, FloatArray]:
+    """Return mm per unit of the reconstruction, its standard deviation, and its derivative (N, 3) by the points.
 
     Raises DegenerateError if no board has enough corners.
 
@@ -44,22 +44,8 @@ def metric_scale(
 
     Notes
     -----
-    The standard deviation is for a fixed pose of the cameras. The caller adds the pose's uncertainty.
-    """
-    scale, sigma, _ = scale_and_gradient(points_unit, board_index, grid, boards, covariances)
-    return scale, sigma
-
-
-def scale_and_gradient(
-    points_unit: Points,
-    board_index: IntArray,
-    grid: IntArray,
-    boards: Sequence[Board],
-    covariances: FloatArray | None = None,
-) -> tuple[float, float, FloatArray]:
-    """Return what `metric_scale` returns, and the derivative (N, 3) of the scale by every point.
-
-    It is that of the least-squares problem with its final weights held: zero for points that were left out.
+    The standard deviation is for a fixed pose of the cameras. The caller adds the pose's uncertainty. The derivative is
+    that of the least-squares problem with its final weights held: zero for points that were left out.
     """
     scales, variance, slopes = board_scales_and_gradients(points_unit, board_index, grid, boards, covariances)
     known = np.isfinite(scales)

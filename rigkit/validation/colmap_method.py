@@ -11,7 +11,7 @@ from rigkit.geometry.triangulation import point_uncertainty
 from rigkit.interop.colmap import ColmapPair, ColmapResult
 from rigkit.reconstruction.metric import covariance_in_mm
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.reconstruction.scale import scale_and_gradient
+from rigkit.reconstruction.scale import metric_scale
 
 BEST_CORNER_PX = 1e-3
 """Floor of the corners' standard deviation: a few corners can fit better by chance."""
@@ -29,7 +29,7 @@ def colmap_reconstruction(reconstruction: Reconstruction, pair: ColmapPair, resu
     variance = max(result.rms_px**2 * 2.0 * len(which) / max(len(which) - 5, 1), BEST_CORNER_PX**2)
     observed = (each[which] for each in reconstruction.measured_rays())
     spread, by_pose = point_uncertainty(unit_points, result.adjusted, *observed)
-    scale, scale_sigma, d_scale_d_points = scale_and_gradient(unit_points, *known, variance * spread)
+    scale, scale_sigma, d_scale_d_points = metric_scale(unit_points, *known, variance * spread)
     picked = {name: getattr(cloud, name)[which] for name in PER_POINT}
     metric = replace(
         reconstruction,

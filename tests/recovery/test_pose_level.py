@@ -46,7 +46,7 @@ def errors(rng, kind, level_deg, scenes):
             try:
                 found = estimate_pose(m, pose_type, sigma).cam2_from_cam1
                 points, covariance, _ = triangulate_matches(m, found)
-                scale, _ = metric_scale(points, m.board_index, m.grid, BOARDS, covariance)
+                scale, _, _ = metric_scale(points, m.board_index, m.grid, BOARDS, covariance)
                 row.append((pose_errors_deg(found, pose)[0], abs(scale - BASELINE_MM)))
             except RigkitError:
                 row.append((np.inf, np.inf))
