@@ -1,4 +1,4 @@
-"""Clouds of pairs against truth: points, ranges, normals, meshes and poses, beside OpenCV's semi-global matching.
+"""Errors of clouds of pairs (points, ranges, normals, meshes, poses), compared with OpenCV's semi-global matching.
 
 python scripts/bench_clouds.py ../shared/data/scenes            every pair of pairs.json
 python scripts/bench_clouds.py ../shared/data/scenes motorcycle --known-pose

@@ -1,11 +1,10 @@
-"""Is what the coach says in the end what `calibrate` states of the session, and is that true?
+"""Compare the coach's final error with that which `calibrate` states, and with the true error.
 
-SIMULATED: five lenses, boards that are not flat, each held where the coach asks within a human's error, until it says
-that there are enough. REAL: the images of a capture, in a random order, offered to the coach as photos in a watched
-folder are, until it says so. In both, what the coach says is put beside what all of `calibrate` states, and beside the
-truth: the lens, or the calibration from all images where boards were. `--rig`: SIMULATED pairs of each lens, 60 mm
-apart; said and true are the largest of the errors of either lens, and of both projections where boards were, mounts
-included. `--follow`: SIMULATED sessions go on to so many frames, whatever is said.
+SIMULATED: five lenses and boards that are not flat. Each board is held where the coach asks, with a human's error,
+until the coach says "enough". REAL: the images of a capture, in random order, are offered to the coach like photos in a
+watched folder, until it says so. The truth is the lens, or the calibration from all images where boards were. `--rig`:
+SIMULATED rigs of two equal lenses, 60 mm apart; errors are the largest of either lens and of both projections where
+boards were, including the extrinsics. `--follow`: SIMULATED sessions continue to N frames whatever the coach says.
 
     python scripts/bench_coach.py [--seeds 5] [--lens NAME ...] [--goal 0.1]
         [--follow N | --rig | --real SET ... [--data DIR] [--cache DIR]]

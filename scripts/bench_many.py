@@ -1,5 +1,5 @@
-"""Two hundred small rendered data sets, validated by processes of this machine and on a local Dask cluster: the table
-has to be the same, whoever computes it. Needs joblib and distributed (pip install 'rigkit[cluster]').
+"""Validate 200 small rendered data sets with local processes and on a local Dask cluster: the tables must be equal.
+Needs joblib and distributed (pip install 'rigkit[cluster]').
 
 python scripts/bench_many.py [--count 200] [--workers 2]
 """

@@ -1,11 +1,10 @@
-"""Does the planner save pictures? Sessions that follow it beside sessions as people take them, and real images.
+"""Measure how many pictures the planner saves, compared with sessions as people take them, and on real images.
 
-Simulated: five lenses, every board held where the planner asks within a human's error (5 degrees, 5 % of the distance,
-2 % of it sideways), beside boards held anyhow and beside a fixed pattern of twelve. Counted are the frames until the
-true error of the projection, over the image and after the best rotation, is that of the free session's median at its
-end. Real: of the images of a capture the planner chooses some, beside as many at random; error is the distance to the
-calibration from all images. Beside it stands plain greedy choice by the book, and what these figures would be if the
-covariance were exactly true.
+Simulated: five lenses. Boards are held where the planner asks, with a human's error (5 degrees, 5 % of the distance,
+2 % of it sideways), at random, or in a fixed pattern of twelve. Counted are the frames until the true projection error,
+over the image and after the best rotation, reaches the final median of the random sessions. Real: the planner chooses
+some images of a capture, compared with as many at random; the error is the difference to the calibration from all
+images. For comparison: plain greedy selection, and the figures for an exactly true covariance.
 
     python scripts/bench_planner.py [--seeds 20] [--lens NAME ...] [--real [--data DIR] [--cache DIR] [--draws 40]]
 """

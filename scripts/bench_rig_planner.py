@@ -1,8 +1,8 @@
-"""Does `rigkit plan rig.json` save pictures? Simulated rigs of two equal lenses, beside frames as people take them.
+"""Measure how many pictures `rigkit plan rig.json` saves for simulated rigs of two equal lenses.
 
-Both cameras see the board in six frames; then three more are taken, held where the plan asks within a human's error, or
-anyhow. Stated is what the rig's covariance leaves of what is planned for: the projections of both cameras where boards
-are, mounts included. True is what parameters and mounts that are off by what they are leave of it.
+Both cameras see the board in six frames. Then three more are taken, held where the plan asks, with a human's error, or
+at random. The goal is the error of both cameras' projections where boards are, including the extrinsics: "stated" is
+from the rig's covariance, "true" from the true errors of its parameters.
 
     python scripts/bench_rig_planner.py [--seeds 8] [--lens NAME ...]
 """

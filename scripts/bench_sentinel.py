@@ -1,18 +1,18 @@
-"""Does the sentinel alarm when something moved, name what, and keep quiet otherwise?
+"""Measure the power and the false alarms of the sentinel, and whether it names the right change.
 
-lens, rig: simulated corners. Cameras calibrated from planned views, checked with three fresh ones: held by hand where
-`rigkit plan --check` asks ("advised"), and lenses also with three as people take them ("free"). Changes leave 0.15 px
-rms over the image after the best rotation; mounts turn by 0.02 degrees. Beside what was found stands what no test could
-find more often: the change in its own direction, known before. `--board` takes another board for all of it.
-departs: lenses that no model is, calibrated with boards in the left part of the image and checked with three in the
-right: what they do there beyond their models is no change.
-rendered: pictures of all five lenses, detected; three or half of them are checked against the rest, and three pictures
+lens, rig: simulated corners. Cameras are calibrated from planned views and checked with three new ones, held by hand
+where `rigkit plan --check` asks ("advised"); lenses also with three as people take them ("free"). Changes are 0.15 px
+RMS over the image after the best rotation; extrinsics rotate by 0.02 degrees. The upper bound of the power is that of a
+test that knows the direction of the change. `--board` chooses another board.
+departs: lenses that no model fits, calibrated with boards in the left part of the image and checked with three in the
+right: their deviation from the model there is no change.
+rendered: detected pictures of all five lenses; three or half of them are checked against the rest, and three pictures
 after a change.
-pupil: simulated fisheyes whose entrance pupils move (`measure_pupil.py`), calibrated from 20 near boards, checked with
-three.
-scene: a rig before rendered textured walls; a mount turns by 0.05 degrees.
-pairs: real pairs of textured scenes whose cameras and pose are known; nothing moved, or the mount turned by 0.05
-degrees: as published, and since the rig's other pairs (`--before`).
+pupil: simulated fisheye lenses with moving entrance pupils (`measure_pupil.py`), calibrated from 20 near boards,
+checked with three.
+scene: a rig in front of rendered textured walls; the extrinsics rotate by 0.05 degrees.
+pairs: real pairs of textured scenes with known cameras and pose; without change, or with extrinsics rotated by 0.05
+degrees, checked as published, or against the rig's other pairs (`--before`).
 real: real captures; three, or half, of the images are checked against a calibration from the others.
 
     python scripts/bench_sentinel.py [lens] [rig] [departs] [pupil] [rendered] [scene] [pairs] [real] [--seeds 20]

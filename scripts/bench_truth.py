@@ -1,13 +1,13 @@
-"""The table of truth: rigkit and its peers on real captures of which somebody measured something.
+"""The table of truth: rigkit, OpenCV, mrcal and COLMAP on real captures with measured truth.
 
     python scripts/bench_truth.py [SET ...] [--data DIR] [--work DIR] [--model MODEL] [--json FILE]
         [--page datasets/public/README.md] [--short docs/pages/accuracy-truth.md]
 
-rigkit runs with its defaults on all sets (model and board's shape chosen by itself). OpenCV, mrcal (Debian: apt-get
-install mrcal python3-mrcal) and COLMAP (pycolmap) get the corners that rigkit kept, so that calibrations are compared
-and not detectors, and OpenCV those that it finds itself as well. No constant is changed for a set. Errors on images
-held out are made alike for all: every fifth image, camera and board from the others, nothing but the pose refitted.
-Sigmas are those that a tool states; where it states none, the error stands alone.
+rigkit runs with its defaults on all sets (automatic model and board shape). OpenCV, mrcal (Debian: apt-get install
+mrcal python3-mrcal) and COLMAP (pycolmap) get the corners that rigkit kept, so that calibrations and not detectors are
+compared; OpenCV also runs on the corners that it detects itself. No constant is changed for a set. Held-out errors are
+computed alike for all: every fifth image, with camera and board from the others, and only the pose refitted. Sigmas are
+those that a tool states, if any.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Calibration beside its peers on the same corners: time, error, difference to the true lens, failures.
+"""Compare calibration with OpenCV, mrcal and Ceres on the same corners: time, error, failures.
 
     python scripts/benchmark_calibration.py [--views 40] [--repeats 15] [--failures 20 [--omnidir 3]]
 
-Times are medians of CPU seconds of one process with one thread, initialisation included, nothing given but the corners;
-all peers of a table take turns, so that what else the machine does falls on each alike. RMS is 2-D per corner.
-"Difference" is the projection against the true lens over its whole field after the best rotation, RMS in px.
+Times are medians of CPU seconds of one process with one thread, including the initialisation from corners only. All
+programs of a table run alternately, so that other load on the machine affects them alike. RMS is 2-D per corner.
+"Difference" is the RMS difference of the projection to the true lens over its field after the best rotation, px.
 
 mrcal is Debian's (apt-get install mrcal python3-mrcal).
 """

@@ -1,10 +1,9 @@
-"""Speed of the affine and epipolar core on one core, beside a plain loop, OpenCV, COLMAP and PoseLib.
+"""Compare the speed of affine and epipolar estimation on one core with a plain loop, OpenCV, COLMAP and PoseLib.
 
 python scripts/benchmark_core.py [--only affine|epipolar|robust] [--corners 1000000] [--json]
 
-Times are of the processor: other programs on the machine hardly change them. Ratios are to the other's rate at the
-same problems: above 1 rigkit is faster. PoseLib is optional (pip install poselib). Where two programs estimate the same
-pose the median errors are shown as well.
+Times are processor times. Ratios are rigkit's rate over the other's on the same problems: above 1 rigkit is faster.
+PoseLib is optional (pip install poselib). If both programs estimate the same pose, the median errors are shown too.
 """
 
 from __future__ import annotations

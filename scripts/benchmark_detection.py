@@ -1,18 +1,18 @@
 #!/usr/bin/env python3
-"""Measure corner detection on rendered scenes with exact truth, beside other detectors and beside what is possible.
+"""Measure corner detection on rendered scenes with exact truth, compared with other detectors and the Cramer-Rao bound.
 
     python scripts/benchmark_detection.py [--parts accuracy conditions peers speed pairs] [--poses 6] [--pairs 200]
                                           [--peers-python PYTHON] [--json FILE]
 
-accuracy    errors at several blurs and noises beside the Cramer-Rao bound, predicted beside actual errors
-conditions  light, lens and sensor that are not as they should be; boards cut, covered, small, many
-peers       the same images through the detectors of scripts/detectors/peers.py, each in a process of its own
+accuracy    errors at several blurs and noises, with the Cramer-Rao bound and the predicted sigmas
+conditions  bad light, lens and sensor; boards cut, covered, small, many
+peers       the same images through the detectors of scripts/detectors/peers.py, each in its own process
 speed       image sizes, pictures without a board, memory
-pairs       three boards that look alike, in two rendered views: same corners, same indices
+pairs       three identical boards in two rendered views: same corners, same indices
 
-Prints Markdown tables, then a line for every figure that we ask of the detector: asked, measured, met or missed.
+Prints Markdown tables, then a line for every requirement on the detector: required, measured, met or missed.
 Distances are 2-D per corner (not per axis), in px; times are processor time of one thread, the least of several calls.
-The peers need not be installed, and need not be in this environment (--peers-python says in which they are).
+Other detectors are optional, and may be installed in another environment (--peers-python).
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
-"""Circle grids beside OpenCV: images found, and the error of cv2.calibrateCamera from either's centres.
+"""Compare circle grids with OpenCV: recall, and the error of cv2.calibrateCamera from each program's centres.
 
     python scripts/compare_circles.py --board circles.toml IMAGE...     real images
     python scripts/compare_circles.py --board circles.toml --worse IMAGE...
     python scripts/compare_circles.py                                   rendered ones, with the errors of the centres
 
-With `--worse` real images are made worse in many ways: whole grids found, those that are none, and by how much centres
-then lie off where they are in the image as it is, rms along an axis, and of rigkit's in the sigmas that it states.
+With `--worse` real images are degraded in many ways. Printed are whole grids found, wrong grids, and the RMS
+displacement of centres, per axis, from those in the original image; for rigkit also in its stated sigmas.
 
-Rendered ones stand beside the Cramer-Rao bound of each circle; then boards 60 degrees off the axis of a fisheye and 60
-degrees slanted, without noise: by how much centres are off in the mean, and at most, along any direction of the image.
-OpenCV is told the size, as rigkit is. It knows no hexagonal grids.
+Errors on rendered images are compared with the Cramer-Rao bound of each circle. Then boards 60 degrees off the axis of
+a fisheye lens and slanted by 60 degrees are rendered without noise: mean and largest errors. Both programs know the
+board's size. OpenCV does not support hexagonal grids.
 """
 
 from __future__ import annotations

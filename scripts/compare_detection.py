@@ -1,17 +1,17 @@
 #!/usr/bin/env python3
-"""How many boards rigkit and others find, in images as they are and in worse ones made of them.
+"""Compare the number of boards that rigkit and other detectors find in images, and in degraded copies of them.
 
     python scripts/compare_detection.py BOARDS=FOLDER ... [--only blur motion] [--most 12] [--save DIR]
                                         [--peers-python PYTHON] [--json FILE]
 
-BOARDS are boards as `rigkit detect --board` takes them, joined by "+" where a picture shows several:
-"9x6x25=left", "3x3x1+6x4x1=pictures", "aprilgrid:6x6x88,spacing=0.3=grids". All detectors are told the boards. What is
-right is what any of the detectors finds in the image itself: where its corners lie in a worse image follows from what
-was done to it. A board counts as whole where all of its corners that lie in the image are found, as a part where some
-are, and as wrong where more than a tenth of its corners are none of the board's.
+BOARDS are as in `rigkit detect --board`, joined by "+" if a picture shows several: "9x6x25=left",
+"3x3x1+6x4x1=pictures", "aprilgrid:6x6x88,spacing=0.3=grids". All detectors know the boards. The truth is what any of
+the detectors finds in the original image; the degradation determines its corners in the degraded copy. A board is
+"whole" if all of its corners inside the image are found, "part" if some are, and "wrong" if more than a tenth of the
+found corners are not the board's.
 
-Chessboards: OpenCV's two detectors, and libcbdetect and calib-targets (each finds one board) where --peers-python has
-them. ChArUco boards: cv2.aruco. AprilGrids: cv2.aruco, and pupil-apriltags where it is installed. Grids of circles:
+Chessboards: OpenCV's two detectors, and libcbdetect and calib-targets (each finds one board) if --peers-python has
+them. ChArUco boards: cv2.aruco. AprilGrids: cv2.aruco, and pupil-apriltags if installed. Circle grids:
 cv2.findCirclesGrid. Images in which others find more than rigkit are listed; --save writes them.
 """
 

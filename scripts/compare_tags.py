@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""AprilGrids beside what is possible, beside pupil-apriltags, and beside motion capture.
+"""Compare AprilGrids with the Cramer-Rao bound, pupil-apriltags, and motion capture.
 
     python scripts/compare_tags.py
     python scripts/compare_tags.py --board grid.toml IMAGE...
     python scripts/compare_tags.py --board grid.toml --calibration grid.json --body body0.csv --target data.csv IMAGE...
 
-The first renders boards: errors over the Cramer-Rao bound. The second counts tags and processor time, those of
-pupil-apriltags, too, where it is installed. The third compares board poses with tracked ones after one hand-eye fit.
+The first renders boards and prints errors over the Cramer-Rao bound. The second prints tags found and processor time,
+also of pupil-apriltags if installed. The third compares board poses with tracked ones after a hand-eye calibration.
 Tracked poses are CSV: time in ns, x, y, z in m, quaternion x, y, z, w. Images are named by their time in ns.
 """
 

@@ -2,7 +2,7 @@
 
     python scripts/cross_compile.py [-o FOLDER] [TARGET...]
 
-Each library goes to FOLDER/TARGET (out/kernels) beside the record that rigkit checks before it loads it.
+Each library is written to FOLDER/TARGET (out/kernels) with the record that rigkit checks before it loads it.
 """
 
 from __future__ import annotations

@@ -1,14 +1,13 @@
 #!/usr/bin/env python3
-"""Clouds of one pair of images by two calibrations of its rig, from halves of its frames: as far apart as is stated?
+"""Do clouds of one pair, by two calibrations of its rig from halves of its frames, agree within the sigmas?
 
     python scripts/measure_rig_clouds.py MM=FOLDER ... [--splits 3] [--pairs 3] [--seed 0]
 
-FOLDER holds images of two cameras that `rigkit calibrate FOLDER --square-mm MM` calibrates as a rig. Its frames are
-split into halves at random and each half is calibrated; pairs of images are grown into a cloud by both. Features, noise
-and texture are the same, so what parts the ranges of one pixel is the calibrations: lenses, mount and length of the
-baseline. Printed for each set: by how much they differ (median of the absolute difference), the same in standard
-deviations by what the calibrations have in the stated sigmas, and by the whole sigmas that a cloud would have if the
-rig were exact. Where sigmas are true the first is 0.67 on average; one split is one error for all points.
+FOLDER has images of two cameras that `rigkit calibrate FOLDER --square-mm MM` calibrates as a rig. Its frames are split
+randomly into halves, and each half is calibrated. Pairs of images are grown into a cloud with both calibrations. Only
+the calibrations (lenses, extrinsics, length of the baseline) differ, so only they change the range of a pixel. Printed
+for each set: the median absolute difference of ranges, the same over the calibrations' part of the sigmas, and over the
+sigmas with an exact rig. If sigmas are true, the second is 0.67 on average; a split is one common error of all points.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""What the edge of a hard shadow does to corners: shadows are multiplied onto images, whose own corners are the truth.
+"""Errors of corners close to the edge of a hard shadow, which is multiplied onto images with known corners.
 
     python scripts/measure_shadows.py BOARDS=FOLDER ... [--left 0.25] [--count 18]
 
-BOARDS as for compare_detection.py. Each set gets so many shadows, anywhere on the board and in any direction, with an
-edge of 1 to 2 px. Printed are the corners found, of those found without the shadow, of all and of those near its edge,
-and how far the latter are from where they were, over their sigma (rms per axis).
+BOARDS as for compare_detection.py. Each set gets `--count` shadows, anywhere on the board and in any direction, with an
+edge of 1 to 2 px. Printed are the recall relative to the image without shadow, of all corners and of those close to the
+edge, and the RMS error of the latter per axis, over their sigma.
 """
 
 from __future__ import annotations

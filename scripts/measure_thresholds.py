@@ -1,23 +1,22 @@
 #!/usr/bin/env python3
-"""Measure what tells chessboards from other patterns: fit the weights of `rigkit.detection.checks.evidence` again.
+"""Fit the weights of `rigkit.detection.checks.evidence`, which separate chessboards from other patterns.
 
     python scripts/measure_thresholds.py [--boards DIR ...] [--without DIR ...] [--seeds 12] [--worse 4]
     python scripts/measure_thresholds.py --circles [--boards DIR ...] [--without DIR ...]
 
 Rendered boards (all conditions of the benchmark, blurs up to 3.5 px, squares down to 8 px) and rendered patterns (the
-blank pictures of the benchmark, grids of dots) are always measured; `--boards` adds folders of images of boards,
-`--without` folders of images that show none. Of each real image, and of each pattern, there are the image itself and
-some that are worse: blurred, noisy, compressed, sharpened, faint, shrunk, covered, cut. Boards are those lattices that
-lie where boards are found in the image itself; all other lattices of such images are left out. Chance blocks of codes
-and mosaics, which are true pieces of chessboards, are left to `validate.compact`.
+blank pictures of the benchmark, grids of dots) are always used; `--boards` adds folders of images of boards,
+`--without` folders of images without boards. Each real image and pattern is used with degraded copies: blurred, noisy,
+compressed, sharpened, faint, shrunk, covered, cut. Lattices at boards found in the original image are positives; other
+lattices of such images are left out. Random blocks of codes and mosaics, which are real pieces of chessboards, are left
+to `validate.compact`.
 
-Prints the weights of a logistic regression (kinds of images weigh the same; with the prior that
-`rigkit.detection.checks.evidence` states), how many lattices it takes for the wrong thing where their kind of image had
-no say in it, then the scores of the boards seen worst and of the patterns that resemble boards most, by the weights in
-use: the margin on both sides of 0.
+Prints the weights of a logistic regression (equal weights of the kinds of images; with the prior of
+`rigkit.detection.checks.evidence`), its errors when cross-validated over kinds of images, and the scores, by the
+weights in use, of the worst boards and of the patterns most similar to boards: the margin on both sides of 0.
 
-With `--circles` the same of grids of circles: what the largest lattice of each image of a grid weighs, and all lattices
-of other images, by `rigkit.detection.circles.evidence`.
+With `--circles` it does the same for circle grids and `rigkit.detection.circles.evidence`: scores of the largest
+lattice of each image of a grid, and of all lattices of other images.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""rigkit on path traced captures, against their truth: `python scripts/measure_traced.py traced/*`.
+"""Errors of rigkit on path-traced captures: `python scripts/measure_traced.py traced/*`.
 
-The folders are those of `path_traced.py`. Each is calibrated as a person would (`rigkit calibrate images --board
-board.toml`), and one table says how far what came of it lies from what was rendered: the corners used (2-D rms); the
-projection over those corners after the rotation that fits best, beside what rigkit states of it. A rig's baseline and
-rotation, a board's shape, and the headline of the verdicts follow. A data set (dataset.toml) is validated.
+The folders are those of `path_traced.py`. Each is calibrated like `rigkit calibrate images --board board.toml`. The
+table has the errors of the corners used (2-D RMS), of the projection at those corners after the best rotation, with the
+stated one, of a rig's baseline and rotation, of a board's shape, and the headline of the verdicts. A data set
+(dataset.toml) is validated.
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
 #!/usr/bin/env python3
-"""What becomes of whole sets of REAL images that are made worse: is the board still told, and the camera the same?
+"""Degrade whole sets of REAL images: is the board still identified, and the camera the same?
 
     python scripts/measure_worse_sets.py MM=FOLDER ... [--only "noise 8" "jpeg 30" ...]
 
-Every image of a folder (of `--most` of them) is made worse in the same way, and the folder calibrated as `rigkit
-calibrate FOLDER --square-mm MM` does it: nobody says which board it is. Both calibrations are of one camera and of the
-same pictures, so that they must differ by less than what `rigkit diff` predicts for pictures taken anew. Prints of each
-set and degradation the board, views used, camera model, held-out error, difference over the one predicted, and the
-verdict; or why nothing came out.
+Every image of a folder (of `--most` of them) is degraded in the same way, and the folder calibrated like `rigkit
+calibrate FOLDER --square-mm MM`, without naming the board. Both calibrations are of the same camera and pictures, so
+they must differ by less than `rigkit diff` predicts for new pictures. Prints for each set and degradation the board,
+views used, camera model, held-out error, difference over its prediction, and the verdict, or the error message.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Captures of boards, path traced by Blender's Cycles: an independent renderer, against whose truth rigkit is measured.
+"""Render captures of boards with exact truth by an independent path tracer, Blender's Cycles.
 
     python -m venv blender && blender/bin/pip install bpy==4.2.0 -e .       # Python 3.11
     blender/bin/python scripts/path_traced.py -o traced narrow fisheye laboratory
@@ -6,10 +6,10 @@
 
 A SET is a folder with the pictures (8 bit, sRGB, shot and read noise), board.toml and truth.json: the lens's formula,
 the cameras' and boards' poses, the board's points. `laboratory` is a data set for `rigkit validate`, with its
-dataset.toml; its cameras are those of `narrow` and `fisheye`, which are calibrated first. The same names give the same
-pictures again; those that are there already are kept. A picture of 800 x 600 takes some 20 s of one core.
+dataset.toml; its cameras are those of `narrow` and `fisheye`, which are calibrated first. The same names always give
+the same pictures; existing ones are kept. A picture of 800 x 600 takes about 20 s of one core.
 
-Lenses and boards stand in traced/captures.py, the laboratory in traced/laboratory.py.
+Lenses and boards are defined in traced/captures.py, the laboratory in traced/laboratory.py.
 """
 
 from __future__ import annotations

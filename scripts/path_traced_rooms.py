@@ -1,10 +1,10 @@
-"""Pairs of images of textured rooms by an independent path tracer, with the exact surface behind every pixel.
+"""Render pairs of images of textured rooms by an independent path tracer, with the exact surface at every pixel.
 
 python scripts/path_traced_rooms.py rooms fisheye:1 perspective:2      in a Python that has `pip install bpy` (5)
 python scripts/bench_clouds.py rooms                                   with rigkit
 
-Blender's Cycles draws a room of boxes, balls, cylinders, posts and boards in painted textures, one wall nearly plain,
-from two places. Each image is drawn again with one sample at the middle of every pixel: positions and normals there.
+Blender's Cycles renders a room of boxes, balls, cylinders, posts and boards in painted textures, one wall nearly plain,
+from two places. Each image is rendered again with one sample at the centre of every pixel for positions and normals.
 """
 
 from __future__ import annotations

@@ -2,15 +2,14 @@
 
     python scripts/quick_tests.py [--total 200] [--further] [--data FILE ...] [--tests PATH ...]
 
-Runs all tests but the slow ones under coverage (a quarter of an hour of one quiet core), each a context of its own. The
-quick run can do without a test where its other tests reach every line and every branch of rigkit that it reaches. Left
-out are the dearest of these, until the rest takes --total seconds of processor time. A limit on a test's time falls
-until that is so. Of the tests that take longer, the quick run keeps those that together reach what the shorter ones do
-not. They are chosen one after the other by what they add a second (Chvatal, Mathematics of Operations Research 4,
-1979), but for those that others chosen later make needless. Files of `WHOLE` are left out. It also keeps a short one
-of every file, `KEPT`, tests that fail under coverage, and those that start programs which are not Python's: what these
-reach is not seen. With --further only the quick tests of now run, in half the time, and more of them are left out.
-Prints seconds, lines and branches of both.
+Runs all tests but the slow ones under coverage (15 minutes of one idle core), each in its own context. A test can be
+left out of the quick run if its other tests reach every line and branch of rigkit that it reaches. The slowest of these
+are left out until the rest takes --total seconds of processor time: a limit on a test's time is lowered until then. Of
+the tests above the limit, a set is kept that reaches what the shorter ones do not. It is chosen greedily by the lines
+and branches added per second (Chvatal, Mathematics of Operations Research 4, 1979), without those that later choices
+make redundant. Files of `WHOLE` are left out. Also kept are a short test of every file, `KEPT`, tests that fail under
+coverage, and those that start programs other than Python, whose coverage is unknown. With --further only the present
+quick tests are run, in half the time, and more of them are left out. Prints seconds, lines and branches of both.
 """
 
 from __future__ import annotations

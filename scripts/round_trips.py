@@ -1,7 +1,7 @@
-"""Every camera model, and a rig, through every format and back: the largest error over the image, px, and what the
-other programs' own readers make of the files. The tables are part of the documentation.
+"""Convert every camera model, and a rig, to every format and back: the largest error over the image, px, and the error
+of the other programs' own readers (calibrators/own_readers.py). The tables are part of the documentation.
 
-python scripts/round_trips.py     (what is read by whom: calibrators/own_readers.py)
+python scripts/round_trips.py
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
-"""Run the tests of the kernels with kernels compiled to watch themselves: AddressSanitizer and UBSan of gcc or clang.
+"""Run the tests of the kernels under AddressSanitizer and UBSan of gcc or clang.
 
     python scripts/sanitize.py [PYTEST_ARGUMENT...]        (default: tests/kernels; needs Linux and gcc)
 
-The package is copied into a temporary folder and its library built there with -fsanitize=address,undefined; Python runs
-with the sanitizer's runtime loaded first and takes memory from malloc, so that arrays of numpy are watched too. Any
-access outside an array, and any behaviour that C leaves undefined, ends the run with a report. Exit code: that of
-pytest, or of the sanitizer.
+The package is copied to a temporary folder and built there with -fsanitize=address,undefined. Python runs with the
+sanitizer's runtime preloaded and allocates with malloc, so that numpy arrays are checked too. Any access outside of an
+array, and any undefined behaviour, ends the run with a report. Exit code: that of pytest, or of the sanitizer.
 """
 
 from __future__ import annotations

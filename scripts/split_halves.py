@@ -1,22 +1,20 @@
-"""Do the stated uncertainties of real calibrations hold? Halves of one camera's images, calibrated apart.
+"""Test the stated uncertainties of real calibrations: calibrate two halves of one camera's images separately.
 
-The images of every set are split at random into halves. Two calibrations of one and the same camera must differ, after
-the rotation that none of them knows and where both had boards, by what they say that they may: the ratio of the
-observed difference and the predicted one is 1 over many splits. Splits of few images are nearly one and the same, and a
-difference is mostly of one kind, so that this ratio scatters by itself. Beside it stands where 95 % of such ratios lie
-if the sigmas are true (the errors of all images drawn anew, the splits the same). More splits narrow that little: what
-all sets say together is the last line. And a test that never alarms is worthless: other cameras, and slightly moved
-lenses, must be found.
+The images of every set are split randomly into halves. The difference of two calibrations of the same camera, after the
+best rotation and where both had boards, must agree with its prediction: the ratio of observed to predicted difference
+is 1 on average over many splits. Splits of few images are strongly correlated, and a difference has few degrees of
+freedom, so this ratio scatters. The interval of 95 % of such ratios for true sigmas is printed too (same splits, new
+errors of all images). More splits narrow it little; the last line combines all sets. The power of the test is measured
+as well: other cameras, and slightly moved lenses, must be found.
 
     python scripts/split_halves.py [SET ...] [--data DIR] [--splits 6] [--images N] [--cache DIR] [--power]
         [--model MODEL] [--without IMAGE ...] [--twins N] [--small N]
 
-With --images so many images are calibrated apart from all others: what a small session says of itself. With --without
-the images named are left out: does a ratio come from one of them? With --twins halves of so many SIMULATED sessions
-like the real one, whose images all err alike (`honesty.twins`): if these agree with their sigmas, small sessions know
-how sure they are, and where the real one does not, an image of it errs otherwise. With --small so many random
-draws of 3, 4, 5, 7 and 10 images against all others (`honesty.small`; with --twins of SIMULATED sessions): what small
-sessions state, and what their verdicts say; give --model auto for what a user gets.
+--images N: calibrate N images against all others, for the sigmas of small sessions. --without: leave the named images
+out, to see whether a ratio comes from one of them. --twins N: halves of N SIMULATED sessions like the real one, with
+equal errors of all images (`honesty.twins`): if these agree with their sigmas and the real one does not, one of its
+images has another error. --small N: N random draws of 3, 4, 5, 7 and 10 images against all others (`honesty.small`;
+with --twins of SIMULATED sessions), with the sigmas and verdicts of small sessions; --model auto is what a user gets.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ epipole errors are so large that their linearised variance is wrong."""
 ROUNDING = 1e-9
 """Floor of residuals, as a part of the distance: exact points have no scatter."""
 RANSAC_ROUNDS = 2
-"""The inlier distance of the first comes from the scatter about the tilted plane, that of the second is right."""
+"""The first inlier distance is from the scatter about a plane tilted by outliers, the second from the common plane."""
 RANSAC_ITERATIONS = 60
 """With a third of the points bad, the probability of no good sample of three is 1e-9."""
 WEIGHT_ROUNDS = 3

@@ -1,7 +1,8 @@
-"""Files of ours as the other programs' own code reads and projects them, none of rigkit's: for `round_trips.py`.
+"""Read our files and project with the other programs' own code, for `round_trips.py`.
 
-What is not installed gives None: mrcal (Debian: python3-mrcal), ROS (Debian: python3-camera-calibration-parsers,
-python3-image-geometry). Kalibr's reader needs its compiled cameras, which no package brings.
+Programs that are not installed return None: mrcal (Debian: python3-mrcal), ROS (Debian:
+python3-camera-calibration-parsers, python3-image-geometry). Kalibr's reader needs its compiled cameras, which no
+package contains.
 """
 
 from __future__ import annotations

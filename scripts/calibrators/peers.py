@@ -1,4 +1,4 @@
-"""The peers of the calibration behind one interface each: OpenCV, mrcal, Ceres through pycolmap.
+"""Other calibration programs behind one interface: OpenCV, mrcal, Ceres through pycolmap.
 
 mrcal is Debian's (apt-get install mrcal python3-mrcal) and runs in Debian's Python, timed in its own process.
 """

@@ -1,4 +1,4 @@
-"""Lenses that no model is: round ones with curves of their own, decentred."""
+"""Lenses that no model fits: rotationally symmetric with arbitrary curves, decentred."""
 
 from __future__ import annotations
 

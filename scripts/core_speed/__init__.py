@@ -1,1 +1,1 @@
-"""The problems, the plain loops and the peers of `benchmark_core.py`."""
+"""Problems, plain loops and other programs for `benchmark_core.py`."""

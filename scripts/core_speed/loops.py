@@ -1,4 +1,4 @@
-"""Single problems solved as one would write it from the paper, with numpy: what the core is timed against."""
+"""Plain numpy solutions of single problems, as written in the paper, to compare the speed with."""
 
 from __future__ import annotations
 

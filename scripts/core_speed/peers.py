@@ -1,4 +1,4 @@
-"""Poses by other programs, each with its options set as ours are."""
+"""Poses by other programs, with options equivalent to ours."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Matches with noisy affinities of random facets, some of them wrong: what the core is timed on."""
+"""Matches with noisy affinities of random facets, with outliers, to measure the speed on."""
 
 from __future__ import annotations
 

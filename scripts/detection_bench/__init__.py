@@ -1,1 +1,1 @@
-"""What measures detection: rendered scenes with exact truth, their scores, the Cramer-Rao bound of their corners."""
+"""Rendered scenes with exact truth, scores and Cramer-Rao bounds, to measure detection."""

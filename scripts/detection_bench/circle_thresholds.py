@@ -1,4 +1,4 @@
-"""What tells grids of circles from other lattices of blobs: the margin on both sides of `GridEvidence`'s limit."""
+"""Measure the margin of `GridEvidence`'s limit between circle grids and other lattices of blobs."""
 
 from __future__ import annotations
 

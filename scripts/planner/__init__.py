@@ -1,1 +1,1 @@
-"""What the planner's benchmark measures on real captures."""
+"""The planner's benchmark on real captures."""

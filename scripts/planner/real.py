@@ -1,8 +1,8 @@
-"""The planner on images at hand, and what its figures would be if the covariance were exactly true.
+"""Measure the planner on existing images, and compute its figures for an exactly true covariance.
 
-A choice is one draw: whoever knows the covariance exactly, and chooses the best images by it, is still nearer to the
-calibration from all than a random choice only so often. Drawn are the scores of all images, each with its information
-as covariance: everything is linear then, and every choice has its error.
+A choice of images is one random draw: even the best choice by an exact covariance is closer to the calibration from all
+images than a random choice only with some probability. It is simulated by drawing the scores of all images, each with
+its information as covariance; everything is then linear, and every choice has its error.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The real captures and the counts of `bench_sentinel.py`."""
+"""Real captures, scenes and statistics for `bench_sentinel.py`."""

@@ -1,4 +1,4 @@
-"""What the sentinel's benchmarks share: changes, checks of what did not change, and how often it alarms."""
+"""Shared by the sentinel's benchmarks: changes, checks without a change, and counts of alarms."""
 
 from __future__ import annotations
 

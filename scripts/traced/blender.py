@@ -1,4 +1,4 @@
-"""What Blender makes of a capture: meshes, materials, cameras; needs `bpy`. Blender's lengths are m, ours mm."""
+"""Build a capture's meshes, materials and cameras in Blender; needs `bpy`. Blender's lengths are in m, ours in mm."""
 
 from __future__ import annotations
 

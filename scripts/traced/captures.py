@@ -1,4 +1,4 @@
-"""Which captures are rendered: cameras, boards, how the boards are held, and how pictures are taken."""
+"""Define the captures to render: cameras, boards, poses of the boards, and exposure."""
 
 from __future__ import annotations
 

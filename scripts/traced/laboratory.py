@@ -1,6 +1,6 @@
 """Three perpendicular chessboards in the corner of a room, and pairs of views of them.
 
-The world stands on z = 0, with the right wall x = 0 and the left wall y = 0; the room is x, y, z > 0. Lengths are mm.
+The floor is z = 0, the right wall x = 0 and the left wall y = 0; the room is x, y, z > 0. Lengths are in mm.
 """
 
 from __future__ import annotations

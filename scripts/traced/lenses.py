@@ -1,8 +1,8 @@
-"""Lenses that Cycles renders exactly, by their own formulas: nothing here is rigkit's, so that it can be its truth.
+"""Formulas of the lenses that Cycles renders, independent of rigkit's, to be used as truth.
 
-Pixel (0, 0) is the centre of the top-left pixel, the camera looks along +z with x to the right and y down. Against
-these formulas the centroids of small discs that Cycles renders are right to 0.002 px (perspective) and 0.008 px
-(fisheyes) rms, which is the scatter of 256 samples a pixel, and to 0.001 px on average.
+Pixel (0, 0) is the centre of the top-left pixel, the camera looks along +z with x to the right and y down. Centroids of
+small discs rendered by Cycles agree with these formulas to 0.002 px (perspective) and 0.008 px (fisheye) RMS, which is
+the noise of 256 samples per pixel, and to 0.001 px on average.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A room full of what looks like a board and is none: floor tiles, tiled boxes, keyboards on posters; needs `bpy`."""
+"""A room with board-like distractors: floor tiles, tiled boxes, keyboards on posters; needs `bpy`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a camera makes of the light: exposure, vignetting and glare, noise, and a webcam's picture processing."""
+"""Simulate a camera's exposure, vignetting, glare and noise, and a webcam's image processing."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The sets, the peers and the tables of `bench_truth.py`."""
+"""Sets, other programs and tables for `bench_truth.py`."""

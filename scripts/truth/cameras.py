@@ -1,4 +1,4 @@
-"""Single cameras of the table of truth: images held out, and what somebody measured."""
+"""Single cameras of the table of truth: held-out errors, and errors against measurements."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""COLMAP on boards, which it has no calibration for: its bundle adjustment (Ceres) with the board's corners as points.
+"""Calibrate from boards with COLMAP's bundle adjustment (Ceres), with the board's corners as points.
 
-One board that moves before a camera at rest is one world at rest before a camera that moves: each image is a pose, each
-corner a point that all images see. It needs a start, which is OpenCV's.
+A board that moves in front of a fixed camera is equivalent to a fixed world and a moving camera: each image is a pose,
+each corner a point seen in all images. The initial values are OpenCV's.
 """
 
 from __future__ import annotations

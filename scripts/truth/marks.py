@@ -1,4 +1,4 @@
-"""A lattice of dark marks on a printed surface: found in an image, and compared with where they were printed."""
+"""Find a lattice of dark marks on a printed surface in an image, and compare it with the print."""
 
 from __future__ import annotations
 

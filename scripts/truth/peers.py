@@ -1,7 +1,7 @@
 """OpenCV, mrcal and COLMAP on the captures of the table of truth, each with its own defaults.
 
-All get the corners that rigkit found and kept, so that calibrations are compared and not detectors; OpenCV runs on
-those that cv2.findChessboardCornersSB finds as well.
+All get the corners that rigkit kept, so that calibrations and not detectors are compared; OpenCV also runs on those of
+cv2.findChessboardCornersSB.
 """
 
 from __future__ import annotations

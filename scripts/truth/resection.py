@@ -1,4 +1,4 @@
-"""Images held out, alike for every tool: camera and board from the other images, nothing but the pose refitted."""
+"""Held-out errors, computed alike for every tool: camera and board from the other images, only the pose refitted."""
 
 from __future__ import annotations
 

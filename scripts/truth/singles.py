@@ -1,4 +1,4 @@
-"""Single images of the table of truth: how many tags of AprilGrids are found."""
+"""Single images of the table of truth: the number of AprilGrid tags found."""
 
 from __future__ import annotations
 

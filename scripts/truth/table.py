@@ -1,4 +1,4 @@
-"""Rows of the table of truth, and the tables made of them: a long one, and one with a column a tool."""
+"""Rows of the table of truth, and the tables: a long one, and one with a column for each tool."""
 
 from __future__ import annotations
 
