@@ -14,9 +14,9 @@ CASES = sorted(path for path in CORPUS.rglob("*") if path.is_file())
 
 
 @pytest.mark.parametrize("damaged", CASES, ids=lambda path: str(path.relative_to(CORPUS)))
-def test_what_once_ended_badly(damaged: Path, place: Path) -> None:
+def test_what_once_ended_badly(damaged: Path, case_place: Path) -> None:
     """Nothing but a result, or one line that names the file, comes of it in any of its readers."""
-    (place / "out").mkdir()
+    (case_place / "out").mkdir()
     case = f"case{damaged.suffix}"
     shutil.copy(damaged, case)
     for reader in KINDS[damaged.parent.name].readers:
