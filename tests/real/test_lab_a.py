@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from helpers.data import REPOSITORY, shared_data
+from helpers.once import once_a_run
 
 PATH_TRACED = ("regular-general", "regular-planar")
 """Noisier images, and noise that neighbouring pixels share."""
@@ -38,10 +39,14 @@ def load_accuracy() -> Any:
 
 
 @pytest.fixture(scope="module", params=["raw", pytest.param("rectified", marks=pytest.mark.thorough)])
-def measured(request: pytest.FixtureRequest) -> dict[str, Any]:
+def measured(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder: Path = shared_data("lab-a")
-    found = load_accuracy().measure(folder, chain=request.param, jobs=1)
-    return {pair["pair"]: pair for pair in found["pairs"]}
+
+    def measure() -> dict[str, Any]:
+        found = load_accuracy().measure(folder, chain=request.param, jobs=1)
+        return {pair["pair"]: pair for pair in found["pairs"]}
+
+    return once_a_run(tmp_path_factory, f"lab-a-{request.param}", measure)
 
 
 @pytest.mark.real
