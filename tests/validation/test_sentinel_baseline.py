@@ -23,6 +23,7 @@ MOUNT = Rigid3(exp_so3(np.array([0.01, -0.08, 0.02])), [-120.0, 2.0, 3.0])
 MATCH_NOISE_PX = 0.1
 WRONG_DEG, TURN_DEG = 0.1, 0.05
 BEFORE, FRESH = 9, 3
+SEEDS = pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.thorough)])
 
 
 def _turned(pose: Rigid3, degrees: float) -> Rigid3:
@@ -67,20 +68,20 @@ def _boards(camera: Camera, rng: np.random.Generator, which: slice) -> Look:
     return lambda now: evidence_of(now, views)
 
 
-def test_a_rig_that_never_held_is_checked_for_what_moved_since() -> None:
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        before, same, moved = (_scenes(_turned(MOUNT, d), n, rng) for d, n in ((0.0, 2), (0.0, 1), (TURN_DEG, 1)))
-        assert not evaluate_evidence(_file(), same).holds
-        quiet, check = (judge_since(_file(), before, look) for look in (same, moved))
-        assert quiet.holds and quiet.baseline is not None and quiet.baseline.frames == 2
-        assert quiet.baseline.rms_corrected_px < 0.5 * quiet.baseline.rms_px
-        assert check_facts(quiet).headline.startswith("Nothing moved since")
-        assert not check.holds and check.change is not None and check.change.hypothesis.kind == "rotation"
-        sigmas = check.change.sigmas
-        assert check.change.amounts == pytest.approx([TURN_DEG, 0.0, 0.0], abs=4.0 * float(sigmas.max()))
-        assert sigmas[0] < 0.1 * TURN_DEG
-        assert check_facts(check).headline.startswith("Moved since (")
+@SEEDS
+def test_a_rig_that_never_held_is_checked_for_what_moved_since(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    before, same, moved = (_scenes(_turned(MOUNT, d), n, rng) for d, n in ((0.0, 2), (0.0, 1), (TURN_DEG, 1)))
+    assert not evaluate_evidence(_file(), same).holds
+    quiet, check = (judge_since(_file(), before, look) for look in (same, moved))
+    assert quiet.holds and quiet.baseline is not None and quiet.baseline.frames == 2
+    assert quiet.baseline.rms_corrected_px < 0.5 * quiet.baseline.rms_px
+    assert check_facts(quiet).headline.startswith("Nothing moved since")
+    assert not check.holds and check.change is not None and check.change.hypothesis.kind == "rotation"
+    sigmas = check.change.sigmas
+    assert check.change.amounts == pytest.approx([TURN_DEG, 0.0, 0.0], abs=4.0 * float(sigmas.max()))
+    assert sigmas[0] < 0.1 * TURN_DEG
+    assert check_facts(check).headline.startswith("Moved since (")
 
 
 def _known(focus: float) -> tuple[Camera, Monitored]:
@@ -99,20 +100,20 @@ def _known(focus: float) -> tuple[Camera, Monitored]:
     return camera, file
 
 
-def test_a_lens_whose_file_is_off_is_checked_for_what_moved_since() -> None:
+@SEEDS
+def test_a_lens_whose_file_is_off_is_checked_for_what_moved_since(seed: int) -> None:
     camera, file = _known(1.01)
     longer = camera.with_parameters(camera.parameters * np.where(np.arange(camera.parameters.size) < 2, 1.001, 1.0))
     fresh = slice(BEFORE, None)
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        before, same, moved = (
-            _boards(c, rng, which) for c, which in ((camera, slice(BEFORE)), (camera, fresh), (longer, fresh))
-        )
-        assert not evaluate_evidence(file, same).holds
-        assert judge_since(file, before, same).holds
-        check = judge_since(file, before, moved)
-        assert not check.holds and check.change is not None and check.change.hypothesis.kind == "focus"
-        assert check.change.amounts == pytest.approx([0.1], abs=4.0 * float(check.change.sigmas[0]))
+    rng = np.random.default_rng(seed)
+    before, same, moved = (
+        _boards(c, rng, which) for c, which in ((camera, slice(BEFORE)), (camera, fresh), (longer, fresh))
+    )
+    assert not evaluate_evidence(file, same).holds
+    assert judge_since(file, before, same).holds
+    check = judge_since(file, before, moved)
+    assert not check.holds and check.change is not None and check.change.hypothesis.kind == "focus"
+    assert check.change.amounts == pytest.approx([0.1], abs=4.0 * float(check.change.sigmas[0]))
 
 
 def test_frames_that_disagree_count_less() -> None:
