@@ -153,13 +153,14 @@ def table(rows: list[tuple[str, str, str, float]]) -> str:
     return "\n".join(lines)
 
 
-def print_sessions(seeds: int, images: list[int], moving: bool) -> None:
+def print_sessions(seeds: int, images: list[int], moving: bool, readout_s: float) -> None:
     """Print how many errors of small sessions lie within one and two stated sigmas."""
     print(
         "| images | boards seen | quantity | count | within 1 sigma | within 2 | rms |\n|--:|:--|:--|--:|--:|--:|--:|"
     )
     for count in images:
-        for (what, seen), errors in (moving_sessions if moving else sessions)(count, seeds).items():
+        found = moving_sessions(count, seeds, readout_s) if moving else sessions(count, seeds)
+        for (what, seen), errors in found.items():
             shares = " | ".join(f"{100 * np.mean(errors < k):.0f} %" for k in (1, 2))
             rms = np.sqrt(np.mean(errors**2))
             print(f"| {count} | {seen} | {what} | {len(errors)} | {shares} | {rms:.2f} |", flush=True)
@@ -174,10 +175,11 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="results so far; new laboratories are added")
     parser.add_argument("--sessions", type=int, metavar="SEEDS", help="instead, small simulated sessions")
     parser.add_argument("--moving", action="store_true", help="of boards that move before cameras without a trigger")
+    parser.add_argument("--readout", type=float, default=0.0, help="s; and images that are read row by row")
     parser.add_argument("--images", default=",".join(map(str, IMAGES)), help="of these sessions")
     args = parser.parse_args()
     if args.sessions:
-        print_sessions(args.sessions, [int(n) for n in args.images.split(",")], args.moving)
+        print_sessions(args.sessions, [int(n) for n in args.images.split(",")], args.moving, args.readout)
         return
     known = json.loads(args.json.read_text()) if args.json and args.json.is_file() else {}
     for seed in range(*map(int, args.labs.split(":"))):

@@ -143,7 +143,8 @@ def _better(found: Sequence[ModelOutcome], again: Sequence[ModelOutcome]) -> boo
         return False  # The standard error of a difference needs two images.
     if len(pairs) == 1:
         return choose(pairs[0], MIN_SIGMAS).name == "again"
-    return HeldOut.of(pairs).chosen() == "again"
+    evidence = HeldOut.of(pairs)
+    return bool(evidence.names) and evidence.chosen() == "again"
 
 
 def _result(

@@ -1,7 +1,7 @@
 """Boards that move before cameras without a common trigger: how far off is the rig, in stated sigmas?
 
 Neighbouring frames err alike, as the board goes on the same way for a while: each camera lags by a time of its own, and
-by a little more in every frame.
+by a little more in every frame, and may read its image row by row.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import numpy as np
 from helpers.calibration_scenes import BOARD, SIZE, lens
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.core.arrays import FloatArray
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.geometry.rigid3 import Rigid3
@@ -27,6 +28,8 @@ LAG_S, JITTER_S = 0.012, 0.003
 PERIODS_S = (1.5, 6.0)
 """Of the swings that a motion is made of."""
 SWINGS = 3
+READ_ROUNDS = 3
+"""A row says when its corner is seen, and that where it is."""
 BASELINES_MM = "baselines, mm"
 MIDDLE, REACH = np.array([0.0, 0.0, 600.0, 0.0, 0.0, 0.0]), np.array([60.0, 45.0, 90.0, 0.3, 0.3, 0.6])
 """Of a board's middle (mm) and of its turns (rad), and how far each swings."""
@@ -52,7 +55,23 @@ class Motion:
         return Rigid3(turn, place[:3] - turn @ BOARD.points().mean(axis=0))
 
 
-def moving_session(frames: int, cameras: int, rng: np.random.Generator) -> dict[str, list[float]]:
+def read_by_rows(
+    camera: Camera, mount: Rigid3, motion: Motion, times_s: tuple[float, float], pixels: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return where the corners are, and whether, when the rows that show them are read: `times_s` are when the middle
+    row is, and how long all take."""
+    middle_s, readout_s = times_s
+    shown = np.ones(len(pixels), dtype=bool)
+    for _ in range(READ_ROUNDS):
+        when = middle_s + readout_s * (pixels[:, 1] - 0.5 * (SIZE[1] - 1.0)) / SIZE[1]
+        corners = zip(when.tolist(), BOARD.points(), strict=True)
+        pixels, shown = camera.project(np.array([(mount @ motion.at(t)).apply(corner) for t, corner in corners]))
+    return pixels, shown
+
+
+def moving_session(
+    frames: int, cameras: int, rng: np.random.Generator, readout_s: float = 0.0
+) -> dict[str, list[float]]:
     """Return the errors of the baselines, mounts and lags of a rig of so many cameras, in stated sigmas, and those of
     the baselines in mm."""
     chosen = dict(list(CAMERAS.items())[:cameras])
@@ -60,8 +79,10 @@ def moving_session(frames: int, cameras: int, rng: np.random.Generator) -> dict[
     lag = {name: rng.uniform(-LAG_S, LAG_S) for name in chosen}
     for k in range(frames):
         for name, (camera, mount) in chosen.items():
-            pose = motion.at(k / FRAMES_PER_S + lag[name] + JITTER_S * rng.normal())
-            pixels, valid = camera.project((mount @ pose).apply(BOARD.points()))
+            time_s = k / FRAMES_PER_S + lag[name] + JITTER_S * rng.normal()
+            pixels, valid = camera.project((mount @ motion.at(time_s)).apply(BOARD.points()))
+            if readout_s:
+                pixels, valid = read_by_rows(camera, mount, motion, (time_s, readout_s), pixels)
             seen = valid & camera.on_image(pixels)
             exact = pixels[seen] + CORNERS_PX * rng.normal(size=(int(seen.sum()), 2))
             pixels = np.clip(exact, -0.5, np.array(SIZE) - 0.5)
@@ -82,16 +103,18 @@ def moving_session(frames: int, cameras: int, rng: np.random.Generator) -> dict[
         mounts += (np.concatenate([turned, moved]) / rig.sigmas[rig.mount(k)]).tolist()
     first = lag[next(iter(chosen))]
     late = [(own.frames - FRAMES_PER_S * (lag[name] - first)) / own.sigma for name, own in rig.lags.items()]
-    return {"baselines": off, "mounts": mounts, "lags": late, BASELINES_MM: mm}
+    read = [(own.frames - FRAMES_PER_S * readout_s) / own.sigma for own in rig.readouts.values()]
+    return {"readouts": read, "baselines": off, "mounts": mounts, "lags": late, BASELINES_MM: mm}
 
 
-def moving_sessions(frames: int, seeds: int) -> dict[tuple[str, str], FloatArray]:
-    """Return the errors in stated sigmas of rigs of two and three cameras with so many frames, by quantity."""
+def moving_sessions(frames: int, seeds: int, readout_s: float = 0.0) -> dict[tuple[str, str], FloatArray]:
+    """Return the errors in stated sigmas of rigs of two and three cameras with so many frames, by quantity; the images
+    are read in `readout_s`."""
     errors: dict[tuple[str, str], list[float]] = defaultdict(list)
     for cameras in (2, 3):
         for seed in range(seeds):
             try:
-                found = moving_session(frames, cameras, np.random.default_rng([seed, frames, cameras]))
+                found = moving_session(frames, cameras, np.random.default_rng([seed, frames, cameras]), readout_s)
             except RigkitError as error:
                 print(f"{frames} frames, {cameras} cameras: {error}", flush=True)
                 continue

@@ -43,9 +43,10 @@ def rig_of(
     time: Callable[[int], float] = float,
     name: Callable[[int], str] = str,
     noise_px: float = NOISE_PX,
+    readout: float = 0.0,
 ) -> RigCalibration:
     """Return a rig whose second camera sees all that much of a frame's time later, give or take `jitter`; frame k is of
-    the `time` and has the `name` that these return."""
+    the `time` and has the `name` that these return, and takes the `readout` to be read."""
     rng = np.random.default_rng(seed)
     cameras = {"left": (Rigid3.identity(), 0.0), "right": (MOUNT, lag)}
     views: dict[str, list[tuple[str, BoardView]]] = {name: [] for name in cameras}
@@ -53,6 +54,10 @@ def rig_of(
         for side, (mount, late) in cameras.items():
             late = late + jitter * rng.normal() if late else late
             pixels, _ = lens("reg").project((mount @ pose(time(k) + late, seed)).apply(BOARD.points()))
+            for _ in range(3 if readout else 0):
+                read = time(k) + late + readout * (pixels[:, 1] - 0.5 * (SIZE[1] - 1.0)) / SIZE[1]
+                corners = zip(read.tolist(), BOARD.points(), strict=True)
+                pixels, _ = lens("reg").project(np.array([(mount @ pose(t, seed)).apply(x) for t, x in corners]))
             seen = lens("reg").on_image(pixels)
             noisy = np.clip(pixels[seen] + noise_px * rng.normal(size=(int(seen.sum()), 2)), 0.0, np.array(SIZE) - 1.0)
             view = BoardView(f"{side}{k}", BOARD, BOARD.grid()[seen], noisy, np.full(len(noisy), noise_px))
@@ -92,9 +97,24 @@ def test_pictures_have_times_of_their_own() -> None:
     assert abs(off_mm(free)[0]) < 3.0 * off_mm(free)[1]
 
 
+def test_images_are_read_row_by_row(tmp_path: Path) -> None:
+    """Without that the baseline is 0.8 mm off, 16 of the standard deviations."""
+    rig = rig_of(0.05, 0, readout=0.05, time=lambda k: 0.5 * k)
+    assert list(rig.readouts) == ["left", "right"]
+    for found in rig.readouts.values():
+        assert abs(found.frames - 0.1) < 3.0 * found.sigma < 0.01
+    off, sigma = off_mm(rig)
+    assert abs(off) < 3.0 * sigma < 0.2
+    assert any("row by row" in printed.message for printed in rig.verdicts)
+    (tmp_path / "rig.json").write_text(rig_text(rig))
+    cameras = json.loads((tmp_path / "rig.json").read_text())["cameras"]
+    assert [camera["readout"]["frames"] for camera in cameras] == [own.frames for own in rig.readouts.values()]
+    assert list(load_saved_rig(tmp_path / "rig.json").cameras) == ["left", "right"]
+
+
 def test_cameras_of_one_moment_have_no_lag() -> None:
     rigs = [rig_of(0.0, seed) for seed in range(3)]
-    assert not any(rig.lags for rig in rigs)
+    assert not any(rig.lags or rig.readouts for rig in rigs)
     assert max(abs(off / sigma) for off, sigma in map(off_mm, rigs)) < 3.0
 
 

@@ -15,12 +15,14 @@ from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.certainty.between_models import between_rig_models
 from rigkit.calibration.rig.certainty.displaced import lens_modes
 from rigkit.calibration.rig.certainty.frame_covariance import frame_covariance
+from rigkit.calibration.rig.certainty.readouts import readout_error
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
 from rigkit.calibration.rig.solving.flatness import shape_error
 from rigkit.calibration.rig.solving.lags import lags_of
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.calibration.rig.solving.pose_jacobians import pose_jacobians
+from rigkit.calibration.rig.solving.shutters import readouts_of
 from rigkit.calibration.rig.solving.state import RigState
 from rigkit.calibration.solving.clustered import Clustered, effective_freedom
 from rigkit.cameras.moving_pupil import PUPIL_TERMS, NearCamera, far_camera
@@ -44,6 +46,8 @@ def assemble_rig(
     beside = _error_of_held(joint, layout, normal.covariance[0])
     off = shape_error(observations, state, sigma * overdispersion)
     beside[: len(off), : len(off)] += np.outer(off, off)
+    by_readouts, readout_sigmas = readout_error(joint)
+    beside += by_readouts
     covariance = known.covariance
     beside += between_rig_models(joint, np.sqrt(np.diag(covariance + beside)))
     covariance += beside
@@ -75,7 +79,8 @@ def assemble_rig(
         departures=lens_modes(observations, joint.solution, far, reported),
         board_rigs=_board_rigs(joint, layout, boards, shapes, covariance, scale, known.clustered),
     )
-    return replace(rig, lags=lags_of(joint.views.names, state, rig.widening**2 * covariance, layout.lags)), far
+    lags = lags_of(joint.views.names, state, rig.widening**2 * covariance, layout.lags)
+    return replace(rig, lags=lags, readouts=readouts_of(joint.views.names, state, readout_sigmas)), far
 
 
 def _lenses_and_mounts(layout: Layout, state: RigState) -> IntArray:

@@ -132,7 +132,7 @@ def solve_jointly(views: RigViews, progress: Progress, known: KnownCameras | Non
         progress("rig", i, MAX_ROUNDS)
         _require_agreement(views, len(left_out), shared)
         observations, solution = _solved(views, mounts, sigma, known)
-        solution = _with_lags(views, observations, solution, sigma)
+        observations, solution = _with_lags(views, observations, solution, sigma)
         cost = cost_of_sharing(observations, solution, seen)
         typical = typical_cost(cost, sigma)
         worse = bad_ones(cost, typical)
@@ -196,8 +196,8 @@ def _solved(
 
 def _with_lags(
     views: RigViews, observations: RigObservations, solution: Solution[RigState], sigma: float
-) -> Solution[RigState]:
-    """Return the solution with the lags of cameras if they are significant."""
+) -> tuple[RigObservations, Solution[RigState]]:
+    """Return the observations and the solution, with the lags of cameras if they are significant."""
     times = times_of(observations.keys, {entry.key: entry.frame for own in views.seen for entry in own.values()})
     return with_lags(observations, solution, sigma, times, frame_numbers(views, observations))
 

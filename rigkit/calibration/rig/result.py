@@ -14,6 +14,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.calibration.rig.solving.moments import Lag
+from rigkit.calibration.rig.solving.shutters import Readout
 from rigkit.calibration.solving.clustered import effective_freedom, widening
 from rigkit.calibration.solving.solver import Convergence
 from rigkit.cameras.base import Camera
@@ -74,6 +75,7 @@ class RigCalibration:
     departures : model inadequacy of each camera's lens, with the error of the rest of the rig; empty if unknown.
     pupils : moving pupils by camera name; their `with_frame` has the rows of `covariance`.
     lags : by name, of all cameras but the first; empty if they have a common trigger or the boards did not move.
+    readouts : by name, of all cameras, where moving boards show that images are read row by row; else empty.
     """
 
     cameras: tuple[RigCamera, ...]
@@ -94,6 +96,7 @@ class RigCalibration:
     departures: tuple[LensModes, ...] = ()
     pupils: Mapping[str, SolvedPupil] = field(default_factory=dict)
     lags: Mapping[str, Lag] = field(default_factory=dict)
+    readouts: Mapping[str, Readout] = field(default_factory=dict)
 
     _repr_html_ = drawn
 

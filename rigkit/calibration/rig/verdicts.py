@@ -43,8 +43,15 @@ def diagnose_rig(
         for camera in rig.cameras
         for note in modelled_pupil(camera.calibration)
     ]
-    lags = [Finding.good(f"{'; '.join(lag_words(rig))}: boards are taken where they were then")] if rig.lags else []
-    return (headline, *pupils, *lags, *others)
+    return (headline, *pupils, *_lags(rig), *others)
+
+
+def _lags(rig: RigCalibration) -> list[Finding]:
+    """Return what was estimated of the lags and readouts, as a finding."""
+    if not rig.lags:
+        return []
+    words = [*lag_words(rig), *_readout_words(rig)]
+    return [Finding.good(f"{'; '.join(words)}: boards are taken where they were then")]
 
 
 def lag_words(rig: RigCalibration) -> list[str]:
@@ -57,6 +64,13 @@ def lag_words(rig: RigCalibration) -> list[str]:
             f"frames {when} '{first}' (they vary by {lag.scatter:.3f})"
         )
     return out
+
+
+def _readout_words(rig: RigCalibration) -> list[str]:
+    return [
+        f"camera '{name}' takes {own.frames:.3f} +- {own.sigma:.3f} of that time to read an image, row by row"
+        for name, own in rig.readouts.items()
+    ]
 
 
 def _not_converged(rig: RigCalibration) -> list[Finding]:

@@ -148,6 +148,7 @@ def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
                 **({} if own is None else {"departures": _rows_of(own)}),
                 **({} if c.name not in rig.pupils else {"pupil": pupil_to_json(rig.pupils[c.name])}),
                 **({} if c.name not in rig.lags else {"lag": asdict(rig.lags[c.name])}),
+                **({} if c.name not in rig.readouts else {"readout": asdict(rig.readouts[c.name])}),
             }
             for c, own in zip_longest(rig.cameras, rig.departures)
         ],
@@ -180,7 +181,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
     pupils: dict[str, SolvedPupil] = {}
     with damage_named(path):
         for entry in data["cameras"]:
-            if set(entry) | {"outline_px", "departures", "pupil", "lag"} != RIG_CAMERA_KEYS:
+            if set(entry) | {"outline_px", "departures", "pupil", "lag", "readout"} != RIG_CAMERA_KEYS:
                 raise InputError(
                     f"'{path}': a camera must have the keys {', '.join(sorted(RIG_CAMERA_KEYS))}, no others"
                 )

@@ -151,6 +151,11 @@ RIG_FILE = file(
                     "by how much it takes its pictures after the first, the standard deviation of that, and by how "
                     "much its pictures lag differently, in the usual time between two frames",
                 ),
+                "readout?": described(
+                    obj({"frames": NUMBER, "sigma": NUMBER}),
+                    "how long it takes from the first row of an image to the last, in the usual time between two "
+                    "frames, and the standard deviation of that",
+                ),
             },
             "the first is the rig's frame",
             min_items=1,

@@ -13,6 +13,7 @@ import numpy as np
 from rigkit.calibration.certainty.uncertainty import step_to_lens
 from rigkit.calibration.choosing.between_models import same_model, spread_rays
 from rigkit.calibration.rig.joint import JointRig
+from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.calibration.rig.solving.solver import solve_rig
 from rigkit.calibration.rig.solving.state import RigState
 from rigkit.calibration.solving.poses import steps_between
@@ -91,13 +92,21 @@ def _global_step(
     """Return the change of the globals (G,) from the state `here` to the state `there`."""
     layout = here.layout(joint.observations)
     steps, turns = _turns(here, there, rays, sigmas, joint)
-    back = _turned(there, [turn.T for turn in turns])
-    global_step = np.zeros(layout.count)
+    global_step = globals_between(layout, here, _turned(there, [turn.T for turn in turns]))
     for lens, step in zip(layout.cameras, steps, strict=True):
         global_step[lens] = step
+    return global_step
+
+
+def globals_between(layout: Layout, here: RigState, there: RigState) -> FloatArray:
+    """Return how far the globals (G,) must move for the rig to be as it is there; lenses of another model stay."""
+    global_step = np.zeros(layout.count)
+    for lens, camera, other in zip(layout.cameras, here.cameras, there.cameras, strict=True):
+        if camera.parameters.size == other.parameters.size:
+            global_step[lens] = other.parameters - camera.parameters
     for runs, before, after in (
-        (layout.mounts, (here.mount_rotation, here.mount_mm), (back.mount_rotation, back.mount_mm)),
-        (layout.boards, (here.board_rotation, here.board_mm), (back.board_rotation, back.board_mm)),
+        (layout.mounts, (here.mount_rotation, here.mount_mm), (there.mount_rotation, there.mount_mm)),
+        (layout.boards, (here.board_rotation, here.board_mm), (there.board_rotation, there.board_mm)),
     ):
         moved = steps_between(before, after)
         for k, run in enumerate(runs):

@@ -23,6 +23,7 @@ from rigkit.calibration.rig.certainty.frame_covariance import frame_covariance, 
 from rigkit.calibration.rig.solving.flatness import CHANCE_SIGMAS, STEP_DAMPING
 from rigkit.calibration.rig.solving.moments import Lag, Moments, ways_through
 from rigkit.calibration.rig.solving.pose_jacobians import at_own_moment
+from rigkit.calibration.rig.solving.shutters import read_on, readout_steps
 from rigkit.calibration.rig.solving.solver import rig_normal, solve_rig
 from rigkit.calibration.rig.solving.state import Key, RigObservations, RigState
 from rigkit.calibration.solving.clustered import LARGE_FREEDOM
@@ -59,33 +60,68 @@ def times_of(keys: Sequence[Key], frames: Mapping[Key, str]) -> FloatArray:
 
 def with_lags(
     observations: RigObservations, solution: Solution[RigState], sigma_px: float, times: FloatArray, frames: IntArray
-) -> Solution[RigState]:
-    """Return the solution with lags and times of pictures, or the same where the frames do not surely tell of lags.
+) -> tuple[RigObservations, Solution[RigState]]:
+    """Return the solution with lags and times of pictures, and the observations as rolling shutters leave them; or the
+    same where the frames do not surely tell of lags.
 
     `times` (F,) of the keys, `sigma_px` as for `solve_rig`, `frames` as for `frame_covariance`.
     """
     cameras, keys = len(observations.cameras), len(observations.keys)
     none = np.zeros((cameras, keys))
-    start = Moments(none[:, 0], np.zeros((keys, 0, 6)), none, np.full_like(none, np.inf))
+    start = Moments(none[:, 0], np.zeros((keys, 0, 6)), none, np.full_like(none, np.inf), none[:, 0])
     start = _through(start, solution.state, observations, times)
     if cameras < 2 or not start.ways.any() or not _asked(observations, solution.state, start, sigma_px):
-        return solution
+        return observations, solution
     lagging = replace(solution, state=replace(solution.state, moments=start))
     for own_times in (False, True):
         for _ in range(MAX_ROUNDS):
-            state, before = lagging.state, lagging.normal.cost
-            moments = _through(state.moments or start, state, observations, times)
-            if own_times:
-                sigma = residual_sigma(observations, lagging, sigma_px)
-                moments = _with_own_times(replace(state, moments=moments), moments, observations, sigma)
-            lagging = solve_rig(observations, replace(state, moments=moments), sigma_px, FROM_OPTIMUM)
+            before = lagging.normal.cost
+            lagging = _solved_again(observations, lagging, sigma_px, times, own_times=own_times)
             if abs(before - lagging.normal.cost) < SETTLED * before:
                 break
         if not own_times and _chance(observations, lagging, sigma_px, frames) > CHANCE:
             sigma = residual_sigma(observations, solution, sigma_px)
             if _chance_of_scatter(solution.state, observations, start, sigma) > CHANCE:
-                return solution
-    return lagging
+                return observations, solution
+    return _with_readouts(observations, lagging, sigma_px, times)
+
+
+def _solved_again(
+    observations: RigObservations, lagging: Solution[RigState], sigma_px: float, times: FloatArray, *, own_times: bool
+) -> Solution[RigState]:
+    """Return the solution with ways through the poses that have come out, and times of pictures by them."""
+    state = lagging.state
+    assert state.moments is not None
+    moments = _through(state.moments, state, observations, times)
+    if own_times:
+        sigma = residual_sigma(observations, lagging, sigma_px)
+        moments = _with_own_times(replace(state, moments=moments), moments, observations, sigma)
+    return solve_rig(observations, replace(state, moments=moments), sigma_px, FROM_OPTIMUM)
+
+
+def _with_readouts(
+    observations: RigObservations, lagging: Solution[RigState], sigma_px: float, times: FloatArray
+) -> tuple[RigObservations, Solution[RigState]]:
+    """Return observations and solution with the readouts of rolling shutters, or the same where no camera surely has
+    one."""
+    # Imported here: scipy is slow to import, and few rigs ask.
+    from scipy.special import stdtr
+
+    step, sigma, freedom = readout_steps(observations, lagging.state)
+    size = np.abs(step) / np.where(sigma > 0.0, sigma, np.inf)
+    if 2.0 * float(stdtr(np.maximum(freedom, 1.0), -size).min()) * len(step) > CHANCE:
+        return observations, lagging
+    for _ in range(MAX_ROUNDS):
+        state, before = lagging.state, lagging.normal.cost
+        assert state.moments is not None
+        observations = read_on(observations, state, step)
+        moments = replace(state.moments, readouts=state.moments.readouts + step)
+        lagging = replace(lagging, state=replace(state, moments=moments))
+        lagging = _solved_again(observations, lagging, sigma_px, times, own_times=True)
+        step = readout_steps(observations, lagging.state)[0]
+        if abs(before - lagging.normal.cost) < SETTLED * before:
+            break
+    return observations, lagging
 
 
 def lags_of(names: Sequence[str], state: RigState, covariance: FloatArray, lags: slice) -> dict[str, Lag]:

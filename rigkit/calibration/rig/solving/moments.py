@@ -48,12 +48,14 @@ class Moments:
     ways : (F, K, 6) of the targets, in the rig.
     own : (n, F) by how much more a camera lags in the frame of a key.
     information : (n, F) px^2 a squared unit, of `own` about zero; infinite where that is zero.
+    readouts : (n,) how long the cameras take to read an image (`shutters`).
     """
 
     lags: FloatArray
     ways: FloatArray
     own: FloatArray
     information: FloatArray
+    readouts: FloatArray
 
     def moved(self, step: FloatArray) -> Moments:
         """Return the moments after a step (n - 1,) of the lags."""

@@ -1,0 +1,100 @@
+"""Rolling shutters: a camera reads its image row by row, and boards go on meanwhile.
+
+A corner that lies some part of the image's height below its middle is seen by this part of the camera's `readout` after
+the picture's time, and its board has gone on by as much (`moments`). A readout shows in residuals that no pose of a
+view explains. Corners are then taken where they were at the picture's time.
+
+References: C. Geyer, M. Meingast, S. Sastry, "Geometric models of rolling-shutter cameras", OMNIVIS 2005. L. Oth,
+P. Furgale, L. Kneip, R. Siegwart, "Rolling shutter camera calibration", CVPR 2013.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.calibration.rig.solving.pose_jacobians import gone_in_cam
+from rigkit.calibration.rig.solving.state import RigObservations, RigState
+from rigkit.core.arrays import FloatArray
+from rigkit.geometry.rotation import skew
+
+POSE_RIDGE = 1e-9
+"""As a part of the largest information: keeps the pose of a view that shows hardly a corner."""
+
+
+@dataclass(frozen=True, slots=True)
+class Readout:
+    """How long a camera takes from the first row of an image to the last, and the standard deviation of that, in units
+    of the usual time between two frames."""
+
+    frames: float
+    sigma: float
+
+
+def read_on(observations: RigObservations, state: RigState, steps: FloatArray) -> RigObservations:
+    """Return the observations with the corners taken where they are if the readouts of the n cameras are longer by
+    `steps` (n,)."""
+    moved = [
+        replace(own, pixels=own.pixels - step * _while_read(observations, state, c)[0])
+        for c, (own, step) in enumerate(zip(observations.cameras, steps.tolist(), strict=True))
+    ]
+    return replace(observations, cameras=tuple(moved))
+
+
+def readout_steps(observations: RigObservations, state: RigState) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return by how much longer the readouts of the n cameras are than the corners are taken for, their standard
+    deviations with views as what repeats, all but the views' poses as it is, and the degrees of freedom of these, (n,)
+    each; zeros where hardly more than one view tells."""
+    found = [_step(*_told(observations, state, c)) for c in range(len(state.cameras))]
+    step, sigma, freedom = np.array(found).T
+    return step, sigma, freedom
+
+
+def readouts_of(names: Sequence[str], state: RigState, sigmas: FloatArray) -> dict[str, Readout]:
+    """Return the readouts of the cameras by their `names`, where they were solved for, with their `sigmas` (n,)."""
+    if state.moments is None or not state.moments.readouts.any():
+        return {}
+    found = zip(state.moments.readouts.tolist(), sigmas.tolist(), strict=True)
+    return {name: Readout(*own) for name, own in zip(names, found, strict=True)}
+
+
+def _step(score: FloatArray, information: FloatArray) -> tuple[float, float, float]:
+    total = float(information.sum())
+    share = information / total if total > 0.0 else np.ones(1)
+    # Views of much leverage count for several, and have pulled the readout to themselves (as in `clustered`).
+    freedom = 1.0 / float((share**2).sum()) - 1.0
+    if freedom < 1.0:
+        return 0.0, 0.0, freedom
+    step = float(score.sum()) / total
+    return step, float(np.linalg.norm((score - step * information) / (1.0 - share))) / total, freedom
+
+
+def _told(observations: RigObservations, state: RigState, c: int) -> tuple[FloatArray, FloatArray]:
+    """Return score and information (V,) of every view of camera `c` on its readout, the view's pose eliminated."""
+    motion, by_pose, residuals = _while_read(observations, state, c)
+    weight = observations.weights[c][:, :, None]
+    views = len(weight)
+    motion, residuals = ((weight * part).reshape(views, -1) for part in (motion, residuals))
+    by_pose = (weight[..., None] * by_pose).reshape(views, -1, 6)
+    back = np.swapaxes(by_pose, -1, -2)
+    pose = back @ by_pose
+    largest = np.maximum(np.einsum("vii->vi", pose).max(axis=1), 1.0)
+    own = np.linalg.solve(pose + POSE_RIDGE * largest[:, None, None] * np.eye(6), back @ motion[..., None])
+    motion = motion - (by_pose @ own)[..., 0]
+    return (motion * residuals).sum(axis=1), (motion**2).sum(axis=1)
+
+
+def _while_read(observations: RigObservations, state: RigState, c: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how far the corners of camera `c` have gone when they are read, px a unit of readout (V, C, 2), their
+    derivatives by the pose of their view (V, C, 2, 6), and residuals (V, C, 2); zero where a corner is not used."""
+    own, alone = observations.cameras[c], state.of_camera(c, observations)
+    points, lever = alone.points_in_cam(own)
+    pixels, valid, by_point, _ = alone.camera.project_with_jacobians(points)
+    used = (valid & (observations.weights[c] > 0.0))[..., None]
+    by_pose = np.where(used[..., None], np.concatenate([by_point @ -skew(lever), by_point], axis=-1), 0.0)
+    speed = np.einsum("vcij,vj->vci", by_pose, gone_in_cam(observations, state, c, alone.translation_mm))
+    height = alone.camera.size_px[1]
+    below = (own.pixels[..., 1:] - 0.5 * (height - 1.0)) / height
+    return speed * below, by_pose, np.where(used, own.pixels - pixels, 0.0)
