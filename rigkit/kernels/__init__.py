@@ -1,8 +1,8 @@
-"""The compiled kernels: loops that numpy is slow at, in plain C, one library called through ctypes.
+"""The compiled kernels: loops that are slow in numpy, in plain C, as one library called through ctypes.
 
-api.h declares what Python calls, once for both sides; `calls` checks every argument against it. The library is built
-when the package is installed (setup.py) and is part of it: without it, detection and relative pose raise
-InstallationError. The functions in numpy that the kernels are compared with are in tests/kernels/reference.
+api.h declares the functions once for both sides; `calls` checks every argument against it. The library is part of the
+package and is built when that is installed (setup.py); without it, detection and relative pose raise InstallationError.
+Reference implementations in numpy are in tests/kernels/reference.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ class Kernels:
 
 @functools.cache
 def kernels() -> Kernels:
-    """Return the kernels; raises InstallationError where they are missing, damaged or built from other sources."""
+    """Return the kernels; raises InstallationError if they are missing, damaged or built from other sources."""
     return _loaded(Kernels)
 
 
 def _loaded(load: Callable[[Path], Library]) -> Library:
-    """Return what `load` makes of the library; raises InstallationError as `kernels` does."""
+    """Return the library as loaded by `load`; raises InstallationError as `kernels`."""
     path = FOLDER / library_name()
     wrong = mismatch(path)
     if wrong is not None:
@@ -56,9 +56,9 @@ def _loaded(load: Callable[[Path], Library]) -> Library:
 
 
 def about() -> str:
-    """Return what `rigkit --version` says of the kernels: the hash of their sources, and the instruction set."""
+    """Return the hash of the kernels' sources and their instruction set, for `rigkit --version`."""
     try:
-        # Without the checks of arrays, which import numpy: this takes no array.
+        # Not through `Kernels`, which imports numpy.
         instruction_set = _loaded(lambda path: ctypes.CDLL(str(path))).instruction_set
     except InstallationError as error:
         return str(error)
@@ -67,7 +67,7 @@ def about() -> str:
 
 
 def _remedy() -> str:
-    """Return what to type."""
+    """Return how to install the kernels."""
     checkout = FOLDER.parents[1]
     if (checkout / "setup.py").is_file():
         install = f"'{sys.executable}' -m pip install --no-deps -e '{checkout}'"

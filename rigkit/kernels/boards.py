@@ -1,4 +1,4 @@
-"""The kernels in board_places.c, boards.c and board_changes.c: the picture of a whole board, and what moves corners."""
+"""The kernels in board_places.c, boards.c and board_changes.c: the image model of a whole board and its derivatives."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Picture = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Blocks:
-    """What a picture changes by with each of N blocks of unknowns, which is nothing beyond a box.
+    """Derivatives of an image by N blocks of unknowns, which are zero outside a box each.
 
     Attributes
     ----------
-    boxes : (N, 4) the first column and row of each, and the last ones; without pixels where these are before the first.
-    starts : (N,) where in `data` the changes by its first unknown begin, row by row; those of others follow.
-    each : unknowns of every block.
-    data : the changes.
+    boxes : (N, 4) first column and row, last column and row; empty if the last is before the first.
+    starts : (N,) index in `data` of the derivatives by the block's first unknown, row by row; those by others follow.
+    each : number of unknowns per block.
+    data : the derivatives.
     """
 
     boxes: IntArray
@@ -34,7 +34,7 @@ class Blocks:
 
     @staticmethod
     def empty(boxes: IntArray, each: int) -> Blocks:
-        """Return blocks with room for the changes in the `boxes`."""
+        """Return blocks with uninitialised derivatives in the `boxes`."""
         sizes = areas(boxes)
         return Blocks(boxes, each * (np.cumsum(sizes) - sizes), each, np.empty(each * int(sizes.sum()), np.float32))
 
@@ -46,13 +46,13 @@ def areas(boxes: IntArray) -> IntArray:
 
 
 def board_places(coefficients: FloatArray, box: tuple[int, int, int, int], around: float) -> FloatArray:
-    """Return the places (H, W, 2) along columns and rows, from the first node, NaN where no square is seen.
+    """Return the board positions (H, W, 2) of pixels along columns and rows, from the first node; NaN off the board.
 
     Parameters
     ----------
     coefficients : (R + 2, C + 2, 2) of a cubic B-spline through the pixels of R x C nodes.
-    box : first column and row of the picture in the image, its width and height.
-    around : squares are looked for so far beside the box of their corners, in sides of that.
+    box : first column and row in the image, width and height.
+    around : margin around the bounding box of a square's corners in which it is sought, in sides of the box.
     """
     rows, columns = coefficients.shape[0] - 2, coefficients.shape[1] - 2
     return np.asarray(kernels().board_places(coefficients, rows, columns, *box, around))
@@ -61,11 +61,11 @@ def board_places(coefficients: FloatArray, box: tuple[int, int, int, int], aroun
 def board_picture(
     places: FloatArray, size: tuple[int, int], ends: FloatArray, paper: FloatArray, sharp_px: float, planes: int = 11
 ) -> Picture:
-    """Return the planes (11, H, W) of the picture of a board of R x C corners, `size`, blurred by `sharp_px` (api.h:
-    BOARD_PLANES); or, of these `planes`, 1, the picture alone.
+    """Return the model image of a board of R x C corners, `size`, blurred by `sharp_px`, and its derivatives as planes
+    (11, H, W) (api.h: BOARD_PLANES); with `planes` 1 the image only.
 
-    `ends` (2, 2): where, in squares, it begins and ends along columns and along rows; `paper` (4,) what is beyond each
-    of these, where squares are 1 and -1.
+    `ends` (2, 2): first and last end along columns and along rows, in squares; `paper` (4,) brightness beyond each of
+    these, where that of squares is 1 and -1.
     """
     return np.asarray(kernels().board_picture(places, *size, ends, paper, sharp_px, planes))
 
@@ -73,23 +73,23 @@ def board_picture(
 def sheet_places(
     places: FloatArray, first: FloatArray, each: int, corners: BoolArray, reach: FloatArray
 ) -> tuple[Picture, BoolArray]:
-    """Return columns and rows (2, H, W) of `places` (H, W, 2) on a sheet of `each` x `each` samples a square that
-    begins at `first` (2,), and (2, H, W) which are nearest to one of the `corners` (2, R, C) and within `reach` (2,) of
-    it along columns and rows."""
+    """Return columns and rows (2, H, W) of board positions `places` (H, W, 2) on a sheet that begins at `first` (2,)
+    and has `each` x `each` samples per square, and which (2, H, W) are nearest to one of the `corners` (2, R, C) and
+    within `reach` (2,) of it along columns and rows."""
     found: tuple[Picture, BoolArray] = kernels().sheet_places(places, corners, first, each, reach)
     return found
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Shares:
-    """How much of the nodes of a grid there is at each pixel.
+    """Interpolation weights of the nodes of a grid at each pixel.
 
     Attributes
     ----------
     size : rows and columns of the grid.
-    nodes : (H, W, 2) the first node along columns and rows of which there is some.
-    weights : (H, W, 2, 4) of four nodes from that.
-    boxes : (R * C, 4) of the pixels with some of each node, and a margin.
+    nodes : (H, W, 2) first node along columns and rows with a weight.
+    weights : (H, W, 2, 4) of four nodes from the first.
+    boxes : (R * C, 4) bounding boxes of the pixels with a weight of each node, with a margin.
     """
 
     size: tuple[int, int]
@@ -101,23 +101,22 @@ class Shares:
     def at(
         places: FloatArray, size: tuple[int, int], *, spacing: float, beyond: float, cubic: bool, margin: int
     ) -> Shares:
-        """Return those at `places` (H, W, 2), in squares, of nodes that are `spacing` squares apart.
+        """Return the weights at `places` (H, W, 2), in squares, of nodes that are `spacing` squares apart.
 
-        Between nodes the shares are those of a cubic, or of a straight line; up to `beyond` squares beyond the nodes
-        the last two go on on a straight line.
+        Interpolation is `cubic` or linear; up to `beyond` squares beyond the nodes it is extrapolated linearly.
         """
         return Shares(size, *kernels().board_shares(places, *size, spacing, beyond, cubic, margin))
 
     def interpolated(self, values: FloatArray) -> Picture:
-        """Return `values` (K, R, C) at the nodes as pictures (K, H, W)."""
+        """Return `values` (K, R, C) at the nodes, interpolated at the pixels (K, H, W)."""
         return np.asarray(kernels().board_values(self.nodes, self.weights, values))
 
 
 def move_blocks(shares: Shares, slopes: Picture, weight: Picture, taps: Picture) -> Blocks:
-    """Return how a blurred picture changes as each of R x C corners moves along u and v, times `weight` (H, W).
+    """Return the derivatives of a blurred image by moves of R x C corners along u and v, times `weight` (H, W).
 
-    `slopes` (2, H, W) are those of the sharp picture along u and v, `taps` (2 K + 1,) the blur, for which the boxes of
-    `shares` have their margin.
+    `slopes` (2, H, W) are the derivatives of the sharp image along u and v, `taps` (2 K + 1,) the blur kernel, which
+    the margin of the boxes of `shares` accommodates.
     """
     blocks = Blocks.empty(shares.boxes, 2)
     room = int(areas(blocks.boxes).max(initial=1))
@@ -129,7 +128,8 @@ def move_blocks(shares: Shares, slopes: Picture, weight: Picture, taps: Picture)
 
 
 def share_blocks(shares: Shares, planes: Picture) -> Blocks:
-    """Return how a picture changes with values at nodes, that are interpolated and times `planes` (K, H, W)."""
+    """Return the derivatives of the products of `planes` (K, H, W) and interpolated values by the values at the
+    nodes."""
     blocks = Blocks.empty(shares.boxes, len(planes))
     room = int(areas(blocks.boxes).max(initial=1))
     kernels().share_blocks(
@@ -139,7 +139,7 @@ def share_blocks(shares: Shares, planes: Picture) -> Blocks:
 
 
 def block_products(groups: Sequence[Blocks], rest: Picture) -> tuple[FloatArray, FloatArray]:
-    """Return the products (U, U) of the changes by the unknowns of the groups, in order, and those with `rest`."""
+    """Return the normal matrix (U, U) of the unknowns of all groups, in order, and the products (U,) with `rest`."""
     boxes = np.concatenate([group.boxes for group in groups])
     before = np.cumsum([0, *(len(group.data) for group in groups)])
     starts = np.concatenate([group.starts + at for group, at in zip(groups, before, strict=False)])

@@ -1,6 +1,6 @@
-"""How the kernels are compiled, and the record that says what a library was built from.
+"""Compilation of the kernels, and the record of the sources that a library was built from.
 
-The standard library alone: setup.py and scripts/cross_compile.py run this file before rigkit is installed.
+It uses the standard library only: setup.py and scripts/cross_compile.py run this file before rigkit is installed.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ def sources(folder: Path) -> list[Path]:
 
 
 def source_hash(folder: Path) -> str:
-    """Return a hash of the C files and headers of `folder`, and of how they are compiled."""
+    """Return a hash of the C files and headers of `folder` and of FLAGS."""
     digest = hashlib.sha256(" ".join(FLAGS).encode())
-    # What begins with a dot is an editor's, and may link nowhere.
+    # Hidden files are those of editors, and may be broken links.
     for path in sorted([*sources(folder), *folder.glob("[!.]*.h")]):
-        # Line ends differ between systems and mean nothing.
+        # Independent of the line ends of the system.
         digest.update(path.name.encode() + b"\0" + path.read_bytes().replace(b"\r\n", b"\n"))
     return digest.hexdigest()[:16]
 
 
 def write_record(library: Path, folder: Path, compiler: str) -> Path:
-    """Write beside `library` what it was built from, the sources in `folder`, and its own hash; return that file."""
+    """Write the hashes of `library` and of its sources in `folder` to a file with its name; return the path."""
     record = {"sources": source_hash(folder), "library": _hash_of(library), "compiler": compiler}
     path = library.with_suffix(".json")
     path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
@@ -50,7 +50,7 @@ def write_record(library: Path, folder: Path, compiler: str) -> Path:
 
 
 def mismatch(library: Path) -> str | None:
-    """Return what is wrong with `library`, which lies beside its sources: None if it is whole and built from them."""
+    """Return what is wrong with `library`; None if it is intact and built from the sources in its folder."""
     if not library.is_file():
         return "are missing"
     try:

@@ -1,9 +1,9 @@
-"""Calls of the kernels as api.h declares them: sizes are read from arrays, results and scratch are made, and of every
-array type, shape and C-contiguity are checked.
+"""Calls of the kernels as declared in api.h: sizes are taken from arrays, results and scratch memory are allocated, and
+type, shape and C-contiguity of every array are checked.
 
-A detection makes sixty calls, some of functions that take ten microseconds: so each call is compiled once, with its
-checks as one expression. What that refuses is looked at again, array by array: what a kernel only reads is copied into
-the type and order that api.h says, and of all else is said what is wrong.
+A detection makes sixty calls, some of functions that take ten microseconds. Each call is therefore compiled once, with
+its checks as one expression. If that fails, arrays are checked one by one: read-only arrays are copied to the declared
+type and order, for others an error is raised.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from rigkit.core.arrays import GreyImage
 from rigkit.kernels.declarations import SCALARS, Declaration, Role, header
 
 STRUCTURES: dict[str, type[Struct]] = {}
-"""By their names in api.h; a structure stands there before those that it is part of."""
+"""By their names in api.h, where a structure precedes those that contain it."""
 
 NAMES_IN_SIZES: dict[str, Any] = dict(header().constants)
-"""What sizes of arrays may be made of, beside other arguments: the constants, and the kernels once they are loaded."""
+"""Names other than arguments in sizes of arrays: the constants, and the kernels once they are loaded."""
 
 FIRST_BYTE: Callable[[Any], ctypes.c_char] = ctypes.c_char.from_buffer
-"""Raises TypeError or ValueError for what is not contiguous, or read-only, or empty."""
+"""Raises TypeError or ValueError for an array that is not contiguous, read-only, or empty."""
 EMPTY = ctypes.c_double()
-"""What is passed for an empty array, which has no first value."""
+"""Passed for an empty array, which has no first value."""
 
 
 AnyStruct = TypeVar("AnyStruct", bound="Struct")
@@ -36,8 +36,8 @@ AnyStruct = TypeVar("AnyStruct", bound="Struct")
 def address(array: NDArray[Any]) -> int:
     """Return the address of the first value of a C-contiguous `array`, which must outlive its use.
 
-    Raises ValueError for another order in memory. `array.ctypes.data` takes four times as long, and a detection needs
-    two hundred addresses.
+    Raises ValueError for another order in memory. It takes a quarter of the time of `array.ctypes.data`; a detection
+    needs two hundred addresses.
     """
     try:
         return ctypes.addressof(FIRST_BYTE(array))
@@ -48,9 +48,9 @@ def address(array: NDArray[Any]) -> int:
 
 
 class _Call:
-    """How a function is called, or a structure made, from what Python gives: the parameters `names`.
+    """Code of a call, or of making a structure, from the parameters `names`.
 
-    The others follow from these: sizes of the arrays given, whether an image is of bytes, results and scratch.
+    The other parameters follow from these: sizes of the arrays, the type of an image, results and scratch memory.
     """
 
     def __init__(self, owner: str, declarations: list[Declaration], pointed: frozenset[str] = frozenset()) -> None:
@@ -61,7 +61,7 @@ class _Call:
         self._given = {name: array for name, array in self._arrays.items() if array.role is Role.GIVEN}
         self._made = {name: array for name, array in self._arrays.items() if array.role is not Role.GIVEN}
         numbers = {one.name for one in declarations if one.type == "int64_t" and one.array is None}
-        # The first array that has a number as a size tells it; the checks then hold the others against it.
+        # The first array with a size determines it; the checks compare those of the others.
         self._sizes: dict[str, str] = {}
         for name, array in self._given.items():
             for axis, size in enumerate(array.sizes):
@@ -72,15 +72,15 @@ class _Call:
         self.names = tuple(name for name in self._all if name not in self._sizes and name not in self._made)
 
     def compiled(self, target: Callable[..., Any], *, returns: bool = False) -> Callable[..., Any]:
-        """Return a function of the parameters `names`, in their order, that calls `target` with addresses for arrays.
+        """Return a function of the parameters `names`, in their order, that calls `target` with addresses of arrays.
 
-        It returns the results, alone or as a tuple, after what `target` returns where it `returns` something, and
-        raises TypeError where an array is not as declared. What sizes are made of must be loaded.
+        It returns the value of `target`, if that `returns` one, and the results, as a tuple if there are several. It
+        raises TypeError if an array is not as declared. NAMES_IN_SIZES must be complete.
         """
         images = [f"{name} = _image({name})" for name, array in self._given.items() if array.dtype is None]
         sizes = [f"{size} = {where}" for size, where in self._sizes.items()]
         tests = [f"{name}.shape == {array.shape}" for name, array in self._given.items()]
-        # A type is one object, but for those of another order of bytes.
+        # Types are singletons, except those of another byte order.
         tests += [_is_of(name, array.dtype) for name, array in self._given.items() if array.dtype is not None]
         ready = [f"{name} = _ready('{name}', {name}, {array.shape})" for name, array in self._given.items()]
         made = [f"{name} = _new({array.shape}, _{array.dtype})" for name, array in self._made.items()]
@@ -88,7 +88,7 @@ class _Call:
         checked = [self._passed(name, "_address({0})") for name in self._all]
         results = [name for name, array in self._made.items() if array.role is Role.RESULT]
         out = ", ".join([*(["_returned"] if returns or not results else []), *results])
-        # A structure keeps alive what it points to; a function is done with it when it returns.
+        # A structure keeps its arrays alive; a function needs them only until it returns.
         keep = ", ".join(f"'{name}': {name}" for name in self._all) if isinstance(target, type) else None
         code = f"""
 def call({", ".join(self.names)}):
@@ -118,14 +118,13 @@ def call({", ".join(self.names)}):
         return cast("Callable[..., Any]", scope["call"])
 
     def _passed(self, name: str, of_array: str) -> str:
-        """Return the expression for what is passed for a parameter: `of_array` with its name where it is one."""
+        """Return the expression of the value passed for a parameter; for an array `of_array` with its name."""
         if name in self._arrays:
             return of_array.format(name)
         return f"_pointer({name})" if name in self._pointed else name
 
     def _ready(self, name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-        """Return an array, or a copy as declared of one that is only read; raises TypeError where it is not as declared
-        and a copy would not do."""
+        """Return the array, or a converted copy if it is read-only; raises TypeError if it cannot be converted."""
         declared = self._arrays[name]
         dtype = array.dtype if declared.dtype is None else declared.dtype
         same = array.dtype == dtype or (dtype == np.uint8 and array.dtype == np.bool_)
@@ -138,17 +137,17 @@ def call({", ".join(self.names)}):
         return array
 
     def _refuse_axes(self, *arrays: NDArray[Any]) -> NoReturn:
-        """Raise TypeError for the first array that has not as many axes as declared: its sizes cannot be read."""
+        """Raise TypeError for the first array whose number of axes is not as declared."""
         for array, (name, declared) in zip(arrays, self._given.items(), strict=True):
             if array.ndim != len(declared.sizes):
                 raise TypeError(
                     f"{self.owner}: '{name}' is {array.dtype} {array.shape}, wants ({', '.join(declared.sizes)})"
                 )
-        raise AssertionError("all arrays have as many axes as declared")
+        raise AssertionError("all arrays have the declared number of axes")
 
     @staticmethod
     def _image(image: GreyImage) -> GreyImage:
-        """Return an image as kernels take it, of bytes or of float32."""
+        """Return a contiguous image of bytes or float32."""
         return np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
 
     @staticmethod
@@ -158,13 +157,13 @@ def call({", ".join(self.names)}):
 
 
 def _is_of(name: str, dtype: np.dtype[Any]) -> str:
-    """Return the test of an array's type; bytes and truth values lie alike in memory."""
+    """Return the test of an array's type; bytes and truth values have the same memory layout."""
     test = f"{name}.dtype is _{dtype}"
     return f"({test} or {name}.dtype is _bool)" if dtype == np.uint8 else test
 
 
 class Struct(ctypes.Structure):
-    """A structure of api.h, its members filled in by `structure`; one without arrays is made like any of ctypes."""
+    """A structure of api.h, whose members `structure` declares; one without arrays can be made like any of ctypes."""
 
     _call: _Call
     _names: frozenset[str]
@@ -173,9 +172,9 @@ class Struct(ctypes.Structure):
 
     @classmethod
     def of(cls, **values: Any) -> Self:
-        """Return the structure with its members, given by name but for sizes; it keeps alive what it points to.
+        """Return the structure with its members, given by name except sizes; it keeps its arrays alive.
 
-        Raises TypeError where a member is missing or an array is not as api.h says.
+        Raises TypeError if a member is missing or an array is not as declared in api.h.
         """
         if values.keys() != cls._names:
             raise TypeError(f"{cls.__name__}: wants {', '.join(cls._call.names)}; was given {', '.join(values)}")
@@ -212,7 +211,7 @@ def _ctype(one: Declaration) -> Any:
 
 
 class Kernel:
-    """A function of the library, called with what api.h wants of Python: arrays, numbers, structures."""
+    """A function of the library, called with arrays, numbers and structures as declared in api.h."""
 
     def __init__(self, name: str, library: ctypes.CDLL) -> None:
         self.name = name
@@ -221,7 +220,7 @@ class Kernel:
         self._compiled: Callable[..., Any] | None = None
 
     def _compile(self) -> Callable[..., Any]:
-        """Declare the arguments, at the first call: by then the caller has declared the structures among them."""
+        """Compile the call, at the first call, when all structures are declared."""
         parameters, result = header().functions[self.name], header().results[self.name]
         self._function.argtypes = [_ctype(one) for one in parameters]
         self._function.restype = None if result.type == "void" else _ctype(result)
@@ -229,8 +228,8 @@ class Kernel:
         return self._compiled
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call it and return what it returns, and its results; raises TypeError where an argument is missing or an
-        array is not as declared."""
+        """Return the value of the function and its results; raises TypeError if an argument is missing or an array is
+        not as declared."""
         if len(arguments) != len(self._call.names):
             raise TypeError(f"{self.name}: wants {', '.join(self._call.names)}; was given {len(arguments)}")
         return (self._compiled or self._compile())(*arguments)

@@ -18,7 +18,7 @@ class _BrownPoints(Struct):
 
 @structure("radial_points_t")
 class _RadialPoints(Struct):
-    """Points in the camera frame and a camera that looks the same all around."""
+    """Points in the camera frame and a radially symmetric camera."""
 
 
 def brown_pixels(
@@ -28,9 +28,9 @@ def brown_pixels(
     d_pixels_d_point: FloatArray | None = None,
     d_pixels_d_parameters: FloatArray | None = None,
 ) -> Projected:
-    """Project points and write those Jacobians that are given as `Camera.derivatives` does; return u, v and valid.
+    """Return u, v and valid of points, and write the given Jacobians as `Camera.derivatives` does.
 
-    `max_r` is the tangent of the largest angle at which the camera, of 8, 9 or 12 `parameters`, sees anything.
+    `max_r` is the tangent of the largest angle of the field of view of the camera, which has 8, 9 or 12 `parameters`.
     """
     camera = {"parameters": _of_twelve(parameters), "rational": int(parameters.size > 9), "max_r": max_r}
     kernel = kernels().differentiate_brown
@@ -40,14 +40,14 @@ def brown_pixels(
 def brown_places(
     m: FloatArray, start: FloatArray, parameters: FloatArray, max_r: float
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the (x, y) (2, N) in the plane at unit depth that a camera distorts to m (2, N), by Newton's method from
-    `start` (2, N) inside the circle of `max_r`, and where it came to an end (N,)."""
+    """Return the (x, y) (2, N) at unit depth that a camera distorts to m (2, N), by Newton's method from `start` (2, N)
+    within the circle of radius `max_r`, and which converged (N,)."""
     plane = np.array(start, order="C")
     return plane, kernels().undistort_brown(_of_twelve(parameters), max_r, parameters.size > 9, m, plane)
 
 
 def _of_twelve(parameters: FloatArray) -> FloatArray:
-    """Return all that Brown's model may have, zero where the camera has less."""
+    """Return the twelve parameters of Brown's model, zero where the camera has none."""
     return np.concatenate([parameters, np.zeros(12 - parameters.size)])
 
 
@@ -66,9 +66,9 @@ def radial_pixels(
     ----------
     polynomial : k1 ... k4, or the coefficients of f(rho), of the power zero first.
     linear : l00, l01, l11 and the centre, px, as of `RadialCamera`.
-    limits : the largest angle, rad, or the largest radius, px, that the camera sees; the other does not count.
+    limits : largest angle, rad, and largest radius, px, of the field of view; each model uses one of them.
     """
-    # A copy: what is read-only takes longer to pass.
+    # A copy: passing read-only arrays takes longer.
     camera: dict[str, Any] = {"polynomial": np.array(polynomial)}
     camera |= zip(("l00", "l01", "l11", "cx", "cy", "max_angle", "max_radius"), (*linear, *limits), strict=True)
     kernel = getattr(kernels(), f"differentiate_{model}")
@@ -83,7 +83,7 @@ def _written(
     d_pixels_d_parameters: FloatArray | None,
     camera: dict[str, Any],
 ) -> Projected:
-    """Call the kernel for the points and the `camera`, members of the structure, and return u, v and valid."""
+    """Return u, v and valid from the kernel for the points and the `camera`, the other members of the structure."""
     count = len(points[0])
     x, y, z = points
     wanted = d_pixels_d_point, d_pixels_d_parameters
@@ -97,7 +97,7 @@ def _written(
 
 
 def _memory(out: FloatArray | None, count: int) -> FloatArray:
-    """Return `out`, or a copy of what is there where its rows do not lie one after the other; no rows for None."""
+    """Return `out`, or a contiguous copy; an array without rows for None."""
     if out is None:
         return np.empty((2, 0, count))
     return out if out.flags.c_contiguous else out.copy()

@@ -1,6 +1,6 @@
-"""Reads api.h and the headers it includes: from them come the calls of `rigkit.kernels`, and their checks.
+"""Parser of api.h and the headers it includes, from which the calls of `rigkit.kernels` and their checks are made.
 
-They are a small part of C (see there), which a few patterns read.
+They are written in a subset of C (described there) that a few regular expressions can parse.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ DTYPES: dict[str, np.dtype[np.generic] | None] = {
     "double": np.dtype(np.float64),
     "void": None,
 }
-"""NumPy's name of a C type; `void` is an image's, of bytes or of float32."""
+"""NumPy types of C types; `void` is that of an image, of bytes or float32."""
 
 IMAGE = r"ARRAY(const void, \1, height, width), int64_t bytes, int64_t width, int64_t height"
-"""What the macro of that name stands for."""
+"""Expansion of the macro of that name."""
 
 
 class Role(StrEnum):
-    """Who makes an array: the caller, or the call, which returns it or forgets it."""
+    """The role of an array: given by the caller, or allocated by the call as a result or as scratch memory."""
 
     GIVEN = "ARRAY"
     RESULT = "RESULT"
@@ -46,8 +46,8 @@ class Role(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """An array that is passed by its address: its type, None for an image's, its sizes in terms of other parameters,
-    and whether the kernel only reads it."""
+    """An array passed by its address: its type (None for an image), its sizes as expressions of other parameters, and
+    whether it is read-only."""
 
     dtype: np.dtype[np.generic] | None
     sizes: tuple[str, ...]
@@ -67,9 +67,9 @@ class Declaration:
     Attributes
     ----------
     type : name of a scalar or of a structure, "char" for text.
-    array : what is known of it if it is an array.
+    array : its properties if it is an array.
     pointer : whether it is the address of a value or structure.
-    length : of a member that is several values, else None.
+    length : number of values of a member that is a C array, else None.
     """
 
     name: str
@@ -91,7 +91,7 @@ class Header:
 
 @functools.cache
 def header() -> Header:
-    """Return what api.h and its parts declare; raises ValueError where they are not as plain as api.h says of them."""
+    """Return the declarations of api.h and its parts; raises ValueError if they are not in the subset of C."""
     folder = Path(__file__).parent
     text = (folder / "api.h").read_text(encoding="utf-8")
     parts = re.findall(r'^#include "(\w+\.h)"', text, flags=re.MULTILINE)
@@ -99,7 +99,7 @@ def header() -> Header:
 
 
 def parsed(text: str) -> Header:
-    """Return what the header `text` declares."""
+    """Return the declarations of the header `text`."""
     text = re.sub(r"/\*.*?\*/", " ", text, flags=re.DOTALL)
     text = re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE)
     text = re.sub(r"\bIMAGE\((\w+)\)", IMAGE, text)
@@ -122,7 +122,7 @@ def parsed(text: str) -> Header:
 
 
 def _split(text: str) -> list[str]:
-    """Return what commas outside brackets separate."""
+    """Return the parts of `text` between commas that are not in brackets."""
     parts, depth = [""], 0
     for letter in text:
         depth += (letter in "([{") - (letter in ")]}")
@@ -134,12 +134,12 @@ def _split(text: str) -> list[str]:
 
 
 def _python(expression: str) -> str:
-    """Return C arithmetic on sizes, which are not negative, as Python's."""
+    """Return C arithmetic on sizes, which are not negative, in Python."""
     return expression.replace("/", "//")
 
 
 def _declared(text: str, constants: dict[str, int]) -> list[Declaration]:
-    """Return what one declaration declares: several members if it names several."""
+    """Return the members or parameters of one declaration, which may have several names."""
     text = " ".join(text.split())
     if found := re.fullmatch(r"(ARRAY|RESULT|SCRATCH)\((const )?(\w+), (\w+), (.*)\)", text):
         role, const, kind, name, sizes = found.groups()

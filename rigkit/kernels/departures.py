@@ -1,4 +1,4 @@
-"""Calls of the kernels in departures.c: what a lens may do beyond its model, and what its images say of that."""
+"""Calls of the kernels in departures.c: displacements of a lens beyond its model, and their estimation from images."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ class LensCorners(Struct):
         counts: IntArray,
         size_px: tuple[int, int],
     ) -> LensCorners:
-        """Return them: N corners, so many of each view (V,) as `counts` say.
+        """Return the structure of N corners, view by view, `counts` (V,) per view.
 
         Parameters
         ----------
-        d_pixels_d_point, d_pixels_d_parameters : (2, 3, N) px/mm and (2, P, N), as of `Camera.derivatives`.
-        sigmas : (P,) units in which parameters count.
+        d_pixels_d_point, d_pixels_d_parameters : (2, 3, N) px/mm and (2, P, N), as from `Camera.derivatives`.
+        sigmas : (P,) units of the parameters.
         lever : (3, N) from the board's origin to the corner, in the camera frame, mm.
-        pixels : u and v, (N,) each, where the corners project.
-        residuals, usable : (N, 2) px, and (N,) which corners tell anything.
+        pixels : u and v, (N,) each, of the projected corners.
+        residuals, usable : (N, 2) px, and (N,) which corners are used.
         """
         return cls.of(
             d_pixels_d_point=d_pixels_d_point,
@@ -55,10 +55,10 @@ class LensCorners(Struct):
         )
 
     def products(self) -> tuple[FloatArray, FloatArray]:
-        """Return the sums of products of the corners' rows that tell: of every view those of all K + 6 with its pose
-        (V, K + 6, 6), and over all views those of the others (K, K).
+        """Return the products of the columns of the usable corners' rows: per view those of all K + 6 with its pose
+        (V, K + 6, 6), and summed over all views those of the other K (K, K).
 
-        With rows in this order: the pose (w, t), the P parameters in units of `sigmas`, the displacements, the
+        The columns are, in this order: the pose (w, t), the P parameters in units of `sigmas`, the displacements, the
         residual.
         """
         products: tuple[FloatArray, FloatArray] = kernels().lens_products(self)
@@ -66,25 +66,27 @@ class LensCorners(Struct):
 
 
 def averaged_amounts(information: FloatArray, score: FloatArray, sizes: FloatArray) -> FloatArray:
-    """Return E[a a^T] (J, J) of the amounts a of displacements, px, of which images give the information (J, J) and the
-    score (J,).
+    """Return the posterior mean of a a^T (J, J) for the amounts a of displacements, px, from information (J, J) and
+    score (J,) of images.
 
-    Beforehand a is normal with mean zero, those along the radius of one of the `sizes` (S,), the others of one, all
-    pairs alike; each counts as far as the images bear it out.
+    The prior of a is normal with mean zero, with one of the `sizes` (S,) as standard deviation of radial displacements
+    and one of the others; all pairs have equal prior probability and are averaged by their posterior probability.
     """
     return np.asarray(kernels().average_amounts(information, score, sizes))
 
 
 def displacements(pixels: Pixels, size_px: tuple[int, int]) -> FloatArray:
-    """Return the displacements (2, J, M) at pixels (M, 2), px: of about one px in the corners of the image.
+    """Return J basis displacements (2, J, M) at pixels (M, 2), px, of about one px in the corners of the image.
 
-    Powers of the radius, decentring (tangential distortion), thin prisms, these again with the square of the radius,
-    aspect ratio and shear.
+    They are powers of the radius, decentring (tangential distortion), thin prisms, these two times the square of the
+    radius, aspect ratio and shear.
     """
     return np.asarray(kernels().displace_pixels(pixels[:, 0], pixels[:, 1], *size_px))
 
 
 def displacement(u: FloatArray, v: FloatArray, amounts: FloatArray, size_px: tuple[int, int]) -> FloatArray:
-    """Return how far amounts (J,) of the displacements move pixels u, v (M,), (2, M) px; beyond the corners of the
-    image as on the circle through them."""
+    """Return the displacement (2, M), px, of pixels u, v (M,) by `amounts` (J,) of the basis displacements.
+
+    Beyond the circle through the corners of the image it is that on the circle.
+    """
     return np.asarray(kernels().displace_by(u, v, *size_px, amounts))

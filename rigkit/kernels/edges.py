@@ -1,5 +1,5 @@
-"""The kernels in edges.c, correlation.c and curvatures.c: the fit of the edge model to corners, what their noise
-shares, and how the lines of a lattice bend."""
+"""The kernels in edges.c, correlation.c and curvatures.c: the fit of the edge model to corners, the correlation of
+their noise, and the curvatures of the lines of a lattice."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rigkit.kernels.declarations import header
 LAG = header().constants["LAG"]
 
 LAGS = tuple((-up, right) for up in range(LAG + 1) for right in range(-LAG, LAG + 1) if up or right >= 0)
-"""How far, in rows and columns, two pixels lie apart whose noise is compared; the opposite ones are the same."""
+"""Lags (rows, columns) of the correlation of noise; opposite lags are equivalent."""
 
 
 @structure("edge_rules_t")
@@ -25,7 +25,7 @@ class Rules(Struct):
 
 @structure("tag_window_t")
 class TagWindow(Struct):
-    """What windows of the corners of tags go by."""
+    """Parameters of the windows of the corners of tags."""
 
 
 @structure("factor_rules_t")
@@ -56,7 +56,7 @@ def fit_corners(
     contrast: FloatArray,
     rules: Rules,
 ) -> FloatArray:
-    """Return the OUTCOMES (api.h) of N corners, (N, 35). Arguments as `detection.subpixel.edge_fit.fit_edges`."""
+    """Return the OUTCOMES (api.h) of N corners, (N, 35). Arguments as for `detection.subpixel.edge_fit.fit_edges`."""
     out = kernels().fit_edges(
         *(image, pixels, sides, curvature, curvature_sigma, gaps, tilts, reach, paper),
         *(single, sign, blur, window_blur, contrast, ends, rules),
@@ -65,15 +65,15 @@ def fit_corners(
 
 
 class NoiseOfCorners(NamedTuple):
-    """What the fits of N corners leave, and how they went: rows of `fit_edges`, N first in all.
+    """Residuals and other results of the fits of N corners, from `fit_edges`.
 
     Attributes
     ----------
-    products, pairs : (N, 13) sums of products of what is left in two pixels LAGS apart, and of how many.
-    noise, blur, used : (N,) what is left, grey levels; px; pixels of the window.
+    products, pairs : (N, 13) sums of products of residuals of pixels at LAGS, and their numbers.
+    noise, blur, used : (N,) rms noise, grey levels; s, px; number of pixels of the window.
     pixels, sides : (N, 2) and (N, 2, 2), of the corners and of their cells, px.
-    good : (N,) those to rely on.
-    owner : (N,) the number of the board of each.
+    good : (N,) corners to be used.
+    owner : (N,) index of the board of each.
     """
 
     products: FloatArray
@@ -88,19 +88,19 @@ class NoiseOfCorners(NamedTuple):
 
 
 def sigma_factors(corners: NoiseOfCorners, boards: int, rules: FactorRules) -> FloatArray:
-    """Return what `detection.subpixel.correlation.sigma_factors` does."""
+    """See `detection.subpixel.correlation.sigma_factors`."""
     return np.asarray(kernels().sigma_factors(*corners, boards, rules))
 
 
 def uneven_factors(corners: NoiseOfCorners, typical: FloatArray, rules: FactorRules) -> FloatArray:
-    """Return what `detection.subpixel.correlation.uneven_factors` does."""
+    """See `detection.subpixel.correlation.uneven_factors`."""
     return np.asarray(kernels().uneven_factors(*corners, typical, rules))
 
 
 def line_curvatures(
     pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides_px: FloatArray, rules: CurvatureRules
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what `detection.subpixel.edge_curvature.line_curvature` does."""
+    """See `detection.subpixel.edge_curvature.line_curvature`."""
     count = len(sides_px)
     if np.count_nonzero(cells) != count:
         raise ValueError(f"line_curvatures: {count} sides for {np.count_nonzero(cells)} cells")

@@ -1,5 +1,4 @@
-"""Calls of the kernels in looks.c, smoothing.c, peaks.c, corners.c and links.c: plain arrays; tolerances are the
-callers'."""
+"""Calls of the kernels in looks.c, smoothing.c, peaks.c, corners.c and links.c, with the callers' tolerances."""
 
 from __future__ import annotations
 
@@ -17,17 +16,17 @@ _CONSTANTS = header().constants
 STRIP, STRIP_ROWS, STRIPS_FROM, HALF = (_CONSTANTS[name] for name in ("STRIP", "STRIP_ROWS", "STRIPS_FROM", "HALF"))
 
 WHOLE = 16.0
-"""A kernel of multiples of 1/16 smooths bytes exactly in integers of 16 bits."""
+"""Denominator of the smoothing kernel, with which bytes are smoothed exactly in 16-bit integers."""
 
 MAX_SUMMED = 256
-"""Bytes whose sum fits 16 bits."""
+"""Largest number of bytes whose sum fits 16 bits."""
 
 Image = NDArray[np.float32]
 
 
 @structure("level_rules_t")
 class LevelRules(Struct):
-    """How levels are smoothed, and what their thresholds follow from."""
+    """Parameters of the smoothing of levels and of their thresholds."""
 
     @classmethod
     def make(cls, kernel: Image, **numbers: float) -> LevelRules:
@@ -37,12 +36,12 @@ class LevelRules(Struct):
 
 @structure("ring_rules_t")
 class RingRules(Struct):
-    """How rings are read."""
+    """Parameters of the ring test."""
 
 
 @structure("link_rules_t")
 class LinkRules(Struct):
-    """How links are found."""
+    """Parameters of the search for links."""
 
 
 @structure("image_t")
@@ -52,19 +51,22 @@ class ImageOf(Struct):
 
 @structure("corners_t")
 class _CornerArrays(Struct):
-    """The corners that links are sought for."""
+    """The corners to be linked."""
 
 
 def has_mosaic(image: GreyImage, step: int, min_level: float, share: float) -> bool:
-    """Return whether a place in squares of 2 x 2 pixels is brighter or darker than the mean of its square by `share` of
-    that. It is so in the upper median over the squares, of every `step`-th both ways, that are brighter than the upper
-    median of all, and than `min_level`."""
+    """Return whether a position in cells of 2 x 2 pixels differs from the mean of its cell by more than the `share` of
+    it.
+
+    The difference is the upper median over the cells, every `step`-th in both directions, that are brighter than the
+    upper median of all and than `min_level`.
+    """
     return bool(kernels().has_mosaic(image, step, min_level, share))
 
 
 def bad_pixels(image: GreyImage, first: int, apart: int, step: float, share: float) -> tuple[int, float]:
-    """Return how many inner pixels of every `apart`-th row from the `first` on stand out of all of their neighbours by
-    more than `step` and by more than `share` of the range of brightness in these rows; and that range."""
+    """Return the number of inner pixels, in every `apart`-th row from the `first`, that differ from all of their
+    neighbours by more than `step` and by more than `share` of the range of brightness in these rows, and that range."""
     count, span = kernels().count_bad_pixels(image, first, apart, step, share)
     return count, float(span[0])
 
@@ -77,11 +79,11 @@ def shrunk(image: GreyImage, factor: int) -> Image:
 
 
 def level(image: GreyImage, rules: LevelRules, step: int) -> tuple[Image, Image, Image]:
-    """Return `image` smoothed, every second of its pixels both ways, and the smallest response of a peak in each STRIP
-    pixels of STRIP_ROWS rows: as the light there, and every `step`-th inner pixel both ways, have it."""
+    """Return the smoothed `image`, every second of its pixels in both directions, and the threshold on the response of
+    peaks per block of STRIP pixels x STRIP_ROWS rows, from the local brightness and every `step`-th inner pixel."""
     height, width = image.shape
     half_height, half_width = (height + 1) // 2, (width + 1) // 2
-    # One block of memory: the allocator keeps it for the next image, as it would not two.
+    # One block of memory, which the allocator reuses for the next image.
     block = np.empty(height * width + half_height * half_width, np.float32)
     smooth, half = block[: height * width].reshape(height, width), block[height * width :].reshape(-1, half_width)
     return smooth, half, kernels().make_level(image, step, rules, smooth, half)
@@ -90,8 +92,8 @@ def level(image: GreyImage, rules: LevelRules, step: int) -> tuple[Image, Image,
 def peaks(smooth: Image, above: Image, limit: int, side: int, finest: int) -> tuple[NDArray[np.int32], Image]:
     """Return (u, v) and response of the peaks above their thresholds (`level`), row by row.
 
-    Of more than `limit` peaks, about so many are kept: those strongest beside the strongest in their square of `side`
-    pixels, to one part in `finest`.
+    If there are more than `limit`, about that number is kept: those with the largest response over the largest one in
+    their block of `side` pixels, quantised to `finest` steps.
     """
     height, width = smooth.shape
     found, at, response = kernels().find_peaks(smooth, above)
@@ -104,14 +106,14 @@ def peaks(smooth: Image, above: Image, limit: int, side: int, finest: int) -> tu
 
 
 class CornersOfLevel(NamedTuple):
-    """What lies next to the peaks of a level, in pixels of the full image.
+    """Saddles and corners at the peaks of a level, in pixels of the full image.
 
     Attributes
     ----------
     saddles : (N, 2)
     pixels, angles, contrast : (M, 2), (M, 2) and (M,), of the corners among these.
-    smeared : (M,) only motion explains their middle.
-    repeated : (M,) there is a known one nearby.
+    smeared : (M,) whether they have motion blur.
+    repeated : (M,) whether there is a known corner nearby.
     """
 
     saddles: FloatArray
@@ -132,13 +134,13 @@ def corners(
     known: FloatArray,
     reach: float,
 ) -> CornersOfLevel:
-    """Return what lies next to the peaks `at` (P, 2) of a level.
+    """Return the saddles and corners at the peaks `at` (P, 2) of a level.
 
     Parameters
     ----------
     tests : radius of the rings, largest step to a saddle, largest response relative to the square of the contrast.
     to_full : scale and offset of the level.
-    known : (K, 2) corners that are known; one within `reach` of these is repeated.
+    known : (K, 2) known corners; corners within `reach` of one are marked as repeated.
     """
     at, response = np.ascontiguousarray(at, np.int32), np.ascontiguousarray(response, np.float32)
     done, saddles, *of_corners, found = kernels().find_corners(
@@ -151,7 +153,7 @@ def corners(
 
 
 def near_any(fresh: FloatArray, known: FloatArray, reach: float) -> BoolArray:
-    """Return which of `fresh` (N, 2) lie within `reach` of any of `known` (M, 2)."""
+    """Return which of `fresh` (N, 2) are within `reach` of any of `known` (M, 2)."""
     if not len(fresh) or not len(known):
         return np.zeros(len(fresh), np.bool_)
     done, mark = kernels().mark_known(fresh, known, reach)
@@ -173,8 +175,8 @@ def links(
 ) -> IntArray:
     """Return the mutual neighbours of N corners, (N, 4): 4 * the neighbour + its arm, -1 for none.
 
-    `lines` (N, 2, 2) are the unit vectors of A and B, `bounds` the contrasts (N,) of those looked at, `reach` (N,) the
-    largest distance of the places that are looked at from the edge.
+    `lines` (N, 2, 2) are the unit vectors of A and B, `bounds` the smallest and largest contrasts (N,) of possible
+    neighbours, `reach` (N,) the largest distance from the edge at which brightness is read.
     """
     min_contrast, max_contrast = bounds
     given = _CornerArrays.of(

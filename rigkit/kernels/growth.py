@@ -1,4 +1,4 @@
-"""Calls of the kernels in growth.c and components.c: plain arrays; all tolerances come from the callers."""
+"""Calls of the kernels in growth.c and components.c, with the callers' tolerances."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from rigkit.kernels.front import ImageOf, RingRules
 
 @structure("fit_rules_t")
 class FitRules(Struct):
-    """How local polynomials are fitted."""
+    """Parameters of local polynomial fits."""
 
 
 @structure("growth_rules_t")
 class GrowthRules(Struct):
-    """How lattices grow."""
+    """Parameters of the growth of lattices."""
 
     @classmethod
     def make(cls, predictions: Sequence[FitRules], ring: RingRules, along: np.ndarray, **numbers: float) -> GrowthRules:
-        """Return the rules; `along` are the places of an edge that are looked at."""
+        """Return the rules; `along` are the positions along an edge that are tested."""
         return cls.of(predictions=(FitRules * 2)(*predictions), ring=ring, along=along, **numbers)
 
 
 @structure("pyramid_level_t")
 class _PyramidLevel(Struct):
-    """The brightness that corners are read from."""
+    """The image level from which brightness is read."""
 
 
 @structure("sheet_t")
@@ -39,7 +39,7 @@ class _Sheet(Struct):
 
 @structure("squares_t")
 class GridBuckets(Struct):
-    """Points (N, 2), N > 0, sorted into squares, to find those near a place."""
+    """Points (N, 2), N > 0, sorted into the cells of a grid, to find those near a position."""
 
     @classmethod
     def sorted(cls, points: FloatArray) -> GridBuckets:
@@ -52,7 +52,7 @@ class GridBuckets(Struct):
 
 
 def fit(lattice: FloatArray, cells: BoolArray, rules: FitRules) -> FloatArray:
-    """Return the fits of M `cells` (R, C) of `lattice` (R, C, 2): (M, 12), in the order of `LocalFit`."""
+    """Return the fits (M, 12) at the M `cells` (R, C) of `lattice` (R, C, 2), in the order of `LocalFit`."""
     return np.asarray(kernels().fit_cells(lattice, cells, rules, int(np.count_nonzero(cells))))
 
 
@@ -69,7 +69,7 @@ def grown(
 ) -> int:
     """Grow the lattice `pixels` (R, C, 2), `contrast` (R, C) in place; both contiguous float64, NaN where unknown.
 
-    Returns the rings that are left if the lattice has reached the border of its arrays, -1 if it has grown all it can.
+    Returns the number of remaining rings when the lattice reaches the border of its arrays, -1 if no more can be added.
     """
     sheet = _Sheet.of(pixels=pixels, contrast=contrast, due=np.ones((2, *contrast.shape), np.uint8), sign=sign)
     level = _PyramidLevel.of(image=ImageOf.of(brightness=image), scale=scale, offset=offset)
@@ -77,9 +77,9 @@ def grown(
 
 
 def components_of(links: IntArray) -> tuple[int, IntArray, IntArray, IntArray, IntArray]:
-    """Return the number of lattices that mutual `links` make up, and label, grid (N, 2), turn, members of the corners.
+    """Return the number of lattices of mutual `links`, and label, grid (N, 2), turn, members of the corners.
 
-    `links` (N, 4) are 4 * the neighbour + its arm, -1 for none.
+    `links` (N, 4) are 4 * neighbour + its arm, -1 for none.
     """
     found: tuple[int, IntArray, IntArray, IntArray, IntArray] = kernels().find_components(
         np.array(links, np.int64, order="C")

@@ -1,4 +1,4 @@
-"""Calls of the kernels in lattice.c and splits.c: plain arrays in and out; all tolerances come from the callers."""
+"""Calls of the kernels in lattice.c and splits.c, with the callers' tolerances."""
 
 from __future__ import annotations
 
@@ -24,10 +24,8 @@ class SplitRules(Struct):
 
 
 def uneven_steps(pixels: FloatArray) -> tuple[list[float], list[int], tuple[float, float]]:
-    """Return what `detection.lattice.spacing.spacing_changes` does of `pixels` (R, C, 2).
-
-    That is `typical` and `seen` of the inner columns and then of the inner rows, and `every` of both.
-    """
+    """Return `typical` and `seen` of the inner columns and then of the inner rows of `pixels` (R, C, 2), and `every` of
+    both; see `detection.lattice.spacing.SpacingChange`."""
     rows, columns = pixels.shape[:2]
     typical, seen, every = kernels().uneven_steps(pixels, max(columns - 2, 0) + max(rows - 2, 0))
     along_rows, along_columns = every.tolist()
@@ -35,14 +33,14 @@ def uneven_steps(pixels: FloatArray) -> tuple[list[float], list[int], tuple[floa
 
 
 def line_gaps(sides: FloatArray, curvatures: FloatArray) -> FloatArray:
-    """Return what `detection.lattice.local_fit.LocalFit.gaps` does of its `sides` and `curvatures`, (M, 2, 2)."""
+    """Return the gaps (M, 2, 2) of `detection.lattice.local_fit.LocalFit` from its `sides` and `curvatures`."""
     return np.asarray(kernels().line_gaps(sides, curvatures))
 
 
 def excess_scatter(
     pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tuple[slice, slice]], rules: ScatterRules
 ) -> FloatArray:
-    """Return what `subpixel.scatter.excess_scatter` does of `pixels` (R, C, 2) and `sigma_px` (R, C), (P,)."""
+    """See `detection.subpixel.scatter.excess_scatter`."""
     where = np.array(
         [(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start) for rows, columns in parts],
         np.int64,
@@ -51,9 +49,9 @@ def excess_scatter(
 
 
 def surface_scatter(pixels: FloatArray, sigma_px: FloatArray, rules: ScatterRules) -> tuple[float, float]:
-    """Return how far `pixels` (R, C, 2) lie off surfaces of both degrees over what `sigma_px` (R, C) says, rms.
+    """Return the rms residuals of surfaces of both degrees through `pixels` (R, C, 2) over `sigma_px` (R, C).
 
-    NaN where these fit any, or where rows and columns have differences enough to tell (`excess_scatter`).
+    NaN without redundancy, or if rows and columns have enough differences for `excess_scatter`.
     """
     lower, higher = kernels().surface_scatter(pixels, sigma_px, rules).tolist()
     return lower, higher
@@ -70,8 +68,7 @@ def shifts_of_edges(
     steps: int,
     max_edges: int,
 ) -> FloatArray:
-    """Return how far edges lie aside, (K,), as `detection.checks.validate._edge_offsets`, of about `max_edges`
-    edges."""
+    """Return the offsets (K,) of `detection.checks.validate._edge_offsets`, over about `max_edges` edges."""
     level, sign = ImageOf.of(brightness=image), 1.0 if rising else -1.0
     places = np.array(along)
     return np.asarray(kernels().edge_shifts(pixels, sign, level, scale, offset, reach, places, steps, max_edges))
@@ -80,8 +77,11 @@ def shifts_of_edges(
 def clearest_splits(
     pixels: FloatArray, sigma_px: FloatArray, several: bool, rules: SplitRules
 ) -> list[tuple[float, int, int]]:
-    """Return the clearest split of `pixels` (R, C, 2), `sigma_px` (R, C), between columns, and that between rows: how
-    many times better the two sides fit alone, 0 where there is none, and the first and the last (exclusive) between
-    them. `detection.checks.discontinuity` says what that is."""
+    """Return the clearest discontinuities of `pixels` (R, C, 2) with `sigma_px` (R, C) between columns and between
+    rows.
+
+    Each is (ratio of the residuals of a common fit to those of separate fits, 0 without a discontinuity; first and last
+    (exclusive) column or row between the two sides). See `detection.checks.discontinuity`.
+    """
     out = kernels().clearest_splits(pixels, sigma_px, several, rules)
     return [(ratio, int(start), int(end)) for ratio, start, end in out.tolist()]

@@ -1,4 +1,4 @@
-"""The kernels in light.c and paper.c: steps of the light in the windows of corners, and what lies beyond the outermost
+"""The kernels in light.c and paper.c: steps of the light in the windows of corners, and the image beyond the outermost
 squares of boards."""
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def fit_light_steps(
     max_step: FloatArray,
     rules: LightRules,
 ) -> FloatArray:
-    """Return the outcomes of N corners, (N, 8). Arguments as `detection.subpixel.shadows.light_steps`; what a step
-    of the fit changes is `max_step` (11,) at most."""
+    """Return the outcomes of N corners, (N, 8). Arguments as for `detection.subpixel.shadows.light_steps`; `max_step`
+    (11,) are the largest changes per iteration."""
     capacity = (2 * math.ceil(rules.radius_px) + 1) ** 2 + LIGHT_BLOCK
     return np.asarray(
         kernels().fit_light_steps(image, start, sides, curvature, lateral, blur, max_step, rules, capacity)

@@ -18,22 +18,22 @@ class BoardViews(Struct):
     """Views of boards, padded to the same number of corners: poses, boards, pixels, weights; members as in api.h."""
 
     def placed(self, first: int, stop: int) -> tuple[FloatArray, FloatArray]:
-        """Return the lever arms R X and the points R X + t, (3, N) mm each, of the corners of the views from `first` to
-        before `stop`."""
+        """Return the lever arms R X and the points R X + t, (3, N) mm each, of the corners of views `first` to `stop`
+        (exclusive)."""
         placed: tuple[FloatArray, FloatArray] = kernels().place_corners(self, first, (stop - first) * self.corners)
         return placed
 
 
 @structure("view_sums_t")
 class _ViewSumsStruct(Struct):
-    """Where the kernel writes to."""
+    """The memory to which the kernel writes."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ViewSums:
-    """What views come to: `residuals` (2, V, C) px, which corners are `valid` (V, C), `costs` (V,) px^2, and of every
-    view the sums of `products` of its weighted rows (V, K, K): derivatives by the parameters, the warp and the pose
-    (w, t), and the residual. Those of the released points are `own` (R, 3, K + 3), with all rows of their corners and
+    """Sums over views: `residuals` (2, V, C) px, which corners are `valid` (V, C), `costs` (V,) px^2, and per view the
+    `products` (V, K, K) of the columns of its weighted rows: derivatives by the parameters, the warp and the pose (w,
+    t), and the residual. Those of the released points are `own` (R, 3, K + 3), with the columns of their corners and
     their own three, and `poses` (V, R, 3, 6).
     """
 
@@ -48,7 +48,7 @@ class ViewSums:
 
     @classmethod
     def of(cls, seen: BoardViews, across: int) -> ViewSums:
-        """Return the sums of K = `across` rows, with no view added yet."""
+        """Return the sums of K = `across` columns, before any view is added."""
         v, c, r = seen.views, seen.corners, seen.released
         arrays: dict[str, NDArray[Any]] = {
             "residuals": np.empty((2, v, c)),
@@ -68,8 +68,8 @@ class ViewSums:
         projected: tuple[FloatArray, FloatArray, BoolArray],
         lever: FloatArray,
     ) -> None:
-        """Add the views from `first` on, of N corners in all: `d_pixels_d_point` (2, 3, N), `d_pixels_d_parameters`
-        (2, P, N) and what `Camera.derivatives` returns with them, and the `lever` arms (3, N)."""
+        """Add the views from `first` on, with N corners in total: `d_pixels_d_point` (2, 3, N), `d_pixels_d_parameters`
+        (2, P, N), the values of `Camera.derivatives`, and the `lever` arms (3, N)."""
         kernels().add_views(self.seen, first, d_pixels_d_point, d_pixels_d_parameters, *projected, lever, self._struct)
 
 
@@ -81,9 +81,10 @@ class _BlockSystem(Struct):
 def schur_step(
     gg: FloatArray, gp: FloatArray, pp: FloatArray, g: FloatArray, p: FloatArray, damping: float
 ) -> tuple[FloatArray, FloatArray, float] | None:
-    """Return the step of globals (G,) and poses (V, 6) with `damping` times the diagonal (times one where that
-    vanishes) added to it, and the decrease of the cost that the undamped quadratic model promises for it; None where
-    the damped system is not positive definite.
+    """Return the damped step of globals (G,) and poses (V, 6), and the decrease of the cost under the undamped
+    quadratic model; None if the damped system is not positive definite.
+
+    `damping` times the diagonal (times one where that vanishes) is added to the diagonal.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Calls of the kernels in monotone.c: inverting increasing functions that a polynomial makes, and its first root."""
+"""Calls of the kernels in monotone.c: inverses of increasing functions of a polynomial, and the first root of one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rigkit.kernels.calls import Struct, structure
 
 @structure("increasing_t")
 class _Increasing(Struct):
-    """The functions, a table from which each inverse starts, and the range of the inverses."""
+    """The functions, a table of initial values, and the range of the inverses."""
 
 
 def inverses(
@@ -22,14 +22,14 @@ def inverses(
     values: tuple[float, float],
     limits: tuple[float, float],
 ) -> FloatArray:
-    """Return the x (N,) between the `limits` at which linear x + factor P(x) - offset, increasing in x, vanishes: by
-    Newton's method kept inside a bracket.
+    """Return the roots x (N,) between the `limits` of linear x + factor P(x) - offset, increasing in x, by Newton's
+    method safeguarded by a bracket.
 
     Parameters
     ----------
     polynomial : coefficients of P, of the power zero first.
     parts : linear, factor and offset, (N,) each.
-    target : (N,) by which the `table` of x (cells + 1,), even in it from the first of `values` to the second, is read.
+    target : (N,) arguments of the `table` (cells + 1,) of initial x, which is uniform between the two `values`.
     """
     linear, factor, offset = parts
     functions = _Increasing.of(
@@ -49,6 +49,6 @@ def inverses(
 
 
 def smallest_root(polynomials: FloatArray, limit: float) -> float:
-    """Return the smallest root in (0, `limit`] of polynomials (M, K) that do not vanish at zero, of the power zero
-    first, or `limit` where there is none; NaN where one overflows."""
+    """Return the smallest root in (0, `limit`] of polynomials (M, K), of the power zero first, that do not vanish at
+    zero; `limit` without a root, NaN if one overflows."""
     return float(kernels().smallest_root(polynomials, limit))

@@ -1,4 +1,5 @@
-"""Calls of the kernels in patches.c and patch_growth.c: patches of two images, aligned or grown over a surface."""
+"""Calls of the kernels in patches.c and patch_growth.c: alignment of patches of two images, and growth over
+surfaces."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ UPPER = np.triu_indices(6)
 
 @structure("pyramid_t")
 class Pyramid(Struct):
-    """An image and its halvings, float32."""
+    """An image pyramid, float32."""
 
     @classmethod
     def make(cls, levels: Sequence[NDArray[np.float32]]) -> Pyramid:
@@ -34,18 +35,18 @@ class Pyramid(Struct):
 
 @structure("patch_rules_t")
 class PatchRules(Struct):
-    """How patches are aligned, and which are good."""
+    """Parameters of the alignment of patches, and of their tests."""
 
 
 @structure("epipolar_t")
 class EpipolarKnowledge(Struct):
-    """The rays of image 2, and how well pairs are known to agree with an essential matrix."""
+    """The rays of image 2, an essential matrix, and tolerances of pairs."""
 
     @classmethod
     def make(
         cls, rays2: FloatArray, spacing: float, E21: Mat3, *, sigma: float, sigma_A: float, max_distance: float
     ) -> EpipolarKnowledge:
-        """Return it for the rays (R, C, 3) at the pixels `spacing` * (column, row), NaN where there is none."""
+        """Return it for the rays (R, C, 3) at the pixels `spacing` * (column, row), NaN where undefined."""
         return cls.of(
             rays2=rays2,
             spacing=float(spacing),
@@ -58,7 +59,7 @@ class EpipolarKnowledge(Struct):
 
 @structure("patch_grid_t")
 class _Grid(Struct):
-    """The nodes that patches grow over."""
+    """The nodes over which patches grow."""
 
 
 class PatchTable(NamedTuple):
@@ -67,7 +68,7 @@ class PatchTable(NamedTuple):
     Attributes
     ----------
     pixels2 : (N, 2); A21 : (N, 2, 2); correlation : (N,); noise : (N,) variance of the brightness a sample.
-    coarser : (N,) levels by which the patch was aligned more coarsely than the images are sharp.
+    coarser : (N,) pyramid levels by which the patch was aligned more coarsely than the resolution of the images.
     covariance : (N, 6, 6) of (u2, v2, a11, a12, a21, a22).
     """
 
@@ -86,7 +87,7 @@ def _table(out: FloatArray) -> PatchTable:
 
 
 def starts_of(pixels1: Pixels, pixels2: Pixels, A21: Affines) -> FloatArray:
-    """Return where alignments start, (N, 8)."""
+    """Return the initial values (N, 8) of alignments."""
     return np.concatenate([pixels1, pixels2, A21.reshape(-1, 4)], axis=1)
 
 

@@ -1,4 +1,4 @@
-"""Calls of the kernel in planes.c: planes through what the nodes of a grid say of a surface."""
+"""Calls of the kernel in planes.c: local planes through measurements at the nodes of a grid."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from rigkit.kernels.calls import Struct, structure
 
 @structure("plane_grid_t")
 class _PlaneGrid(Struct):
-    """What the nodes say, and how planes are fitted."""
+    """The measurements at the nodes, and parameters of the fits."""
 
 
 class PlaneFits(NamedTuple):
-    """Planes (R, C, 3), the normal matrices of their fits (R, C, 3, 3), the sums of weights (R, C), and those of
-    weighted squares (R, C) of Mahalanobis' distances from them. NaN where there is none."""
+    """Planes (R, C, 3), normal matrices of their fits (R, C, 3, 3), sums of weights (R, C), and weighted sums of
+    squared Mahalanobis distances (R, C). NaN where there is no plane."""
 
     planes: FloatArray
     normals: FloatArray
@@ -27,11 +27,11 @@ class PlaneFits(NamedTuple):
 def fitted_planes(
     values: FloatArray, information: FloatArray, frames: FloatArray, *, reach: int, rounds: int, turn: float
 ) -> PlaneFits:
-    """Return the planes through what nodes say.
+    """Return the planes through the measurements at the nodes.
 
-    `values` (R, C, 3), NaN where there are none, their `information` (R, C, 3, 3) and `frames` (R, C, 3, 3), by which
-    a plane predicts them. Of a neighbour at the Mahalanobis distance s from a plane the weight is
-    1 / (1 + s^2 / (3 turn^2))^2 (Geman and McClure), in the first round with the uncertainty of the node's own plane.
+    `values` (R, C, 3), NaN where unknown, with their `information` (R, C, 3, 3); `frames` (R, C, 3, 3) map a plane to
+    its predicted values. A neighbour at the Mahalanobis distance s from a plane has the weight 1 / (1 + s^2 / (3
+    turn^2))^2 (Geman and McClure), in the first round with the uncertainty of the node's own plane added.
     """
     grid = _PlaneGrid.of(values=values, information=information, frames=frames, reach=reach, rounds=rounds, turn=turn)
     return PlaneFits(*kernels().fit_planes(grid))

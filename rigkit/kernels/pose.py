@@ -1,5 +1,5 @@
-"""Calls of the kernels in five_point.c and six_point.c, which give hypotheses of the relative pose from many minimal
-samples, and of those in pose_quality.c and pose_minimum.c, which hold these against many matches.
+"""Calls of the kernels in five_point.c and six_point.c, minimal solvers of the relative pose for many samples, and of
+those in pose_quality.c and pose_minimum.c, which evaluate and refine hypotheses with many matches.
 
 Five equations (five points, or one affine correspondence and two points): ten cubics in three unknowns, solved by a
 polynomial in one of them (Nister, "An efficient solution to the five-point relative pose problem", 2004). Six (two
@@ -21,7 +21,7 @@ NO_MEMORY = header().constants["NO_MEMORY"]
 
 @structure("pose_problem_t")
 class _Problem(Struct):
-    """What the maximum likelihood pose is sought from."""
+    """Data and parameters of the maximum likelihood pose."""
 
 
 def residuals(packed: FloatArray, E21: Mat3) -> FloatArray:
@@ -35,14 +35,14 @@ def qualities(packed: FloatArray, E21: Mat3, noise: float) -> FloatArray:
 
 
 def qualities_ahead(packed: FloatArray, R: FloatArray, t: FloatArray, noise: float, sigmas: float) -> FloatArray:
-    """Return the sums (H,) over what lies ahead, of rotations (H, 2, 3, 3) and directions (H, 3), as pose_quality.c."""
+    """Return the sums (H,) with cheirality for rotations (H, 2, 3, 3) and directions (H, 3); see pose_quality.c."""
     return np.asarray(kernels().qualities_ahead(packed, R, t, noise, sigmas))
 
 
 def improve(
     packed: FloatArray, R: FloatArray, t: FloatArray, noise: float, free: IntArray, max_steps: int, settled_rad: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the rotations (H, 3, 3) and directions (H, 3) of best quality at a noise level near those given."""
+    """Return the local optima of the quality at a noise level, rotations (H, 3, 3) and directions (H, 3)."""
     R, t = np.array(R, np.float64, order="C"), np.array(t, np.float64, order="C")
     kernels().improve(packed, R, t, noise, free, max_steps, settled_rad)
     return R, t
@@ -62,8 +62,8 @@ def minimise(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, int, bool]:
     """Return R, t, residuals (M,), Jacobian (M, 5), weights (M,), iterations, and whether the last step was small.
 
-    `affine` (25, K) are the affinities of the matches `which` (K,), see pose_minimum.c; `loss` is 0 for none,
-    1 for Cauchy's or 2 for the marginal one, and its scale; `free` which of the five unknowns move.
+    `affine` (25, K) are the affinities of the matches `which` (K,), see pose_minimum.c; `loss` is its number (0 none, 1
+    Cauchy, 2 marginal) and its scale; `free` are the indices of the free parameters.
     """
     problem = _Problem.of(
         packed=packed,
@@ -84,15 +84,15 @@ def minimise(
 
 
 def five_rows(rows: FloatArray) -> Mat3:
-    """Return up to ten E (B, 10, 3, 3) of `rows` (B, 5, 9), NaN where there are fewer."""
+    """Return up to ten E (B, 10, 3, 3) of `rows` (B, 5, 9), padded with NaN."""
     return np.asarray(kernels().five_rows(rows))
 
 
 def six_rows(rows: FloatArray) -> Mat3:
-    """Return the E (B, 1, 3, 3) of `rows` (B, 6, 9): nearest to the matrix whose monomials violate the ten cubics
-    least.
+    """Return the E (B, 1, 3, 3) of `rows` (B, 6, 9), nearest to the matrix with the least squares monomials of the ten
+    cubics.
 
-    The monomials are scaled so that the answer does not depend on the choice of the basis: all 27 products of three of
-    the unknowns, of which ten differ, have the length one together.
+    The monomials are scaled so that the result does not depend on the choice of the basis: the vector of all 27
+    products of three of the unknowns, of which ten differ, has length one.
     """
     return np.asarray(kernels().six_rows(rows))

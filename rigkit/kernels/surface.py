@@ -16,21 +16,21 @@ SIDES, SECOND, GAIN, CURVATURE, HEIGHTS, SURFACE_COLUMNS = (
     _CONSTANTS[name] for name in ("SIDES", "SECOND", "GAIN", "CURVATURE", "HEIGHTS", "SURFACE_COLUMNS")
 )
 SURFACE_DEGREE = _CONSTANTS["SURFACE_DEGREE"]
-"""Of the polynomial that a lens adds to a perspective: a board that fills a fisheye of 180 degrees takes degree 7."""
+"""Largest degree of the polynomial that models distortion in addition to a perspective: a board that fills a fisheye of
+180 degrees needs degree 7."""
 
 TERMS_OF_DEGREE = tuple((degree + 1) * (degree + 2) // 2 for degree in range(SURFACE_DEGREE + 1))
-"""How many terms x^i y^j there are up to a degree."""
+"""Number of terms x^i y^j up to a degree."""
 
 HARDLY_MORE = 1.25
-"""Times the least miss: what is beyond such a degree is less than what points scatter, and over a board so many
-windows wide it bends no line within one. But the 8th, where it misses by a tenth less than the 3rd, bends lines at the
-rim by up to 8 px within a window (REAL)."""
+"""Largest ratio of the prediction error of the chosen degree to the smallest one. Higher degrees improve less than the
+scatter of the points, but the 8th, with an error a tenth smaller than that of the 3rd, bends lines at the rim by up to
+8 px within a window (REAL)."""
 
 
 def perspective(places: FloatArray, pixels: FloatArray) -> tuple[FloatArray, float]:
-    """Return the homography (3, 3) that takes `places` (N, 2) nearest to `pixels` (N, 2), of depth 1 at their mean, and
-    the least depth of a place (Hartley and Zisserman, Multiple View Geometry, 2004, algorithm 4.2).
-    """
+    """Return the least squares homography (3, 3) from `places` (N, 2) to `pixels` (N, 2), with depth 1 at their mean,
+    and the smallest depth of a place (Hartley and Zisserman, Multiple View Geometry, 2004, algorithm 4.2)."""
     depth, homography = kernels().fit_perspective(places, pixels)
     return homography, depth
 
@@ -41,14 +41,14 @@ class TagSurface:
 
     Attributes
     ----------
-    rows : (M, SURFACE_COLUMNS) all that is known of each.
+    rows : (M, SURFACE_COLUMNS) the following properties as columns.
     """
 
     rows: FloatArray
 
     @classmethod
     def made_of(cls, pixels: FloatArray, sides: FloatArray, curvatures: FloatArray) -> TagSurface:
-        """Return the map with these properties, without what `Polynomials.added_to` works out."""
+        """Return the map with these properties, without those that `Polynomials.added_to` computes."""
         rows = np.zeros((len(pixels), SURFACE_COLUMNS))
         rows[:, :SIDES], rows[:, SIDES:SECOND] = pixels, sides.reshape(-1, 4)
         rows[:, SECOND:GAIN] = curvatures.reshape(-1, 4)
@@ -71,7 +71,7 @@ class TagSurface:
 
     @property
     def gain(self) -> FloatArray:
-        """(M,) standard deviation of `pixels` for points of standard deviation 1, 0 where nobody asked for it."""
+        """(M,) standard deviation of `pixels` for points of standard deviation 1, 0 if not computed."""
         return self.rows[:, GAIN]
 
     @property
@@ -81,13 +81,13 @@ class TagSurface:
 
     @property
     def heights(self) -> FloatArray:
-        """(M, 2) how far a unit of the board lies from the line along x, and from that along y, px."""
+        """(M, 2) distance of a unit of the board from the line along x, and from that along y, px."""
         return self.rows[:, HEIGHTS:]
 
     @property
     def seen(self) -> BoolArray:
-        """(M,) whether the place is seen, and how the board lies there is known."""
-        # A sum is a number where all of them are; all(axis=1) takes eight times as long.
+        """(M,) whether the place is visible, with known derivatives."""
+        # A sum is finite if all terms are; all(axis=1) takes eight times as long.
         return np.isfinite(self.rows[:, :SECOND] @ np.ones(SECOND))
 
     @property
@@ -97,7 +97,7 @@ class TagSurface:
 
     @property
     def height(self) -> FloatArray:
-        """(M,) the lesser of the heights; min(axis=1) takes ten times as long."""
+        """(M,) the smaller of the heights; min(axis=1) takes ten times as long."""
         return np.minimum(self.rows[:, HEIGHTS], self.rows[:, HEIGHTS + 1])
 
     def of(self, which: BoolArray) -> TagSurface:
@@ -106,13 +106,12 @@ class TagSurface:
 
 
 def projected(homography: FloatArray, places: FloatArray) -> TagSurface:
-    """Return what a homography (3, 3) does of `places` (M, 2), without curvatures and heights."""
+    """Return the map of a homography (3, 3) at `places` (M, 2), without curvatures and heights."""
     return TagSurface(kernels().project_places(places, homography))
 
 
 def _empty_triangle(max_terms: int) -> FloatArray:
-    """Return what the kernel writes the triangle (T, T) of a polynomial to that has `max_terms` terms at most: those of
-    whole degrees."""
+    """Return the memory (T, T) for the triangle of a polynomial of complete degree with at most `max_terms` terms."""
     terms = TERMS_OF_DEGREE[bisect_right(TERMS_OF_DEGREE, max_terms) - 1]
     return np.zeros((terms, terms))
 
@@ -123,15 +122,14 @@ class Polynomials:
 
     Attributes
     ----------
-    unit : (3,) the middle of the points and half the longer side of their box: places are taken in these.
-    triangle : (T, T) and told : (T, 2), the QR decomposition of the terms at the points, and the values in its basis;
-        the diagonal of a term that the others are as good as at these points is 0.
-    misses : (D,) how far off points usually lie where the others have them, by degree; infinite where that was not
-        tried, for there are too few points, or from degree 6 on no better ones among the two degrees before.
-    plain : the lowest degree that misses by hardly more than the best: what further terms add is noise, which bends
-        lines at the rim.
-    off : (N,) how far the points lie off where the others have them, by the best degree, and gain : (N,) of those.
-    scatter : the median of `off`, beside what those err by.
+    unit : (3,) centre of the points and half the longer side of their bounding box, which normalise places.
+    triangle : (T, T) and basis_values : (T, 2), the QR decomposition of the terms at the points, and the values in its
+        basis; the diagonal is 0 for a term that depends on the others at these points.
+    misses : (D,) typical leave-one-out errors by degree; infinite for degrees that were not tried, with too few points,
+        or from degree 6 on if the two lower degrees gave no improvement.
+    plain : the lowest degree whose error is at most HARDLY_MORE times the smallest: further terms fit noise.
+    off : (N,) leave-one-out errors of the points for the best degree, and gain : (N,) of these predictions.
+    scatter : the median of `off` over hypot(1, gain).
     """
 
     unit: FloatArray
@@ -145,7 +143,7 @@ class Polynomials:
 
     @classmethod
     def through(cls, places: FloatArray, values: FloatArray, max_terms: int, max_leverage: float) -> Polynomials:
-        """Return those through `values` (N, 2) at `places` (N, 2), of `max_terms` terms at most."""
+        """Return the polynomials through `values` (N, 2) at `places` (N, 2), with at most `max_terms` terms."""
         triangle = _empty_triangle(max_terms)
         best, unit, *fitted = kernels().fit_polynomials(places, values, max_leverage, triangle)
         return cls._of(best, unit, triangle, *fitted)
@@ -154,8 +152,8 @@ class Polynomials:
     def beside_perspective(
         cls, places: FloatArray, pixels: FloatArray, max_terms: int, max_leverage: float, nearest: float
     ) -> tuple[FloatArray, Polynomials] | None:
-        """Return the `perspective` that takes `places` (N, 2) nearest to `pixels` (N, 2), and polynomials through what
-        it leaves; None where a place is nearer than `nearest` in it."""
+        """Return the `perspective` from `places` (N, 2) to `pixels` (N, 2), and polynomials through its residuals; None
+        if the depth of a place is less than `nearest`."""
         triangle = _empty_triangle(max_terms)
         best, homography, unit, *fitted = kernels().fit_map(places, pixels, max_leverage, nearest, triangle)
         return None if best < 0 else (homography, cls._of(best, unit, triangle, *fitted))
@@ -185,11 +183,11 @@ class Polynomials:
         )
 
     def added_to(self, base: TagSurface | None, wanted: FloatArray, *, most_certain: bool) -> TagSurface:
-        """Return the map `base` (without one, nothing) at `wanted` (M, 2) with the values there and their derivatives,
-        by the plain degree.
+        """Return the map `base` (None: zero) at `wanted` (M, 2) with the values and derivatives of the plain degree
+        added.
 
-        With `most_certain`, the values are by the degree that is surest at each place, and have gains: beyond the
-        points high degrees run wild, and what counts is the usual miss times the gain.
+        With `most_certain`, the values are those of the degree with the smallest product of typical error and gain at
+        each place, and gains are computed: high degrees diverge beyond the points.
         """
         out = np.zeros((len(wanted), SURFACE_COLUMNS)) if base is None else base.rows.copy()
         kernels().add_polynomial(
@@ -217,7 +215,8 @@ def read_modules(image: GreyImage, quads: FloatArray, side: int) -> tuple[FloatA
 def read_codes(
     image: GreyImage, quads: FloatArray, side: int, patterns: FloatArray, min_contrast: float
 ) -> tuple[IntArray, FloatArray]:
-    """Return which of the `patterns` (C, side * side) the modules of N tags are most like, (N,), and the correlation,
-    (N,); 0 and 0 where their brightness has a standard deviation below `min_contrast`. Else as `read_modules`."""
+    """Return the pattern of `patterns` (C, side * side) with the largest correlation with the modules of N tags, (N,),
+    and the correlation, (N,); 0 and 0 if the standard deviation of their brightness is below `min_contrast`. Otherwise
+    as `read_modules`."""
     read: tuple[IntArray, FloatArray] = kernels().read_codes(image, quads, side, patterns, min_contrast)
     return read

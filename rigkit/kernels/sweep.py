@@ -1,4 +1,4 @@
-"""Calls of the kernels in sweep.c: the costs of a sweep through the ranges, and its surfaces of least cost."""
+"""Calls of the kernels in sweep.c: matching costs of a sweep over ranges, and surfaces of minimal cost."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from rigkit.kernels.declarations import header
 from rigkit.kernels.front import ImageOf
 
 CENSUS_BITS: int = header().constants["CENSUS_BITS"]
-"""Of a sample's census: whether each of the neighbours in 5 x 5 samples is darker."""
+"""Bits of a sample's census: whether each of its neighbours in 5 x 5 samples is darker."""
 
 
 @structure("sweep_t")
 class _SweptRanges(Struct):
-    """Samples of image 1, and where image 2 shows them at each range."""
+    """Samples of image 1, and their positions in image 2 at each range."""
 
 
 @structure("surface_rules_t")
 class _SurfaceRules(Struct):
-    """What steps of a surface from level to level cost."""
+    """Costs of changes of level along a surface."""
 
 
 @structure("claims_t")
 class _Claims(Struct):
-    """Surfaces at some samples, and which samples around are asked about them."""
+    """Surfaces at some samples, and parameters of their neighbourhoods."""
 
 
 def swept_costs(
     image2: NDArray[np.float32], samples1: NDArray[np.float32], table: NDArray[np.float32], spacing: int
 ) -> NDArray[np.uint8]:
-    """Return the bits in which the census of `samples1` (R, C) and of image 2 differ at each of K levels, (R, C, K').
+    """Return the number of different census bits of `samples1` (R, C) and image 2 at each of K levels, (R, C, K').
 
-    `table` (K, r, c, 2) are the places in image 2 of every `spacing`-th sample, NaN where there is none. Where image 2
-    shows nothing it is half of the bits. K' is K and what fills up vectors: levels of high cost.
+    `table` (K, r, c, 2) are the positions in image 2 of every `spacing`-th sample, NaN where undefined. Outside image 2
+    half of the bits count as different. K' is K padded to whole vectors, with levels of high cost.
     """
     rows, columns = samples1.shape
     sweep = _SweptRanges.of(table=table, spacing=spacing, rows=rows, columns=columns)
@@ -46,10 +46,10 @@ def swept_costs(
 def swept_surfaces(
     costs: NDArray[np.uint8], levels: int, samples1: NDArray[np.float32], *, bend: int, jump: int, even: float
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the best of `levels` >= 3 for each sample (R, C), and costs (R, C, 4): its own; of the three around it.
+    """Return the best of `levels` >= 3 for each sample (R, C), and costs (R, C, 4): its own, and the three around it.
 
-    A step to the next level costs `bend`, any larger one `jump` where the brightness of `samples1` is even. Both
-    together are below 120.
+    A change by one level costs `bend`, a larger one `jump` where the brightness of `samples1` is uniform. Their sum
+    must be below 120.
     """
     rows, columns = samples1.shape
     rules = _SurfaceRules.of(rows=rows, columns=columns, levels=levels, bend=bend, jump=jump, even=even)
@@ -68,13 +68,13 @@ def swept_rivals(
     radius: float,
     alike: float,
 ) -> NDArray[np.float32]:
-    """Return for each of N surfaces its costs, and those of the cheapest other one of the same slant, (N, 2).
+    """Return the cost of each of N surfaces and that of the cheapest other surface with the same slant, (N, 2).
 
-    Both are bits a sample, over the samples around that are as bright: those further away than `radius` samples, or
-    different by more than `alike`, count little. NaN where the sweep has none of `levels` there.
+    Both are bits per sample, averaged over neighbouring samples with weights that decrease beyond `radius` samples and
+    for differences of brightness above `alike`. NaN if the sweep has no such level there.
 
-    `surfaces` (N, 4) at `samples` (N, 2), row and column: the level there, its change from row to row and from column
-    to column, and how many levels away another surface begins.
+    `surfaces` (N, 4) at `samples` (N, 2), row and column: the level there, its change per row and per column, and the
+    smallest difference in levels of another surface.
     """
     rows, columns = samples1.shape
     claims = _Claims.of(

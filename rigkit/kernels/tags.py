@@ -37,9 +37,9 @@ def fit_tags(
     maps : (N, 2, 10) polynomials of 1, u, v, uu, uv, vv, uuu, uuv, uvv, vvv, (u, v) the position from `centres` (N, 2)
         over `scales` (N,): the place in the tag, (0, 0) to (1, 1).
     ink : (N, C, C) which of the cells between the `breaks` (C - 1,) along y and x are dark.
-    reach : pixels are used so far beyond the tag, in its sides.
-    blur, contrast : (N,) where to start.
-    curvature_sigma : (N,) how well it is known where the middles of the sides are beside their ends, px.
+    reach : distance beyond the tag up to which pixels are used, in its sides.
+    blur, contrast : (N,) initial values.
+    curvature_sigma : (N,) standard deviation of the middles of the sides relative to their ends, px.
     """
     capacity = int((2.0 * (1.0 + 2.0 * reach) * float(np.max(scales, initial=1.0)) / TAG_SIDE + 2.0) ** 2)
     out = kernels().fit_tags(
