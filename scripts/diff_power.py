@@ -1,10 +1,10 @@
-"""Size and power of `rigkit diff` where the truth is known: calibrations of simulated sessions of 20 images.
+"""Measure the false alarms and the power of `rigkit diff` on simulated sessions of 20 images.
 
-Of every lens (60, 110, 185 degrees) and every kind of error one camera is calibrated from two sessions, and from one
-session more behind a lens that was touched. Errors are corners' own, or common to an image too: a smooth displacement
-of so many px in each of its five modes, as blur, light or a board that bends leave it. Also what the differences of one
-camera are like beside the one expected, and how often the longer focal length could be found at all: by the most
-powerful test there is (Cramér-Rao), and by least squares of single corners whose covariance were exactly known.
+For every lens (60, 110, 185 degrees) and kind of error, one camera is calibrated from two sessions, and from another
+one after the lens was changed. Errors are independent for each corner, or also have a smooth displacement common to an
+image, in five modes, as by blur, light or a bending board. Printed are also the differences for an unchanged camera
+over the predicted, and the upper bounds of the power for a longer focal length: of the most powerful test (Cramér-Rao),
+and of least squares with exactly known covariance.
 
     python scripts/diff_power.py [--seeds 20] [--lenses reg,wide,fish]
 """

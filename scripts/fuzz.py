@@ -1,11 +1,10 @@
-"""Damaged inputs by the thousand: what rigkit reads, changed at random, must end in a result or in one clear line.
+"""Fuzz rigkit: randomly damaged inputs must end in a result or in a clear error message of one line.
 
     python scripts/fuzz.py --count 2000 --seed 7 [--classes board,ply] [--seconds 30] [--memory-gb 4] [--keep DIR]
 
-A finding is an exception that is no RigkitError, exit code 70 or one that is not documented, a message that does not
-name the file, a case that takes too long, and a process that dies. The files of each finding are kept, and it is
-printed with a command that shows it again. The cases depend on seed, class and number alone. Exit code: 1 if anything
-was found.
+A finding is an exception other than RigkitError, exit code 70 or an undocumented one, a message that does not name the
+file, a timeout, or a crash. The files of each finding are kept, and the command that reproduces it is printed. Cases
+depend only on seed, class and number. Exit code: 1 if anything was found.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""OpenCV's fisheye model against Scaramuzza's, by the baseline that they lead to: L. Hajder's experiment.
+"""Compare the baselines with OpenCV's fisheye model and Scaramuzza's model: L. Hajder's experiment.
 
-The cameras of a data set are calibrated from the very same corners of their sessions with each model; the pairs whose
-baseline was measured are reconstructed with each calibration. Prints one row a pair.
+The cameras of a data set are calibrated from the same corners with each model, and the pairs with a measured baseline
+are reconstructed with each calibration. Prints a row for each pair.
 
 Usage: python scripts/lens_models.py datasets/lab-a [--models kannala_brandt scaramuzza] [--pair fisheye-standard ...]
 """

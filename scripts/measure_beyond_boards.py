@@ -1,15 +1,15 @@
-"""Are stated uncertainties true beyond the part of the image that boards covered? Sessions that keep to the middle.
+"""Test the stated uncertainties outside of the part of the image that boards covered.
 
-Random images of one camera, of which only the corners in an ellipse about the middle are kept, are calibrated. After
-the rotation that fits best where boards were, the projection is held against the truth (lab-a, RENDERED), or against
-the calibration from all corners of all other images of the same camera (REAL; its own share is in what is stated).
-Bands are by the distance to the boards' cover, in parts of half the image's diagonal.
+Cameras are calibrated from random images, with only the corners in an ellipse around the middle. After the best
+rotation where boards were, the projection is compared with the truth (lab-a, RENDERED), or with the calibration from
+all corners of all other images of the same camera (REAL; its uncertainty is included). Bands are by the distance to the
+covered part, over half the image's diagonal.
 
     python scripts/measure_beyond_boards.py [SET ...] [--data DIR] [--sessions 20] [--middle .45 .75] [--model MODEL]
         [--cache DIR]
 
-SETs are those of `split_halves.py`. Prints of each set and band: rms error over what is stated, rms of both in px, and
-in how many sessions the error of the band (rms) is more than twice what is stated (rms).
+SETs are those of `split_halves.py`. Prints for each set and band: RMS error over the stated one, both in px, and the
+number of sessions whose RMS error in the band is more than twice the stated one.
 """
 
 from __future__ import annotations

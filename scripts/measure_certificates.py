@@ -1,14 +1,14 @@
-"""Do certificates hold? Rigs and cameras calibrated from noisy corners, and what they then measure.
+"""Test certificates: measure with simulated rigs and cameras that were calibrated from noisy corners.
 
-Each trial is a pair of cameras on one mount (or one camera), calibrated from a few images of a board with noisy corners
-as a user's would be, certified, and used. Used means: lengths, depths, planes and angles at places all over the image,
-of known size, from corners with new noise. Of the errors 95 % should lie within the certificate's 95 % bounds.
+Each trial is a rig of two cameras (or one camera), calibrated from a few images of a board with noisy corners, and
+certified. Then lengths, depths, planes and angles of known size are measured all over the image from corners with new
+noise. 95 % of the errors should be within the certificate's 95 % bounds.
 
-With --departs PX the lenses do what no model does: displacements of their images (powers of the radius, decentring,
-thin prisms, shear) of so many pixels at its corners, others each time; with --half boards are in the left of the image
-alone. With --strange they are of six kinds in turn that are nobody's model, decentred, and the model is "auto" (ten
-times as slow). Errors are told apart by whether all cameras had boards where the thing is measured; beside a share
-stands its standard error, by sessions: one calibration errs alike all over the image.
+With --departs PX the lenses deviate from every model: random displacements of their images (powers of the radius,
+decentring, thin prisms, shear) of PX pixels at the corners; with --half boards are only in the left half of the image.
+With --strange the lenses are of six kinds that no model fits, decentred, and the model is "auto" (ten times slower).
+Errors are listed separately for places where all cameras had boards. The standard error of a share is computed over
+sessions, because errors of one calibration are correlated all over the image.
 
     python scripts/measure_certificates.py [--trials 100] [--frames 12] [--lens brown | kannala_brandt]
         [--departs 0] [--strange] [--half] [--noise 0.1]

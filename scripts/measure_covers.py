@@ -1,15 +1,14 @@
 #!/usr/bin/env python3
-"""What detection makes of REAL boards half of which something covers: is all found that is seen, and nothing else?
+"""Measure recall and false corners on REAL boards that are half covered.
 
     python scripts/measure_covers.py BOARD=FOLDER ... [--most 14] [--kinds flat texture hand] [--share 0.5] [--list]
 
-BOARD is as `rigkit detect --board` takes it. In each image that shows nine in ten of its corners, a straight cover (of
-one grey level, or of random texture), or a hand that reaches in from one side, is laid over a half of the board, in a
-direction drawn at random. The truth is where the corners are found without it. A corner is in view where the cover is
-more than half a square away; it is false where it lies more than a tenth of a square, or a pixel, from every corner
-there is. Prints of each set and kind: boards found (half of 12 corners or more in view), corners found of those in
-view, false ones and the worst of them, corners whose sigma is a twentieth of the square and more, and error over sigma
-(rms) of all others.
+BOARD is as in `rigkit detect --board`. In each image that shows nine tenths of its corners, half of the board is
+covered in a random direction: by a straight cover of one grey level or random texture, or by a hand from one side. The
+truth is the corners found without the cover. A corner is in view if the cover is more than half a square away; it is
+false if it is more than a tenth of a square, or a pixel, from every true corner. Prints for each set and kind: boards
+found (half of 12 corners or more in view), corners found of those in view, false ones and the worst of them, corners
+whose sigma is a twentieth of the square or more, and RMS error over sigma of all others.
 """
 
 from __future__ import annotations

@@ -1,16 +1,15 @@
-"""Are the stated sigmas true? Freshly rendered laboratories, from images, with the calibration's share.
+"""Test the stated sigmas, including the calibration's uncertainty, on newly rendered laboratories.
 
-A laboratory is a lens that nobody has seen before, images of a board to calibrate it from, and pairs of views of three
-perpendicular boards, one for each pose type. The lens is drawn at random, 55 to 75 or 170 to 190 degrees, of a kind
-that none of the models is. Everything goes the way of a user's images: boards are found, the camera is calibrated,
-pairs are reconstructed. Each angle, baseline and normal is then held against the exact truth in its stated sigmas: 68
-and 95 % of them should lie within one and two.
+A laboratory is a random lens, images of a board to calibrate it from, and pairs of views of three perpendicular boards,
+one for each pose type. The lens has 55 to 75 or 170 to 190 degrees and a projection that no model has. Images are
+processed as a user's: boards are detected, the camera is calibrated, pairs are reconstructed. Then the errors of each
+angle, baseline and normal are compared with their sigmas: 68 and 95 % should be within one and two sigmas.
 
     python scripts/measure_honesty.py [--labs 0:20] [--odd] [--json FILE] [--model MODEL] [--views 14]
     python scripts/measure_honesty.py --sessions 20 [--moving] [--images 3,4,5,7,10,20]
 
-One laboratory takes 20 to 40 s. With --json, laboratories that the file has are not made again: run it in pieces, the
-table is of all. --sessions has no images: simulated corners of sessions from three images on, so many of a kind.
+One laboratory takes 20 to 40 s. With --json, laboratories that the file has are not repeated, so it can run in parts;
+the table is of all. --sessions N simulates corners, without images: N sessions of each kind, from three images on.
 """
 
 from __future__ import annotations

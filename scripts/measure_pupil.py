@@ -1,23 +1,24 @@
-"""Is a moving entrance pupil found, and are its sigmas true? SIMULATED sessions of a fisheye before near boards.
+"""Test the detection of a moving entrance pupil and its sigmas: SIMULATED sessions of a fisheye lens and near boards.
 
-A lens of 185 degrees sees 20 boards of 9x6 squares of 12 mm, 70 to 250 mm away, flat, with noise of 0.05 px, or boards
-that are waved (every corner off by 0.02 mm); every third session's lens looks from one point. With --far the boards are
-ten times as large and as far away: there a pupil does nothing, and none is to be found.
+A lens of 185 degrees sees 20 flat boards of 9x6 squares of 12 mm, 70 to 250 mm away, with noise of 0.05 px, or waved
+boards (every corner displaced by 0.02 mm). The lens of every third session is central. With --far the boards are ten
+times as large and as far away; then a pupil has no effect, and none should be detected.
 
     python scripts/measure_pupil.py [--seeds 0:60] [--pupil 3.0 -0.3] [--waved] [--far] [--model kannala_brandt]
     python scripts/measure_pupil.py --pairs [--seeds 0:10] [--pupil 3.0 -0.3]
     python scripts/measure_pupil.py --rig [--seeds 0:12] [--pupil 3.0 -0.3]
     python scripts/measure_pupil.py --real FOLDER --board 8x6x32.5 --model scaramuzza
 
-Of each session: whether the pupil was found, its terms and its shift at 80 degrees in stated sigmas, and how far the
-lens is off the truth far away (rms where boards were, after the best rotation) against what is stated.
+Printed for each session: whether the pupil was detected, errors of its terms and of its shift at 80 degrees over their
+sigmas, and the RMS error of the projection at large distances (where boards were, after the best rotation) with the
+stated one.
 
-With --pairs what the session's camera then measures: four pairs, the camera moved by 40 to 80 mm, of three boards 110
-to 300 mm away; by a central calibration, by the far camera of one with a pupil, and by that with the pupil. With --rig
-two such lenses 60 mm apart, the second's pupil moving 0.8 times as far, in 20 frames: the baseline and the lenses.
-Errors are printed with what they are in stated sigmas. --real takes REAL images of one board. By either half of them
-the camera is calibrated, and any two of the other half are a pair. Its epipolar geometry is held against the pixels,
-its board's shape from triangulated corners against the lattice.
+--pairs measures with the session's camera: four pairs, the camera moved by 40 to 80 mm, of three boards 110 to 300 mm
+away, with a central calibration, with the far camera of one with a pupil, and with the pupil. --rig: two such lenses
+60 mm apart, with 0.8 times the pupil's motion in the second, in 20 frames: errors of the baseline and the lenses, also
+over their sigmas. --real uses REAL images of one board. The camera is calibrated from each half of them, and any two
+images of the other half are a pair: residuals of its epipolar geometry, and of the triangulated board's shape against
+the lattice.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The kernels in board_pose.c: residuals between the points of a rigid board and rays, and the poses that minimise them."""
+"""The kernels in board_pose.c: residuals of the points of a rigid board against rays, and the poses that minimise."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""How well the centres of circles can be placed at all: the Cramer-Rao bound of every circle of a rendered scene.
+"""Compute the Cramer-Rao bound of the centre of every circle of a rendered scene.
 
-As `detection_bench.corner_bound`, from ten unknowns a circle: its position (2), size and slant (3), the blur (1), and
-brightness, contrast and the light's gradient (4). Held as known: how the map from the plane to the image bends, which
-takes the centre off the middle of what is seen, that blur and noise are the same over the cell, the noise's level.
+As `detection_bench.corner_bound`, with ten unknowns for each circle: its position (2), size and slant (3), the blur
+(1), and brightness, contrast and the light's gradient (4). Assumed known: the nonlinearity of the map from the plane to
+the image, which displaces the centre from that of the ellipse, constant blur and noise over the cell, the noise level.
 """
 
 from __future__ import annotations

@@ -1,16 +1,14 @@
-"""How well corners can be placed at all: the Cramer-Rao bound of every corner of a rendered scene.
+"""Compute the Cramer-Rao bound of every corner of a rendered scene.
 
-The image of a corner is taken to depend on nine unknowns: its position (2), the directions of the two lines (2), the
-blur (1), and brightness, contrast and the light's gradient (4). They come from the pixels of its own cell: those nearer
-to it, along the cell's sides, than to its neighbours. Held as known: that lines are straight but for what the lens
-bends, that blur and noise are the same over the cell, the noise's level. Corners are bound one by one: that they belong
-to one plane and one lens is not used. The bound is that of unbiased estimators that know nothing beforehand: one that
-expects angles near those of the board's rows, or a light that is nearly even, may come out a little below it on small,
-foreshortened, noisy squares.
+The image of a corner has nine unknowns: its position (2), the directions of the two lines (2), the blur (1), and
+brightness, contrast and the light's gradient (4). They are estimated from the pixels of its cell: those closer to it,
+along the cell's sides, than to its neighbours. Assumed known: lines are straight except for distortion, blur and noise
+are constant over the cell, and the noise level. Each corner has its own bound; a common plane and lens are not used.
+The bound is for unbiased estimators without priors: one that expects angles close to those of the board's rows, or
+nearly uniform light, may be slightly below it on small, foreshortened, noisy squares.
 
-The derivatives are differences of rendered images, noise-free and before rounding: the scene moved by a part of a
-pixel along u and v, and blurred a little more or less. Moving one line only is a motion of the picture that shears
-along the other line.
+The derivatives are differences of rendered images, noise-free and before rounding: the scene moved by a fraction of a
+pixel along u and v, and blurred a little more or less. Moving one line only is a shear of the image along the other.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Pairs of views of boards that look alike, and whether identifying the boards took the same corners for the same.
+"""Pairs of views of identical boards, and whether identification matched the same corners.
 
-Three boards of one size, each of which looks the same turned by 180 degrees, are the hardest case: nothing but the
-geometry of both views tells which is which, and which way round.
+Three boards of one size, each of which looks the same rotated by 180 degrees, are the hardest case: only the geometry
+of both views determines their identities and orientations.
 """
 
 from __future__ import annotations

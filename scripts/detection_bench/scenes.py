@@ -1,7 +1,7 @@
-"""Scenes on which corner detectors are measured: one board, three, a room full of them, boards cut by the frame.
+"""Scenes to measure corner detectors on: one board, three, a room full of them, boards cut by the frame.
 
-Each function draws one scene from `rng`, for a regular or a fisheye lens, at any image size; `BenchScene.render` makes
-its image and `BenchScene.truth` says where every corner is, `BenchScene.clear` which of them a detector must find.
+Each function draws one scene from `rng`, for a regular or a fisheye lens, at any image size. `BenchScene.render`
+returns its image, `BenchScene.truth` every corner, and `BenchScene.clear` those that a detector must find.
 Pictures without any board are in `detection_bench.blanks`, pairs of views in `detection_bench.pairs`.
 """
 

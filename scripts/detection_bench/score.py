@@ -1,4 +1,4 @@
-"""What a detector found held against exact corners: errors, recall, complete boards, false boards, wrong indices."""
+"""Score detections against exact corners: errors, recall, complete boards, false boards, wrong indices."""
 
 from __future__ import annotations
 

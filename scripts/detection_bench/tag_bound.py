@@ -1,7 +1,7 @@
-"""How well corners of tags can be placed at all: the Cramer-Rao bound, from pixels that show nothing but the corner.
+"""Compute the Cramer-Rao bound of tags' corners, from pixels that show only the corner.
 
-As `detection_bench.corner_bound`, only that lines are not evenly spaced: pixels count up to half of the way to the
-next corner, within the tag and across the gap, and not where its code, blurred, begins.
+As `detection_bench.corner_bound`, but lines are not evenly spaced: pixels are used up to half of the distance to the
+next corner, within the tag and across the gap, but not those of its blurred code.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Things of rows and columns that are no chessboards: keys, puzzles, tables, cloth, floors, walls, codes.
+"""Distractors with rows and columns: keys, puzzles, tables, cloth, floors, walls, codes.
 
-Each is drawn on a sheet and seen turned and aslant; `detection_bench.blanks` puts lens and sensor before it.
+Each is drawn on a sheet and rendered rotated and slanted; `detection_bench.blanks` adds lens and sensor.
 """
 
 from __future__ import annotations

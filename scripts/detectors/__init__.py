@@ -1,1 +1,1 @@
-"""Detectors of boards behind one interface, and what makes an image worse, for the benchmarks of detection."""
+"""Detectors of boards behind one interface, and degradations of images, for the benchmarks of detection."""

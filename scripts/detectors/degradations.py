@@ -1,4 +1,4 @@
-"""What goes wrong between a board and an image, done to an image: optics, light, sensor, codec, framing.
+"""Degrade images by defects of optics, light, sensor, codec and framing.
 
 Each returns the image and the affine map (2, 3) of pixels of the first into it. Levels are 0..255.
 """

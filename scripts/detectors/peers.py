@@ -1,8 +1,8 @@
-"""Detectors of chessboards behind one interface, each in a process of its own.
+"""Detectors of chessboards behind one interface, each in its own process.
 
-A worker process holds one detector on one core with one thread, so that processor time and peak memory are its own, a
-crash is its own, and packages that do not get along with ours can live in another environment. This file needs numpy
-only; everything else is imported by the worker that needs it.
+A worker process runs one detector on one core with one thread. So processor time and peak memory are only the
+detector's, a crash does not affect others, and incompatible packages can be in another environment. This file needs
+only numpy; each worker imports what it needs.
 
     python scripts/detectors/peers.py NAME        run as a worker (by `Worker`): pickles in, pickles out
 """

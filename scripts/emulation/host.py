@@ -1,8 +1,8 @@
-"""A small program in C, made from api.h, that loads the kernels of another system and calls what it is asked to.
+"""Generate a small C program from api.h that loads the kernels of another system and calls their functions.
 
-It shares a file, mapped at one address, with who asks: addresses mean the same on both sides. A call is one number on
-its standard input, the function's; the arguments stand at the beginning of the file, eight bytes each, and the result
-takes their place.
+It shares a file with the caller, mapped at the same address, so that pointers are valid on both sides. A call is the
+number of the function on its standard input. The arguments are at the beginning of the file, eight bytes each, and are
+replaced by the result.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What the tests call in place of the kernels of this system: the same calls, made by the program of `host`.
+"""Replace the kernels in the tests by calls to the program of `host`.
 
-A plugin of pytest (-p emulation.remote). Arrays and structures are copied into the shared file before a call and back
+A pytest plugin (-p emulation.remote). Arrays and structures are copied into the shared file before a call and back
 after it, with all addresses in them translated.
 """
 

@@ -1,1 +1,1 @@
-"""What `fuzz.py` damages, how, and what reads it."""
+"""Inputs, mutations and readers of `fuzz.py`."""

@@ -1,4 +1,4 @@
-"""Calls of the library with arguments that make no sense, for `fuzz.py`."""
+"""Calls of the library with invalid arguments, for `fuzz.py`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Good commands on the good files (`seeds.py`), for `fuzz.py` to put other words into."""
+"""Valid commands on the valid files (`seeds.py`), for `fuzz.py` to change words of."""
 
 from __future__ import annotations
 

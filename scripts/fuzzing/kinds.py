@@ -1,4 +1,4 @@
-"""The classes of input that `fuzz.py` damages, and what reads each."""
+"""The classes of input that `fuzz.py` damages, and their readers."""
 
 from __future__ import annotations
 

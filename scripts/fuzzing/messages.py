@@ -1,4 +1,4 @@
-"""What a message of an error has to say: about which file or option, and what to do. For `fuzz.py`."""
+"""Requirements on error messages, for `fuzz.py`: they must name the file or option, and what to do."""
 
 from __future__ import annotations
 

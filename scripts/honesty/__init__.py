@@ -1,4 +1,4 @@
-"""The small sessions of `measure_honesty.py`, of scenes that the tests have, too."""
+"""Laboratories and small sessions of `measure_honesty.py`, with scenes of the tests."""
 
 import sys
 from pathlib import Path

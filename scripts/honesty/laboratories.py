@@ -1,4 +1,4 @@
-"""Laboratories: a lens that nobody has seen before, and images of a board that a user would take with it.
+"""Laboratories: a random lens, and images of a board as a user would take them.
 
 Ordinary ones have 960 x 720 pixels and 55 to 75 or 170 to 190 degrees. Odd ones have any number of pixels from 320 x
 240 to 2400 x 1800, a lens of 45 to 200 degrees, six to 24 images, sharp or blurred, some of them JPEG.

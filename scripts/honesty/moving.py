@@ -1,7 +1,7 @@
-"""Boards that move before cameras without a common trigger: how far off is the rig, in stated sigmas?
+"""Errors of rigs, over their sigmas, from boards that move in front of cameras without a common trigger.
 
-Neighbouring frames err alike, as the board goes on the same way for a while: each camera lags by a time of its own, and
-by a little more in every frame, and may read its image row by row.
+Each camera has its own lag, with a small random part in every frame, and may read its image row by row. Errors of
+successive frames are correlated, because the board keeps its direction for a while.
 """
 
 from __future__ import annotations

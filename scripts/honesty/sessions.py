@@ -1,9 +1,8 @@
-"""Small sessions: the stated sigmas of lens, mounts and baseline after three images, or after twenty; of boards
-mounted to each other, and of a camera on a robot's hand.
+"""Errors over sigmas of lens, extrinsics and baseline in sessions of three to twenty images; of boards mounted to each
+other, and of a camera on a robot's hand.
 
-Corners are simulated: each with an error of its own, and with a smooth one that an image's corners have in common, as
-blur, light or a board that bends leave it. Boards are seen whole, or in part as ChArUco boards are: what lies on one
-side of a line across them.
+Corners are simulated with independent errors, and a smooth error common to an image, as by blur, light or a bending
+board. Boards are seen whole, or, as ChArUco boards may be, only on one side of a line across them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Small sessions: so few images of one camera as users take, calibrated apart from all others of it.
+"""Test the sigmas of small sessions against the calibration from all other images of the same camera.
 
-What a small session states of itself is held against the calibration from all other images of the same camera, which
-has its own share in the difference. Random draws of 3, 4, 5, 7 and 10 images, model and board's shape chosen as for a
-user ("auto").
+The uncertainty of the latter is included. Random draws of 3, 4, 5, 7 and 10 images, with automatic model and board
+shape ("auto").
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""SIMULATED twins of a real session: its poses, its lens and its bent board, its images' errors dealt anew.
+"""SIMULATED twins of a real session: its poses, lens and bent board, with its images' errors redistributed.
 
-Whether a small session says too much of itself, or this one breaks what is assumed, twins tell apart: in them every
-image errs like any other. The errors of an image are those that a random one of the real images has left, mirrored
-left to right, upside down, and in their sign, by chance: smooth and large where the real ones are.
+In twins all images have the same distribution of errors. So they show whether sigmas of small sessions are too small in
+general, or the real session violates the assumptions. The errors of an image are the residuals of a random real image,
+randomly mirrored in both directions and in sign: smooth and large where the real ones are.
 """
 
 from __future__ import annotations
