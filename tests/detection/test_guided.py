@@ -196,12 +196,13 @@ def test_a_blurred_board_is_placed_together_with_a_camera_too() -> None:
 def test_corners_are_judged_by_those_beside_them() -> None:
     state = BoardState.unfitted(np.zeros((6, 9, 2)), np.ones((6, 9)))
     shade = np.where(np.arange(9) < 4, 0.25, 1.0) * np.ones((6, 1))
-    state = replace(state, contrast=120.0 * shade, residual=2.0 * shade)
+    state = replace(state, contrast=120.0 * shade, residual=2.0 * shade, sigma_px=0.1 / shade)
     missing = np.zeros((6, 9), bool)
     missing[2:4, [0, 8]] = True
-    contrast, residual = state.without(missing).typical_near(missing)
+    contrast, residual, sigma_px = state.without(missing).typical_near(missing)
     assert np.array_equal(contrast, [30.0, 120.0, 30.0, 120.0])
     assert np.array_equal(residual, [0.5, 2.0, 0.5, 2.0])
+    assert np.array_equal(sigma_px, [0.4, 0.1, 0.4, 0.1])
 
 
 def test_a_corner_without_a_fit_of_its_own_does_not_spoil_the_others() -> None:

@@ -84,15 +84,18 @@ class BoardState:
     def typical_sigma(self) -> float:
         return known_median(self.sigma_px[self.known])
 
-    def typical_near(self, cells: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return median contrast and residual of the neighbours of each of the `cells` (R, C), (M,) each: light, blur
-        and size of the squares vary over a board."""
+    def typical_near(self, cells: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return median contrast, residual and sigma of the neighbours of each of the `cells` (R, C), (M,) each: light,
+        blur and size of the squares vary over a board."""
         row, column = np.nonzero(cells)
         known_row, known_column = np.nonzero(self.known & np.isfinite(self.residual))
         separation = (row[:, None] - known_row) ** 2 + (column[:, None] - known_column) ** 2
         nearest = np.argsort(separation, axis=1, kind="stable")[:, :NEIGHBOURS_USED]
         around = known_row[nearest], known_column[nearest]
-        return np.median(self.contrast[around], axis=1), np.median(self.residual[around], axis=1)
+        contrast, residual, sigma = (
+            np.median(values[around], axis=1) for values in (self.contrast, self.residual, self.sigma_px)
+        )
+        return contrast, residual, sigma
 
     def with_fit(self, cells: BoolArray, fit: EdgeFit, good: BoolArray) -> BoardState:
         """Return the state with the `good` ones of the corners fitted at `cells`."""

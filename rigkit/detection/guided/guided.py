@@ -31,7 +31,7 @@ from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
-from rigkit.detection.subpixel.uncertain_corners import strays
+from rigkit.detection.subpixel.uncertain_corners import IN_PLACE_CELLS, UNCERTAIN_FACTOR, strays
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
@@ -75,6 +75,10 @@ objects in the window increase it."""
 
 MAX_ADDED_RESIDUAL_MARKED = 3.0
 """The same on ChArUco boards, where the part of the markers in the windows varies."""
+
+MAX_UNEXPLAINED, UNEXPLAINED_FACTOR = 0.25, 3.0
+"""Residual in parts of the corner's contrast, of its neighbours' too where that is more (ink of markers): where one of
+the four squares is missing, at the end of the paper or under a cover, it is 0.3 and more."""
 
 MAX_SIGMA_CELLS = 0.03
 """Largest predicted standard deviation of an added corner, in sides of the cell."""
@@ -280,13 +284,16 @@ def _confirmed(
     if guide.camera is not None:
         typical = float(np.median(np.linalg.norm(state.pixels[known] - guide.at(state, known)[0].pixels, axis=1)))
         limit = np.minimum(limit, np.maximum(MOVED_FACTOR * typical * shape.gain, MOVED_PX))
-    contrast, residual = state.typical_near(cells)
+    contrast, residual, sigma_px = state.typical_near(cells)
     good = fit.valid & (moved < limit) & (fit.contrast > MIN_ADDED_CONTRAST * contrast)
     # Noise is independent of the contrast, model errors grow with it.
     most = MAX_ADDED_RESIDUAL if guide.camera is not None else MAX_ADDED_RESIDUAL_ALONE
     most = MAX_ADDED_RESIDUAL_MARKED if isinstance(guide.board.pattern, Charuco) else most
     good &= fit.residual < most * residual * np.maximum(1.0, fit.contrast / contrast)
     good &= fit.sigma_px < MAX_SIGMA_CELLS * side
+    good &= fit.residual < np.maximum(MAX_UNEXPLAINED, UNEXPLAINED_FACTOR * residual / contrast) * fit.contrast
+    # What is unsure leads to more of its like: on a cover with a texture, ring by ring.
+    good &= (fit.sigma_px < UNCERTAIN_FACTOR * sigma_px) | (moved < IN_PLACE_CELLS * side)
     return np.asarray(good)
 
 

@@ -100,12 +100,15 @@ def checked(item: RefinedLattice, parts: Sequence[tuple[slice, slice]]) -> Refin
     excess = spread(distance / (item.sigma_px[known] * np.hypot(1.0, shape.gain)))
     gain = spread(shape.gain)
     relative = item.noise / item.lattice.contrast
+    # Nor is a corner one that has no other beside it: nobody judges it.
+    around = cv2.boxFilter(known.astype(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    alone = known & (around == 1)
     drop = np.zeros_like(known)
     for part in parts:
         here, sure = known[part], judged[part]
         if here.sum() < MIN_CHECKED:
             continue
-        drop[part] = strays(item.sigma_px[part], cells[part], gain[part])
+        drop[part] = alone[part] | strays(item.sigma_px[part], cells[part], gain[part])
         if sure.sum() < MIN_TESTED:
             continue
         typical = upper_median(cells[part][sure])
