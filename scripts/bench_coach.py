@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 from bench_planner import BOARD, LENSES, NOISE_PX, SIZE, Lens, by_hand, true_error
 from bench_rig_planner import MOUNT, NAMES
+from halves.captures import CAPTURES
 from planner.real import GRID, Images
 from scipy.optimize import least_squares
-from split_halves import CAPTURES
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.displaced import uncertain_camera

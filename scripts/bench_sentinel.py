@@ -32,12 +32,12 @@ from pathlib import Path
 import bench_planner
 import numpy as np
 from bench_planner import LENSES, Lens, by_hand, free_poses, see
+from halves.captures import identified
 from scipy.special import ndtr, ndtri
 from sentinel.captures import SAID, left_out, real
 from sentinel.pupils import pupils
 from sentinel.scenes import pairs
 from sentinel.tally import CHANGED_PX, COUNTED, FRESH, KINDS, SCENE_TURNED_DEG, TALLY, checked, tell, turned, unchanged
-from split_halves import identified
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.displaced import DisplacedCamera

@@ -22,9 +22,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+from halves.power import shift_px
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
 from helpers.focal_bounds import best_powers
-from split_halves import shift_px
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.compare import CalibrationComparison, CameraVerdict, compare_calibrations

@@ -21,8 +21,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from halves.captures import CAPTURES, Loaded, Views, load
+from halves.comparing import calibrated
 from scipy.ndimage import distance_transform_edt
-from split_halves import CAPTURES, Loaded, Views, calibrated, load
 
 from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.certainty.uncertainty import FarProjection

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from split_halves import load
+from halves.captures import load
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.coverage import covered_by_boards

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from split_halves import load
+from halves.captures import load
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration

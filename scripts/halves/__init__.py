@@ -1,0 +1,1 @@
+"""Parts of `split_halves.py`: captures of cameras and of rigs, halves of them, and lenses that were touched."""
