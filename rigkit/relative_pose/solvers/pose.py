@@ -12,6 +12,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import cross, log_so3, skew
 from rigkit.geometry.triangulation import ray_ranges
 from rigkit.relative_pose.solvers.eight_point import essential_nearest
+from rigkit.relative_pose.solvers.weights import px_angles
 
 
 def essential_from_pose(cam2_from_cam1: Rigid3) -> Mat3:
@@ -99,9 +100,8 @@ def cheirality_margin(matches: Matches, cam2_from_cam1: Rigid3) -> FloatArray:
 
 def parallax_noise(matches: Matches) -> FloatArray:
     """Return the standard deviation (N,), rad, of the angle between the rays of each match in a fixed direction."""
-    m = matches
-    size1, size2 = (np.sqrt(0.5 * np.sum(b * b, axis=(1, 2))) for b in (m.jacobians1, m.jacobians2))
-    return np.asarray(np.hypot(m.sigma1_px * size1, m.sigma2_px * size2))
+    size1, size2 = px_angles(matches)
+    return np.asarray(np.hypot(matches.sigma1_px * size1, matches.sigma2_px * size2))
 
 
 def _in_front(pose: Rigid3, rays1: Rays, rays2: Rays) -> tuple[int, int]:

@@ -67,10 +67,15 @@ def assumed_sigma_A(matches: Matches, rule: WeightRule) -> FloatArray:
     raise InputError(f"weights '{rule}' are unknown; use 'noise', 'auto', 'equal' or 'points'")
 
 
-def initial_weights(matches: Matches, sigma_A: FloatArray) -> RowWeights:
-    """Return weights before E is known: |n1| and |n2| are approximated by the rms column norms of the ray Jacobians."""
+def px_angles(matches: Matches) -> tuple[FloatArray, FloatArray]:
+    """Return the angle per pixel (N,), rad, at the rays of either image: the rms column norm of the ray Jacobian."""
     size1, size2 = (np.sqrt(0.5 * np.sum(b * b, axis=(-2, -1))) for b in (matches.jacobians1, matches.jacobians2))
-    return _weights(matches, size1, size2, sigma_A)
+    return size1, size2
+
+
+def initial_weights(matches: Matches, sigma_A: FloatArray) -> RowWeights:
+    """Return weights before E is known: |n1| and |n2| are approximated by `px_angles`."""
+    return _weights(matches, *px_angles(matches), sigma_A)
 
 
 def noise_weights(matches: Matches, E21: Mat3, sigma_A: FloatArray) -> RowWeights:
@@ -99,10 +104,9 @@ def pixel_share(matches: Matches, E21: Mat3) -> FloatArray:
 
 
 def equal_weights(matches: Matches) -> RowWeights:
-    """Return equal weights of all rows, affinities' rows divided by the mean size of the ray Jacobians of image 1."""
-    usable = usable_affinities(matches)
-    size1 = np.sqrt(0.5 * np.sum(matches.jacobians1**2, axis=(-2, -1)))
-    return RowWeights(np.ones(len(matches)), np.where(usable, 1.0 / size1.mean(), 0.0), np.full(len(matches), np.nan))
+    """Return equal weights of all rows, affinities' rows divided by the mean of `px_angles` of image 1."""
+    usable, unit = usable_affinities(matches), px_angles(matches)[0].mean()
+    return RowWeights(np.ones(len(matches)), np.where(usable, 1.0 / unit, 0.0), np.full(len(matches), np.nan))
 
 
 def affinity_residuals(matches: Matches, E21: Mat3) -> FloatArray:
