@@ -1,4 +1,4 @@
-"""Where boards can be held, and a length that is to be measured: arguments of `check`, `coach` and `plan`."""
+"""Arguments of `check`, `coach` and `plan` for the positions of boards and for a length to be measured."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ if TYPE_CHECKING:
 
 
 def add_reach_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add where boards can be held."""
+    """Add the limits of the positions of boards."""
     parser.add_argument("--near", type=float, default=0.0, metavar="MM", help="the board is not sharp nearer than this")
     parser.add_argument("--far", type=float, default=float("inf"), metavar="MM", help="nor held farther than this")
     parser.add_argument("--field", type=float, metavar="DEG", help="the lens sees no more than this full angle")
 
 
 def reach_of(args: argparse.Namespace) -> Reach:
-    """Return where boards can be held."""
+    """Return the limits of the positions of boards."""
     from rigkit.planning.candidates import Reach
 
     return Reach(nearest_mm=args.near, farthest_mm=args.far, field_deg=args.field)
 
 
 def length_of(args: argparse.Namespace, verb: str) -> Task | None:
-    """Return the length at a distance that is asked for, if one is; raises InputError for one without the other."""
+    """Return the length to be measured, or None; raises InputError for a length without distance or vice versa."""
     from rigkit.validation.certificate.contracts import Quantity, Task
 
     if (args.length is None) != (args.distance is None):

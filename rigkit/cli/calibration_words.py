@@ -1,4 +1,4 @@
-"""What `rigkit calibrate` says of one camera: for programs and for a person."""
+"""Output of `rigkit calibrate` for one camera, as JSON and as text."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_NAMED = 3
 
 
 def page(calibration: Calibration, boards: Sequence[Board]) -> PageFacts:
-    """Return what the page says of one camera, with the pictures of `boards` to take next where any are to be found."""
+    """Return the facts on the page of one camera, with the pictures of `boards` to take next if a plan exists."""
     from rigkit.report.pages.calibration_facts import camera_facts
     from rigkit.workflows.calibration.next_pictures import next_views
 
@@ -29,7 +29,7 @@ def page(calibration: Calibration, boards: Sequence[Board]) -> PageFacts:
 
 
 def summary(calibration: Calibration) -> dict[str, Any]:
-    """Return the figures for programs."""
+    """Return the result as JSON values."""
     from rigkit.io.calibrations.calibration_file import camera_to_json
 
     camera = calibration.camera
@@ -47,7 +47,7 @@ def summary(calibration: Calibration) -> dict[str, Any]:
 
 
 def describe(calibration: Calibration) -> str:
-    """Return the result for a person: the headline first."""
+    """Return the result as text, the headline first."""
     from rigkit.rectification.targets import field_across
     from rigkit.report.pages.calibration_facts import focal_words, training_note
     from rigkit.report.tables import rounded_parameters
@@ -72,23 +72,24 @@ def describe(calibration: Calibration) -> str:
 
 
 def left_out(calibration: Calibration) -> list[str]:
-    """Return a line for each reason why images are left out, or something in images that are used; the page and --json
-    name every image."""
+    """Return one line for each reason why images, or parts of used images, are left out."""
     used = {view.image for view in calibration.views}
     images: dict[tuple[str, str], list[str]] = {}
     for image, reason in calibration.dropped:
         images.setdefault(("left out of" if image in used else "dropped", reason), []).append(image)
-    return [f"{how} {_named(some)}: {reason}" for (how, reason), some in sorted(images.items(), key=lambda i: i[0][0])]
+    return [
+        f"{how} {_first_names(some)}: {reason}" for (how, reason), some in sorted(images.items(), key=lambda i: i[0][0])
+    ]
 
 
-def _named(images: Sequence[str]) -> str:
-    """Return the first images by name: of a video hundreds may show nothing."""
+def _first_names(images: Sequence[str]) -> str:
+    """Return the first images by name, and the number of the others."""
     more = len(images) - MAX_NAMED
     return ", ".join(images[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _choices(candidates: Sequence[Candidate]) -> list[str]:
-    """Return what was chosen of how many; the page and --json have every figure."""
+    """Return one line for each automatic choice."""
     lines = []
     for what in ("model", "board", "lens with"):
         tried = [c for c in candidates if _chosen_of(c) == what]
@@ -101,7 +102,7 @@ def _choices(candidates: Sequence[Candidate]) -> list[str]:
 
 
 def _chosen_of(candidate: Candidate) -> str:
-    """Return of what a candidate is one: models, shapes of boards, or whether the lens looks from one point."""
+    """Return which choice a candidate belongs to: model, board shape, or entrance pupil ("lens with")."""
     from rigkit.calibration.with_pupil import CENTRAL, MOVING
 
     if candidate.name in (CENTRAL, MOVING):

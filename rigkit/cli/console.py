@@ -1,4 +1,4 @@
-"""What the verbs share: a progress line on stderr, and results on stdout."""
+"""Common functions of the verbs: progress on stderr, results on stdout, options from arguments."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ IMAGE_SIZE = re.compile(r"([0-9]{1,6})[xX]([0-9]{1,6})")
 
 
 def progress_on_stderr() -> Progress:
-    """Return a progress callback: a bar that redraws on a terminal, one line a finished stage elsewhere."""
+    """Return a progress callback: a bar on a terminal, elsewhere one line for each finished stage."""
     started: dict[str, float] = {}
     drawn = 0.0
 
@@ -38,7 +38,7 @@ def progress_on_stderr() -> Progress:
         now = time.monotonic()
         started.setdefault(what, now)
         finished = done >= total
-        # A stderr that is closed or full loses the bar, not the work.
+        # A closed or full stderr must not stop the work.
         with suppress(OSError, ValueError):
             if sys.stderr.isatty():
                 if finished or now - drawn >= REDRAW_S:
@@ -56,18 +56,18 @@ def progress_on_stderr() -> Progress:
 
 
 def note(text: str) -> None:
-    """Tell the person at the terminal: through the log, which goes to stderr; results go to stdout."""
+    """Log a message for the user, which goes to stderr."""
     logging.getLogger("rigkit.cli").info("%s", printable(text))
 
 
 def note_written(paths: Iterable[Path]) -> None:
-    """Tell which files were written."""
+    """Log the written files."""
     for path in paths:
         note(f"{path} written")
 
 
 def options_of(kind: type[Options], args: Namespace, /, **others: Any) -> Options:
-    """Return a workflow's options: `others`, and of its further fields those of which arguments have the names."""
+    """Return a workflow's options from `others` and from the arguments with the names of its other fields."""
     from dataclasses import fields
 
     own = {f.name for f in fields(kind) if f.name not in others}  # type: ignore[arg-type]
@@ -76,12 +76,12 @@ def options_of(kind: type[Options], args: Namespace, /, **others: Any) -> Option
 
 
 def print_statement(facts: PageFacts) -> None:
-    """Print what a page states: its headline, and its sentences below."""
+    """Print headline and sentences of a page."""
     print("\n  ".join([facts.headline, *facts.sentences]))
 
 
 def pose_in_words(name: str, pose: Rigid3, turn_sigma_rad: FloatArray, move_sigma_mm: FloatArray) -> str:
-    """Return a pose as rotation vector (deg) and translation (mm), each with its standard deviation."""
+    """Return a pose in words: rotation vector (deg) and translation (mm) with standard deviations."""
     import numpy as np
 
     from rigkit.geometry.rotation import log_so3
@@ -95,7 +95,7 @@ def pose_in_words(name: str, pose: Rigid3, turn_sigma_rad: FloatArray, move_sigm
 
 
 def print_json(value: Any) -> None:
-    """Print a result for programs."""
+    """Print a result as JSON."""
     print(json.dumps(value, indent=1, allow_nan=False))
 
 

@@ -1,4 +1,4 @@
-"""What the verbs on a data set share: their arguments, the folder of results, and what came to nothing."""
+"""Common arguments of the verbs on a data set, the folder of results, and failed pairs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = False, several: bool = False) -> None:
-    """Add what every verb on a data set takes; `optional`: the verb works on something else too; `several`: on many."""
+    """Add the common arguments; `optional`: the data set may be missing; `several`: there may be more than one."""
     number = "?" if optional else "+" if several else None
     parser.add_argument(
         "dataset", metavar="DATASET", nargs=number, help="folder with a dataset.toml, or the file itself"
@@ -31,7 +31,7 @@ def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = F
 
 
 def add_direction_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what normals are computed from."""
+    """Add the choices of directions that normals are computed from."""
     parser.add_argument(
         "--directions",
         choices=("chord", "neighbours", "line", "patch"),
@@ -45,7 +45,7 @@ def add_direction_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_planes_argument(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add what is known of the boards' points, with a word on `what` that decides."""
+    """Add the choice of the boards' planes; `what` it affects is for the help text."""
     parser.add_argument(
         "--planes",
         choices=("free", "coplanar", "lattice"),
@@ -55,14 +55,14 @@ def add_planes_argument(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def results_folder(args: argparse.Namespace, name: str) -> Path:
-    """Return the folder asked for, or a new one of that name."""
+    """Return the folder of `--output`, or a new one of that name."""
     from rigkit.workflows.outputs.results import free_folder
 
     return Path(args.output) if args.output else free_folder(name, force=args.force)
 
 
 def dataset_options(args: argparse.Namespace, name: str) -> dict[str, Any]:
-    """Return the fields of `DatasetOptions` that the arguments tell, for the data set of that name."""
+    """Return the fields of `DatasetOptions` from the arguments, for the data set `name`."""
     return {
         "pairs": tuple(args.pair),
         "output": results_folder(args, name),
@@ -74,18 +74,18 @@ def dataset_options(args: argparse.Namespace, name: str) -> dict[str, Any]:
 
 
 def direction_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the fields of `DatasetOptions` about directions that were given."""
+    """Return the fields of `DatasetOptions` for the given direction arguments."""
     given = {"support": args.directions, "det_scale": args.det_scale}
     return {name: value for name, value in given.items() if value is not None}
 
 
 def failed_pairs(failures: Sequence[PairFailure]) -> dict[str, dict[str, str]]:
-    """Return what a program needs to know of `failures`; nothing where there are none."""
+    """Return the failures as JSON values; {} without any."""
     return {"failed": {failure.pair_id: str(failure.error) for failure in failures}} if failures else {}
 
 
 def exit_code_of(failures: Sequence[PairFailure], otherwise: int) -> int:
-    """Say which pairs came to nothing; return the exit code that the first of them asks for, else `otherwise`."""
+    """Log the failed pairs; return the exit code of the first one's error, or `otherwise` without failures."""
     for failure in failures:
         note(str(failure))
     return failures[0].error.exit_code if failures else otherwise

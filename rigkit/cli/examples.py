@@ -1,4 +1,4 @@
-"""What to type: examples of every verb, which `rigkit VERB --help` ends with."""
+"""Examples of every verb, for the end of `rigkit VERB --help`."""
 
 from __future__ import annotations
 
@@ -136,4 +136,4 @@ EXAMPLES: dict[str, str] = {
   rigkit schema session -o session.json  and in the session's first line: #:schema ./session.json
 """,
 }
-"""Verb -> lines to type, each with what it does."""
+"""Verb -> example commands with comments."""

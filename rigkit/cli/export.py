@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--to", choices=sorted({*CAMERA_FORMATS, *CLOUD_FORMATS}), help="format (default: by the ending)"
     )
     parser.add_argument(
-        "--from", dest="source_format", choices=READ_FORMATS, help="of a camera file (default: told by its content)"
+        "--from", dest="source_format", choices=READ_FORMATS, help="of a camera file (default: by its content)"
     )
     parser.add_argument("--names", nargs="+", metavar="CAMERA", help="of a rig, in this order (default: all)")
     parser.add_argument("--size", metavar="WxH", help="of the images, px, where a file does not say it")

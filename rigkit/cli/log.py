@@ -1,4 +1,4 @@
-"""Where the library's log goes: notes to stderr, with -v the details too, with --log-file everything into a file."""
+"""Handlers of the library's log: notes to stderr, with -v also details; with --log-file everything to a file."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from rigkit.io.disk.reading import usable_path
 
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 LINE = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} [A-Z]+ rigkit")
-"""How the first line of a log of ours begins."""
+"""Start of a log file of rigkit."""
 
 
 def add_log_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what every verb takes."""
+    """Add the log arguments of every verb."""
     group = parser.add_argument_group("log")
     group.add_argument("-v", "--verbose", action="store_true", help="say on stderr what is being done, and with what")
     group.add_argument("--log-file", type=Path, metavar="FILE", help="append all of that, with times, to a file")
 
 
 def _appending(path: Path) -> logging.Handler:
-    """Return a handler that appends to the file; InputError where that is not a log of ours, or cannot be written."""
+    """Return a handler that appends to a file; raises InputError if it is no log of rigkit, or cannot be written."""
     usable_path(path)
     try:
         if path.exists() and not path.is_file():
@@ -46,7 +46,7 @@ def _appending(path: Path) -> logging.Handler:
 
 
 class _InFile(logging.FileHandler):
-    """Appends to a file; a disk that is full loses the rest of the log, which is said once, not results."""
+    """Appends to a file; if the disk is full, it says so once and does not stop the work."""
 
     given = False
 
@@ -93,10 +93,10 @@ def _noted(
 
 @contextmanager
 def logging_to(*, verbose: bool, log_file: Path | None) -> Iterator[None]:
-    """Let the log of the package go to stderr (details if `verbose`) and to `log_file` within the block. Warnings of
-    numpy about numbers that are refused afterwards are details, not messages.
+    """Send the log of the package to stderr (with details if `verbose`) and to `log_file` within the block.
 
-    Raises InputError where the file cannot be written.
+    Python's warnings, such as numpy's about invalid values, count as details. Raises InputError if the file cannot be
+    written.
     """
     root = logging.getLogger("rigkit")
     terminal = _OnStderr(logging.DEBUG if verbose else logging.INFO)
@@ -119,7 +119,7 @@ def logging_to(*, verbose: bool, log_file: Path | None) -> Iterator[None]:
 
 
 def logged_run(args: argparse.Namespace) -> int:
-    """Run the verb, with its options and what ends it in the log."""
+    """Run the verb, and log its options and any exception."""
     log = logging.getLogger(__name__)
     log.debug("rigkit %s: %s", args.verb, {k: v for k, v in vars(args).items() if k not in ("verb", "run")})
     try:

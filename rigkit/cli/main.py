@@ -45,11 +45,11 @@ VERBS: dict[str, str] = {
     "fetch": "public captures with measured truth",
     "schema": "every key of every file, as JSON Schema or a table",
 }
-"""Verb -> what it does, in a line; `rigkit VERB --help` begins with the docstring of its module."""
+"""Verb -> summary; `rigkit VERB --help` begins with the docstring of its module."""
 
 
 class _Version(argparse.Action):
-    """Shows what is installed; the kernels are looked at only when asked for."""
+    """Prints the version and the kernels, which are only imported for that."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, help: str | None = None) -> None:
         super().__init__(option_strings, argparse.SUPPRESS, nargs=0, help=help)
@@ -66,7 +66,7 @@ class _Version(argparse.Action):
 
 
 class _VerbParser(argparse.ArgumentParser):
-    """A verb's parser: of an argument that it does not know it shows its own usage, not that of all verbs."""
+    """Parser of a verb, which shows its own usage for unknown arguments, not that of the main parser."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         known, unknown = super().parse_known_args(args, namespace)
@@ -76,7 +76,7 @@ class _VerbParser(argparse.ArgumentParser):
 
 
 def build_parser(verb: str | None) -> argparse.ArgumentParser:
-    """Return the parser; only the module of `verb` is imported, and only a word that is no verb needs all of them."""
+    """Return the parser with the arguments of `verb`, whose module alone is imported; else with all verbs' names."""
     listed = "\n".join(f"  {name:<12} {summary}" for name, summary in VERBS.items())
     parser = argparse.ArgumentParser(
         prog="rigkit",
@@ -105,7 +105,7 @@ def build_parser(verb: str | None) -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    # The matrices here are small: threads inside BLAS only get in each other's way.
+    # The matrices are small: threads inside BLAS slow the program down.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = list(sys.argv[1:] if argv is None else argv)
     verb = next((a for a in arguments if not a.startswith("-")), None)

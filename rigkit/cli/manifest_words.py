@@ -1,4 +1,4 @@
-"""What the options of `rigkit init` say about a manifest, and the questions for what they leave open."""
+"""Parsers of the options of `rigkit init`, and questions at the terminal for missing facts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ONE_CAMERA, TWO_CAMERAS = ("camera",), ("camera1", "camera2")
 
 
 def require_answers(args: argparse.Namespace) -> None:
-    """Raise InputError that names everything that nobody has said and that, without a terminal, nobody can be asked."""
+    """Raise InputError for missing options if there is no terminal to ask for them."""
     needed = {
         "--square-mm": ("side of a square, mm", args.square_mm or args.board or None),
         "--calibration": ("camera's calibration.json", args.calibration or None),
@@ -38,8 +38,8 @@ def require_answers(args: argparse.Namespace) -> None:
 
 
 def parse_calibrations(declared: Sequence[str], folder: Path) -> dict[str, str]:
-    """Return camera -> path of its calibration, as it stands in a manifest in `folder`; paths are as typed, or from
-    that folder. A rig's file stands for those of its cameras, under their names."""
+    """Return camera -> path of its calibration for a manifest in `folder`; existing relative paths are rewritten to
+    it. A rig's file is replaced by the files of its cameras, with their names."""
     declared = _of_rigs(declared)
     typical = TWO_CAMERAS if len(declared) == 2 else ONE_CAMERA
     out: dict[str, str] = {}
@@ -59,7 +59,7 @@ def parse_calibrations(declared: Sequence[str], folder: Path) -> dict[str, str]:
 
 
 def _of_rigs(declared: Sequence[str]) -> list[str]:
-    """Return what is told with every rig's file replaced by those of its cameras, NAME=FILE."""
+    """Return `declared` with every rig's file replaced by NAME=FILE of its cameras."""
     from rigkit.io.calibrations.rig_file import is_rig_file
     from rigkit.workflows.inputs.camera_files import own_files
 
@@ -72,7 +72,7 @@ def _of_rigs(declared: Sequence[str]) -> list[str]:
 
 
 def parse_boards(words: Sequence[str]) -> list[DeclaredBoard]:
-    """Return the boards that are told: files keep their names, words are called plane1, plane2, ... in their order."""
+    """Return the boards of --board: those of files keep their ids, those in words are plane1, plane2, ... by order."""
     from rigkit.io.boards.board_file import load_board
     from rigkit.io.boards.board_words import board_in_words
     from rigkit.io.manifests.manifest_writer import DeclaredBoard
@@ -90,8 +90,8 @@ def parse_boards(words: Sequence[str]) -> list[DeclaredBoard]:
 def cameras_of(
     pairs: Sequence[str], calibrations: dict[str, str], declared: Sequence[str]
 ) -> dict[str, tuple[str, str]]:
-    """Return the cameras of every pair; raises InputError for cameras that are not there, or pairs of more than two
-    that nobody gives cameras to."""
+    """Return the two cameras of every pair; raises InputError for unknown cameras, and, with more than two cameras, for
+    pairs without --cameras."""
     known = list(calibrations)
     patterns: list[tuple[str, tuple[str, str]]] = []
     for words in declared:
@@ -125,12 +125,12 @@ def parse_pose_types(declared: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def pose_type_of(declared: Sequence[tuple[str, str]], name: str) -> str | None:
-    """Return the first pose type that is told of the pair `name`, or None."""
+    """Return the first pose type whose pattern matches the pair `name`, or None."""
     return next((value for pattern, value in declared if fnmatch(name, pattern)), None)
 
 
 def parse_baselines(declared: Sequence[str], pairs: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Return pair -> (mm, sigma mm) from PAIR=MM+-SIGMA; raises InputError for other pairs and what is no length."""
+    """Return pair -> (mm, sigma mm) from PAIR=MM+-SIGMA; raises InputError for unknown pairs and invalid lengths."""
     out = {}
     for text in declared:
         name, of, value = text.partition("=")
@@ -145,7 +145,7 @@ def parse_baselines(declared: Sequence[str], pairs: Sequence[str]) -> dict[str, 
 
 
 def parse_angles(declared: Sequence[str]) -> list[tuple[str, float, float]]:
-    """Return (pattern of pairs, degrees, sigma) from [PAIRS=]DEG+-SIGMA; raises InputError for what is no angle."""
+    """Return (pattern of pairs, degrees, sigma) from [PAIRS=]DEG+-SIGMA; raises InputError for invalid angles."""
     out = []
     for text in declared:
         pattern, _, value = text.rpartition("=")
@@ -161,12 +161,12 @@ def parse_angles(declared: Sequence[str]) -> list[tuple[str, float, float]]:
 
 
 def angle_of(declared: Sequence[tuple[str, float, float]], name: str) -> tuple[float, float] | None:
-    """Return the first angle, with its sigma, that is told of the pair `name`, or None."""
+    """Return the first (angle, sigma) whose pattern matches the pair `name`, or None."""
     return next(((value, sigma) for pattern, value, sigma in declared if fnmatch(name, pattern)), None)
 
 
 def parse_length(what: str, value: str | float) -> float:
-    """Return a length in mm; raises InputError where it is no positive number."""
+    """Return a length in mm; raises InputError unless it is a positive number."""
     try:
         number = float(value)
     except ValueError:
@@ -177,7 +177,7 @@ def parse_length(what: str, value: str | float) -> float:
 
 
 def ask(question: str, choices: tuple[str, ...] = ()) -> str:
-    """Ask at the terminal until there is an answer."""
+    """Ask at the terminal until there is a valid answer."""
     hint = f" ({', '.join(choices)})" if choices else ""
     while True:
         print(f"{question}{hint}: ", end="", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""What `rigkit calibrate` says of a rig: for programs and for a person."""
+"""Output of `rigkit calibrate` for a rig, as JSON and as text."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def page(rig: RigCalibration, checks: Sequence[Check], session: RigSession) -> PageFacts:
-    """Return what the page says of a rig, and of each camera, calibrated as its session asks for."""
+    """Return the facts on the page of a rig and of its cameras."""
     from rigkit.report.pages.calibration_facts import rig_facts
     from rigkit.workflows.calibration.calibrate_rig import shown_cameras
 
@@ -28,7 +28,7 @@ def page(rig: RigCalibration, checks: Sequence[Check], session: RigSession) -> P
 
 
 def summary(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
-    """Return the figures for programs."""
+    """Return the result as JSON values."""
     from dataclasses import asdict
 
     return {
@@ -60,18 +60,18 @@ def summary(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
 
 
 def baselines(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
-    """Return (from, to, mm, sigma mm) of every two cameras."""
+    """Return (from, to, mm, sigma mm) for every two cameras."""
     names = [c.name for c in rig.cameras]
     return [(a, b, *rig.baseline_mm(a, b)) for a, b in combinations(names, 2)]
 
 
 def angles(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
-    """Return (board, board, deg, sigma deg) of every two boards on one mount."""
+    """Return (board, board, deg, sigma deg) for every two boards on one mount."""
     return [(a, b, *t.angle_deg(a, b)) for t in rig.board_rigs for a, b in combinations(t.names, 2)]
 
 
 def transfers(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
-    """Return (from, to, px at the middle corner, px at the worst) of every two cameras that see the same places."""
+    """Return (from, to, median px, worst px) of the transfer uncertainty for every two cameras with a common field."""
     from rigkit.calibration.rig.certainty.uncertainty import transfer_uncertainty
 
     found = [transfer_uncertainty(rig, a, b) for a, b in combinations([c.name for c in rig.cameras], 2)]
@@ -79,7 +79,7 @@ def transfers(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
 
 
 def describe(rig: RigCalibration, checks: Sequence[Check]) -> str:
-    """Return the result for a person: the headline first."""
+    """Return the result as text, the headline first."""
     import numpy as np
 
     from rigkit.geometry.rotation import log_so3
@@ -111,7 +111,7 @@ def describe(rig: RigCalibration, checks: Sequence[Check]) -> str:
             f"{c.name} {verdict}: {c.ours:.3f} {c.unit}, measured {c.measured:g} +- {c.measured_sigma:g} {c.unit} "
             f"({c.how}), off by {c.k:.1f} combined sigmas"
         )
-    # What is wrong with the rig comes before what that did to its cameras.
+    # The verdicts on the rig come before their consequences for its cameras.
     lines += map(str, most_severe_first(rig.verdicts))
     lines += [f"frame {frame}, board '{board}' left out: {reason}" for frame, board, reason in rig.left_out]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):

@@ -1,4 +1,4 @@
-"""What a program owes the system it runs in: its streams, its signals, and errors that are nobody's bug."""
+"""Standard streams, signals, and errors of the operating system."""
 
 from __future__ import annotations
 
@@ -23,12 +23,11 @@ SURROUNDINGS = {
     for name in names
     if hasattr(errno, name)
 }
-"""Errors of the system that are nobody's bug, and what to do: a full disk, a folder that may not be written, too many
-open files, a path that leads nowhere."""
+"""Errors of the system that are no bugs -> remedy: a full disk, a read-only folder, too many open files, a bad path."""
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP, taken as Ctrl-C is: what is half done is cleared away on the way out."""
+    """SIGTERM or SIGHUP, handled like Ctrl-C: partial results are removed."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -36,14 +35,13 @@ class Terminated(KeyboardInterrupt):
 
 
 def say(words: str, *, before: str = "") -> None:
-    """Print the last line of a run to stderr; the exit code says it too where nobody can read that."""
+    """Print the last line of a run to stderr, if that is open."""
     with contextlib.suppress(OSError, ValueError):
         print(f"{before}rigkit: {words}", file=sys.stderr, flush=True)
 
 
 def settle_stderr() -> None:
-    """Leave nothing unwritten to a stderr that takes nothing: Python (up to 3.11.2) ends with a code of its own, 120,
-    where it cannot write the rest."""
+    """Flush stderr, or replace it if that fails: Python (up to 3.11.2) would otherwise exit with code 120."""
     try:
         sys.stderr.flush()
     except (OSError, ValueError):
@@ -51,7 +49,7 @@ def settle_stderr() -> None:
 
 
 def open_streams() -> None:
-    """Let results be printed whatever the terminal's letters are, and nothing end because nobody listens to stderr."""
+    """Escape characters that the terminal cannot encode, and replace a missing stderr."""
     if sys.stderr is None:
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - for the rest of the process
     for stream in (sys.stdout, sys.stderr):
@@ -61,7 +59,7 @@ def open_streams() -> None:
 
 @contextmanager
 def signals_interrupt() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP interrupt the block as Ctrl-C does; a signal that is ignored (nohup) stays ignored."""
+    """Let SIGTERM and SIGHUP interrupt the block like Ctrl-C; an ignored signal (nohup) stays ignored."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise Terminated(number)

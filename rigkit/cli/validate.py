@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.validation.validate import validate_dataset
 
     if len(args.dataset) > 1:
-        return _many(args)
+        return _validate_several(args)
     if args.cluster is not None:
         raise InputError("--cluster is for several data sets; -j uses the processors of this machine")
     dataset = load_dataset(args.dataset[0])
@@ -85,7 +85,7 @@ def _options(args: argparse.Namespace, common: dict[str, Any]) -> ValidateOption
     )
 
 
-def _many(args: argparse.Namespace) -> int:
+def _validate_several(args: argparse.Namespace) -> int:
     """Validate several data sets, each in a folder of its own; print one table."""
     from dataclasses import replace
 

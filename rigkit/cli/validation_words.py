@@ -1,4 +1,4 @@
-"""What `rigkit validate` says of a data set: the table, failures, causes and notes."""
+"""Output of `rigkit validate`, as JSON and as text."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
-    """Print what a data set came to, of which the files are in `out`; return the exit code."""
+    """Print the validation of a data set, whose files are in `out`; return the exit code."""
     from rigkit.report.pages.validation_page import summary_table
     from rigkit.report.tables import tables_to_text
 
@@ -40,7 +40,7 @@ def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
                 note(f"to look at: {cause.text}")
             else:
                 print(f"probable cause: {cause.text}")
-        # What is no cause comes after the causes: first it would be taken for one.
+        # Notes come after the causes, so that they are not mistaken for causes.
         _print_notes(done.reports, done.crosschecks)
         failed = "NOT every pair was validated" if done.failures else "a check FAILED"
         page = "report.html" if "report.html" in done.files else "tables.md"
@@ -49,7 +49,7 @@ def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
 
 
 def show_paper(done: PaperValidation, options: PaperOptions, *, json: bool) -> int:
-    """Print the paper's tables; return the exit code. What the paper claims passes or fails no check of ours."""
+    """Print the paper's tables; return the exit code, which does not depend on the paper's claims."""
     from rigkit.report.tables import tables_to_text
     from rigkit.workflows.validation.paper import NOT_CHECKED
 
