@@ -63,7 +63,7 @@ def _write_colmap(camera: Camera, outline: Pixels | None) -> Written:
     return replace(lines[1], text=text)
 
 
-def _only(cameras: tuple[Camera, ...], name: str) -> Camera:
+def _single_camera(cameras: tuple[Camera, ...], name: str) -> Camera:
     if len(cameras) != 1:
         raise InputError(
             f"'{name}' holds {len(cameras)} cameras; `rigkit export {name} --names cam0 -o cam0.json` takes out one"
@@ -83,7 +83,7 @@ FOREIGN_FORMATS: dict[str, CameraFormat] = {
     ),
     "kalibr": CameraFormat(
         re.compile(r"^cam\d+\s*:", re.MULTILINE),
-        lambda text, name, _: _only(read_kalibr(text, name)[0], name),
+        lambda text, name, _: _single_camera(read_kalibr(text, name)[0], name),
         lambda c, outline: write_kalibr([c], outlines=[outline]).cameras[0],
     ),
     "matlab": CameraFormat(MAT_SIGN, read_matlab),
@@ -95,7 +95,7 @@ FOREIGN_FORMATS: dict[str, CameraFormat] = {
     ),
     "colmap": CameraFormat(
         re.compile(r"^\s*\d+\s+[A-Z][A-Z_]+\s+\d+\s+\d+\s+[-+.\d]", re.MULTILINE),
-        lambda text, name, _: _only(tuple(read_colmap_cameras(text, name).values()), name),
+        lambda text, name, _: _single_camera(tuple(read_colmap_cameras(text, name).values()), name),
         _write_colmap,
     ),
 }

@@ -108,7 +108,7 @@ def read_colmap_cameras(text: str, name: str = "cameras.txt") -> dict[int, Camer
             raise InputError(f"{where}: camera model '{model}' is unknown; known: {', '.join((*LAYOUTS, *FURTHER))}")
         keys = parameters_of(words[1])
         try:
-            camera_id, *size, values = (*(_whole(words[i]) for i in (0, 2, 3)), [float(w) for w in words[4:]])
+            camera_id, *size, values = (*(_integer(words[i]) for i in (0, 2, 3)), [float(w) for w in words[4:]])
         except ValueError as error:
             raise InputError(f"{where}: not a camera ({error}); correct the line") from error
         if camera_id in cameras:
@@ -153,7 +153,7 @@ def parameters_of(model: str) -> tuple[str, ...]:
     return LAYOUTS[model][1] if model in LAYOUTS else FURTHER[model]
 
 
-def _whole(word: str) -> int:
+def _integer(word: str) -> int:
     if not word.isascii() or not word.isdigit() or len(word) > MAX_COLMAP_DIGITS:
         raise ValueError(f"'{word[:40]}' is no whole number")
     return int(word)

@@ -58,7 +58,7 @@ def read_matlab(text: str, name: str = "camera.mat", size_px: SizePx | None = No
     if len(found) > 1 or is_matlab_pair(text):
         raise InputError(f"'{name}' holds several cameras; give it as a rig (--rig), or save the one that you want")
     if not found:
-        raise _nothing(text, name)
+        raise _no_camera_error(text, name)
     return _camera(found[next(iter(found))], name, size_px)
 
 
@@ -82,7 +82,7 @@ def read_matlab_pair(
     first = next((key for key in found if "CameraParameters1" in key), None)
     second = None if first is None else first.replace("CameraParameters1", "CameraParameters2")
     if first is None or second not in found:
-        raise _nothing(text, name)
+        raise _no_camera_error(text, name)
     left, right = (_camera(found[key], name, size_px) for key in (first, second))
     of = first.split("CameraParameters1")[0]
     if f"{of}PoseCamera2.R" in values:
@@ -176,7 +176,7 @@ def _toolbox_matrix(data: dict[str, FloatArray], name: str) -> FloatArray:
     return K.reshape(9)
 
 
-def _nothing(text: str, name: str) -> InputError:
+def _no_camera_error(text: str, name: str) -> InputError:
     if OBJECTS in text:
         which = text.split(OBJECTS)[1].split()[0]
         return InputError(

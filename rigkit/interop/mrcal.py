@@ -84,11 +84,11 @@ def read_cameramodel(text: str, name: str = "cameramodel") -> tuple[Camera, Rigi
     pose_key = "rt_cam_ref" if "rt_cam_ref" in data else "extrinsics"
     rt = numbers(field(data, pose_key, name), name, pose_key, 6)
     pose = Rigid3(exp_so3(rt[:3]), rt[3:] * MM_PER_M)
-    camera, error_px = _lens(lens, intrinsics, size, name)
+    camera, error_px = _camera_of_model(lens, intrinsics, size, name)
     return camera, pose, error_px
 
 
-def _lens(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], name: str) -> tuple[Camera, float]:
+def _camera_of_model(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], name: str) -> tuple[Camera, float]:
     """Return the camera of a lens model and its intrinsics, and the largest error of a refit, px (0 without refit)."""
     kind = lens.removeprefix("LENSMODEL_")
     if SPLINED.match(lens) is not None:

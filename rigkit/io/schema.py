@@ -26,24 +26,24 @@ SCHEMAS: dict[str, Schema] = {
     str(schema["properties"]["schema"]["const"]).removeprefix("rigkit.").partition("/")[0]: schema
     for schema in (*_OF_PEOPLE, *_RESULTS)
 }
-"""By name, such as "session" or "calibration"."""
+"""Schemas by name, such as "session" or "calibration"."""
 _KIND_WORDS = {"string": "text", "object": "table", "boolean": "true or false", "integer": "whole number"}
 
 
 def schema_named(name: str) -> Schema:
-    """Return the schema of a kind of file; raises InputError that lists the kinds."""
+    """Return the schema of this name; raises InputError that lists the known ones."""
     if name not in SCHEMAS:
         raise InputError(f"no file is called '{name}'; there are {', '.join(SCHEMAS)}")
     return SCHEMAS[name]
 
 
 def schema_text(name: str) -> str:
-    """Return the schema as a file."""
+    """Return the schema as the content of a file."""
     return json.dumps(schema_named(name), indent=1, ensure_ascii=False) + "\n"
 
 
 def key_rows(schema: Schema, prefix: str = "") -> Iterator[tuple[str, str, str]]:
-    """Yield (key, what it holds, what it means) of every key of a schema, those of inner objects after `prefix`."""
+    """Yield (key, type, description) of every key of a schema; `prefix` is that of inner objects."""
     required = schema.get("required", [])
     for key, own in schema["properties"].items():
         if key == "schema":
@@ -56,7 +56,7 @@ def key_rows(schema: Schema, prefix: str = "") -> Iterator[tuple[str, str, str]]
 
 
 def _inner(schema: Schema) -> Schema | None:
-    """Return the object that a schema is, or is a list or a choice of; None where it is none."""
+    """Return the object schema that `schema` is, or is a list or choice of; None if there is none."""
     if "properties" in schema:
         return schema
     for one in (schema.get("items"), schema.get("additionalProperties"), *schema.get(ANY_OF, ())):
@@ -67,7 +67,7 @@ def _inner(schema: Schema) -> Schema | None:
 
 
 def _kind(schema: Schema) -> str:
-    """Return what a schema holds, in a word or two."""
+    """Return the type of a schema in words."""
     if "const" in schema or "enum" in schema:
         return ", ".join(f"`{value}`" for value in schema.get("enum", [schema.get("const")]))
     if ANY_OF in schema:

@@ -1,4 +1,4 @@
-"""The files of results (JSON), as JSON Schemas: described by the fields of the classes that they are made of."""
+"""JSON Schemas of result files, described by the docstrings of their classes."""
 
 from __future__ import annotations
 

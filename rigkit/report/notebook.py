@@ -37,9 +37,9 @@ def html_of(result: Calibration | RigCalibration | Reconstruction) -> str:
     """Return a result as HTML for a notebook: summary, verdicts, and a drawing of its 3D scene."""
     if isinstance(result, Calibration):
         scene = boards_scene(result.views, result.boards)
-        return _shown(repr(result), most_severe_first(result.verdicts)[:2], scene)
+        return _result_html(repr(result), most_severe_first(result.verdicts)[:2], scene)
     if isinstance(result, RigCalibration):
-        return _shown(
+        return _result_html(
             f"{result!r}\n  {rig_reach(result, ())}", most_severe_first(result.verdicts)[:2], rig_scene(result)
         )
     baseline = measured_words(result.baseline_mm, result.baseline_sigma_mm, 2)
@@ -48,10 +48,10 @@ def html_of(result: Calibration | RigCalibration | Reconstruction) -> str:
         f"points, {counted(len(result.boards), 'board')}, baseline {baseline} mm, Sampson rms "
         f"{result.sampson_rms_px:.3f} px"
     )
-    return _shown(words, (), scene_of(result))
+    return _result_html(words, (), scene_of(result))
 
 
-def _shown(words: str, findings: Sequence[Finding], scene: Mapping[str, Any]) -> str:
+def _result_html(words: str, findings: Sequence[Finding], scene: Mapping[str, Any]) -> str:
     colour = COLOUR_OF[worst(findings)] if findings else "#1f5fa8"
     lines = [line.strip() for line in words.splitlines()]
     lines = [*(line for line in lines if line not in {str(f) for f in findings}), *(str(f) for f in findings)]

@@ -46,15 +46,15 @@ def tables_to_markdown(tables: Sequence[Table]) -> str:
         lines = [
             f"## {_escape_markdown(table.title)}",
             "",
-            _bar(head),
-            _bar([":--" if left else "--:" for left in in_words(table)]),
+            _markdown_row(head),
+            _markdown_row([":--" if left else "--:" for left in in_words(table)]),
         ]
         for row in table.rows:
             cells = []
             for cell, column in zip(row, table.columns, strict=True):
                 text = _escape_markdown(_text(cell, column))
                 cells.append(f"**{text}**" if text and (cell.best or cell.failed) else text)
-            lines.append(_bar(cells))
+            lines.append(_markdown_row(cells))
         lines += ["", *filter(None, [_escape_markdown(below(table))])]
         parts.append("\n".join(lines).rstrip() + "\n")
     return "\n".join(parts)
@@ -71,19 +71,19 @@ def tables_to_csv(tables: Sequence[Table]) -> str:
         if i:
             out.write("\n")
         out.write(f"# {_one_line(table.title)}\n")
-        extra = [_extra(table, j) for j in range(len(table.columns))]
+        extra = [_extra_columns(table, j) for j in range(len(table.columns))]
         head: list[str] = []
         for column, (with_sigma, with_paper) in zip(table.columns, extra, strict=True):
             unit = f" [{column.unit}]" if column.unit else ""
             head.append(column.label + unit)
             head += [f"{column.label} sigma{unit}"] if with_sigma else []
             head += [f"{column.label} paper{unit}"] if with_paper else []
-        writer.writerow([_in_cell(label) for label in head])
+        writer.writerow([_csv_text(label) for label in head])
         for row in table.rows:
             cells: list[str] = []
             for cell, (with_sigma, with_paper) in zip(row, extra, strict=True):
-                cells.append(_exact(cell.value))
-                cells += [_exact(cell.sigma)] if with_sigma else []
+                cells.append(_csv_value(cell.value))
+                cells += [_csv_value(cell.sigma)] if with_sigma else []
                 cells += [cell.paper or ""] if with_paper else []
             writer.writerow(cells)
     return out.getvalue()
@@ -234,26 +234,26 @@ def below(table: Table) -> str:
     return " ".join(filter(None, [table.note, "In brackets: the paper's." if printed else ""]))
 
 
-def _extra(table: Table, j: int) -> tuple[bool, bool]:
+def _extra_columns(table: Table, j: int) -> tuple[bool, bool]:
     """Return whether column j has sigmas, and values of the paper."""
     cells = [row[j] for row in table.rows]
     return any(cell.sigma is not None for cell in cells), any(cell.paper is not None for cell in cells)
 
 
-def _exact(value: float | str | None) -> str:
+def _csv_value(value: float | str | None) -> str:
     value = without_nan(value)
     if value is None:
         return ""
     if isinstance(value, str):
-        return _in_cell(value)
+        return _csv_text(value)
     return str(int(value)) if float(value).is_integer() else repr(float(value))
 
 
-def _bar(cells: Sequence[str]) -> str:
+def _markdown_row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _in_cell(text: str) -> str:
+def _csv_text(text: str) -> str:
     """Return a text on one line for a spreadsheet; texts that begin like a formula are quoted."""
     text = _one_line(text)
     return f"'{text}" if text.lstrip().startswith(FORMULA) and not is_number(text) else text

@@ -1,4 +1,4 @@
-"""What a verb does, as functions: typed options in, typed results out; no printing, progress is told by callback.
+"""The verbs as functions with typed options and results; they print nothing, progress is reported by a callback.
 
 Options and results are frozen dataclasses with keywords only. Notes go to the package's loggers. Files are written only
 where the options say so. What verbs work on is made ready in `inputs`, what several write is in `outputs`; verbs that

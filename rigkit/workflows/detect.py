@@ -30,7 +30,7 @@ from rigkit.io.media.images import Image, images_of_folder, name_unread, no_imag
 from rigkit.io.media.video import is_video
 from rigkit.report.pictures.overlay import draw_boards
 from rigkit.workflows.inputs.camera_files import import_camera
-from rigkit.workflows.inputs.frames import VideoFrames, frames_folder, frames_of_video
+from rigkit.workflows.inputs.frames import VideoFrames, frames_folder, frames_of_videos
 from rigkit.workflows.inputs.identify_board import explained, suggestion
 from rigkit.workflows.inputs.paths import NamesFiles
 
@@ -151,7 +151,7 @@ def _frames_of(
     kept, bad = {}, {}
     for path in videos:
         try:
-            kept[path] = frames_of_video(path, frames_folder([path]), boards, progress=progress)
+            kept[path] = frames_of_videos({"": path}, frames_folder([path]), boards, progress=progress)
         except InputError as error:
             bad[str(path)] = error
     return kept, bad

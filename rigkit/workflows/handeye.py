@@ -1,4 +1,4 @@
-"""World frames: where a camera is against a board, and where it sits on a robot."""
+"""`rigkit pose` and `rigkit handeye`: the pose of a camera relative to a board, and on a robot."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
         if not np.isfinite(found[0].covariance).all() or not np.isfinite(rms):
             raise DegenerateError("the lens does not see the board where it stands; check the numbers of its file")
     ambiguous = len(found) > 1 and found[1].rms_rad < PLANAR_AMBIGUITY * found[0].rms_rad
-    pose, covariance, of_lens = found[0].cam_from_board, found[0].covariance.copy(), _known(camera)
+    pose, covariance, of_lens = found[0].cam_from_board, found[0].covariance.copy(), _uncertain_camera(camera)
     if of_lens is not None:
         covariance += pose_covariance_of_lens(
             of_lens.camera, of_lens.covariance, pose.apply(points), pose.translation_mm, view.sigma_px[valid]
@@ -184,7 +184,7 @@ def _with_fixed_pupil(camera: Camera, view: BoardView) -> BoardView:
     return replace(view, pixels=board_with_fixed_pupil(camera, view.pixels, view.points()))
 
 
-def _known(camera: str | Path) -> UncertainCamera | None:
+def _uncertain_camera(camera: str | Path) -> UncertainCamera | None:
     """Return the camera with the covariance of its file; None for another tool's file, which has none."""
     try:
         return uncertain_camera(load_calibration(camera))

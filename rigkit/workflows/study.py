@@ -134,7 +134,7 @@ def run_study(
     key = study_key(study)
     done: dict[int, Errors] = {}
     for index in range(total) if parts is not None else ():
-        earlier = _read(_part(parts, key, index))
+        earlier = _read_chunk(_chunk_path(parts, key, index))
         if earlier is not None:
             done[index] = earlier
     progress(study.name, len(done), total)
@@ -143,22 +143,22 @@ def run_study(
         index = missing[place]
         done[index] = errors
         if parts is not None:
-            write_atomic(_part(parts, key, index), _npy(errors), force=True)
+            write_atomic(_chunk_path(parts, key, index), _npy(errors), force=True)
         progress(study.name, len(done), total)
     if parts is not None:
         for index in range(total):
-            _part(parts, key, index).unlink(missing_ok=True)
+            _chunk_path(parts, key, index).unlink(missing_ok=True)
         with suppress(OSError):
             parts.rmdir()
     return [done[index] for index in range(total)]
 
 
-def _part(parts: Path | None, key: str, index: int) -> Path:
+def _chunk_path(parts: Path | None, key: str, index: int) -> Path:
     assert parts is not None
     return parts / f"{key}-{index:05d}.npy"
 
 
-def _read(path: Path) -> Errors | None:
+def _read_chunk(path: Path) -> Errors | None:
     """Return a finished chunk, or None if it is missing or cannot be read."""
     try:
         return np.asarray(np.load(path), dtype=np.float32)

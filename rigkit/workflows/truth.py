@@ -46,10 +46,8 @@ class FetchedSet:
 
     def files(self, pattern: str) -> tuple[Path, ...]:
         """Return the files of the set that match, sorted by name."""
-        return tuple(sorted(path for path in self.folder.glob(pattern) if self._is_own(path)))
-
-    def _is_own(self, path: Path) -> bool:
-        return path.relative_to(self.folder).as_posix() in self.present
+        found = (path for path in self.folder.glob(pattern) if path.relative_to(self.folder).as_posix() in self.present)
+        return tuple(sorted(found))
 
 
 def public_sets(catalogue: Path | None = None) -> dict[str, PublicSet]:

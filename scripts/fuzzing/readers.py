@@ -23,7 +23,7 @@ from rigkit.io.manifests.truth_csv import load_truth_csv
 from rigkit.io.media.video import read_timestamps
 from rigkit.workflows.calibration.calibrate import calibrate_session
 from rigkit.workflows.capture.coach import CoachOptions, coach_frames, coach_recording, open_coach
-from rigkit.workflows.inputs.frames import frames_of_video
+from rigkit.workflows.inputs.frames import frames_of_videos
 
 SMALL = Board("small", 5, 4, 30.0, 30.0)
 GUIDE = GuideOptions(boards=(SMALL,))
@@ -69,14 +69,14 @@ def fetch_listed(path: Path) -> None:
 
 def read_frames(path: Path) -> None:
     """Keep the frames of a video that show the board."""
-    frames_of_video(path, Path("out/frames"), [SMALL], max_frames=4)
+    frames_of_videos({"": path}, Path("out/frames"), [SMALL], max_frames=4)
 
 
 def read_record(path: Path) -> None:
     """Keep the frames of a video where a record of former ones is damaged: they are chosen anew."""
     Path("out/frames").mkdir()
     shutil.copy(path, "out/frames/frames.json")
-    frames_of_video(Path("film.avi"), Path("out/frames"), [SMALL], max_frames=4)
+    frames_of_videos({"": Path("film.avi")}, Path("out/frames"), [SMALL], max_frames=4)
 
 
 def read_database(path: Path) -> None:

@@ -101,8 +101,8 @@ def test_no_board_truth_or_session_of_a_data_set_is_lost(folder: Path) -> None:
 def test_two_sessions_in_one_folder_do_not_meet(folder: Path) -> None:
     shutil.copy(folder / "session.toml", folder / "night.toml")
     day, night = load_session(folder / "session.toml"), load_session(folder / "night.toml")
-    assert day.calibration_path.name == "calibration.json" and day.corners_path.name == "corners.json"
-    assert night.calibration_path.name == "night-calibration.json"
+    assert day.result_path.name == "calibration.json" and day.corners_path.name == "corners.json"
+    assert night.result_path.name == "night-calibration.json"
     assert night.corners_path.name == "night-corners.json"
     assert night.corners_path in files_of_session(night.path)
 

@@ -24,7 +24,7 @@ from rigkit.core.errors import InputError
 from rigkit.io.calibrations.history_file import load_history
 from rigkit.workflows.capture.coach import CoachOptions, open_coach
 from rigkit.workflows.handeye import HandEyeOptions, calibrate_hand_eye
-from rigkit.workflows.inputs.frames import frames_of_video
+from rigkit.workflows.inputs.frames import frames_of_videos
 
 BOARD = Board("small", 5, 4, 30.0, 30.0)
 CHECK = ["check", "calibration.json", "--board", "floor.toml"]
@@ -79,7 +79,7 @@ def test_videos(capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFix
     printed = capsys.readouterr()
     assert "image.png" in printed.out and "film-frames" in printed.out and "'bad.avi'" in printed.err
     cut("film.avi", "half.avi")
-    frames_of_video(Path("half.avi"), Path("half"), [BOARD])
+    frames_of_videos({"": Path("half.avi")}, Path("half"), [BOARD])
     assert "half.avi" in caplog.text and "of 8 frames can be decoded" in caplog.text
     # The board is looked for in the video first, and once more for the frames.
     caplog.clear()
@@ -92,12 +92,12 @@ def test_frames_go_over_no_other_files(place: Path) -> None:
     folder.mkdir()
     (folder / "000001.png").write_bytes(b"mine")
     with pytest.raises(InputError, match=r"film-frames.*rename or remove"):
-        frames_of_video(Path("film.avi"), folder, [BOARD])
+        frames_of_videos({"": Path("film.avi")}, folder, [BOARD])
     assert (folder / "000001.png").read_bytes() == b"mine"
     (folder / "000001.png").unlink()
-    first = frames_of_video(Path("film.avi"), folder, [BOARD]).images
+    first = frames_of_videos({"": Path("film.avi")}, folder, [BOARD]).images
     (folder / "frames.json").write_text("[" * 100_000)
-    assert frames_of_video(Path("film.avi"), folder, [BOARD]).images == first
+    assert frames_of_videos({"": Path("film.avi")}, folder, [BOARD]).images == first
 
 
 def test_the_coach(place: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture) -> None:

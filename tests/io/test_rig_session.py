@@ -55,7 +55,7 @@ def test_reads_boards_on_one_mount(tmp_path: Path) -> None:
     assert is_rig_session(path)
     rig = load_rig_session(path)
     assert list(rig.cameras) == [ONE] and rig.cameras[ONE].camera is None
-    assert rig.rig_path.name == "calibration.json"
+    assert rig.result_path.name == "calibration.json"
     (group,) = rig.rigid_boards
     assert group.boards == ("board", "other") and group.layout == {"board": "floor"}
     assert group.truth.angles[0].value_deg == 90.0 and str(group.truth.distances[0].a) == "board[0,0]"

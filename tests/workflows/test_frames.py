@@ -26,7 +26,7 @@ from rigkit.workflows.calibration.calibrate_any import FolderOptions, calibrate_
 from rigkit.workflows.detect import detect_in_images
 from rigkit.workflows.inputs.folder_session import boards_seen
 from rigkit.workflows.inputs.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
-from rigkit.workflows.inputs.frames import _FrameFolder, frames_of_video, frames_of_videos
+from rigkit.workflows.inputs.frames import _FrameFolder, frames_of_videos
 from rigkit.workflows.inputs.identify_board import identify_board
 
 BOARD = Board("b", 7, 5, 20.0, 20.0)
@@ -62,7 +62,7 @@ def test_each_view_is_kept_once_and_sharp(tmp_path: Path) -> None:
     frames = [empty]
     for k, pose in enumerate(poses):
         frames += [picture(*pose, blur_px=0.7 if shot == k % 3 else 2.5) for shot in range(3)]
-    done = frames_of_video(video(tmp_path / "a.avi", frames), tmp_path / "out", [BOARD])
+    done = frames_of_videos({"": video(tmp_path / "a.avi", frames)}, tmp_path / "out", [BOARD])
     assert (done.looked_at, done.with_boards, done.near_copies) == (13, 12, 8)
     assert [path.stem for path in done.images[""]] == ["000001", "000005", "000009", "000010"]
     kept = read_image(done.images[""][1])
@@ -70,11 +70,11 @@ def test_each_view_is_kept_once_and_sharp(tmp_path: Path) -> None:
     # Nothing else is left behind, and the second time nothing is decoded.
     assert sorted(p.name for p in (tmp_path / "out").iterdir())[:-1] == [p.name for p in done.images[""]]
     stamp = (tmp_path / "out" / "frames.json").stat().st_mtime_ns
-    again = frames_of_video(tmp_path / "a.avi", tmp_path / "out", [BOARD])
+    again = frames_of_videos({"": tmp_path / "a.avi"}, tmp_path / "out", [BOARD])
     assert again.images == done.images
     assert (tmp_path / "out" / "frames.json").stat().st_mtime_ns == stamp
     with pytest.raises(InputError, match="no board in 2 frames"):
-        frames_of_video(video(tmp_path / "b.avi", [empty, empty]), tmp_path / "other")
+        frames_of_videos({"": video(tmp_path / "b.avi", [empty, empty])}, tmp_path / "other")
 
 
 def test_videos_of_two_cameras_give_frames_of_one_moment(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -144,7 +144,7 @@ def test_a_video_tells_its_board_and_why_another_is_not_seen(tmp_path: Path) -> 
     assert (len(found.seen), len(found.looked_at)) == (3, 6)
     other = replace(MARKED, pattern=Charuco("DICT_4X4_50", 19.5, inverted=True))
     with pytest.raises(InputError, match=r"no board in 6 frames; 5 x 4 inner corners seen .*: set inverted = false"):
-        frames_of_video(path, tmp_path / "out", [other])
+        frames_of_videos({"": path}, tmp_path / "out", [other])
 
 
 def test_the_board_of_a_video_is_identified(tmp_path: Path) -> None:

@@ -54,9 +54,9 @@ def _kalibr(values: Mapping[str, Any]) -> Values:
     kind = values["target_type"]
     if kind == "aprilgrid":
         rows, columns = (
-            _either(values, f"tag{axis_name}", f"tag_{axis_name.lower()}") for axis_name in ("Rows", "Cols")
+            _first_of(values, f"tag{axis_name}", f"tag_{axis_name.lower()}") for axis_name in ("Rows", "Cols")
         )
-        size, spacing = _either(values, "tagSize", "tag_size"), _either(values, "tagSpacing", "tag_spacing")
+        size, spacing = _first_of(values, "tagSize", "tag_size"), _first_of(values, "tagSpacing", "tag_spacing")
         return {"type": "aprilgrid", "columns": columns, "rows": rows, "tag_mm": _mm(size), "spacing": float(spacing)}
     # Kalibr counts the inner corners of checkerboards, as rigkit does.
     size = {"columns": values["targetCols"], "rows": values["targetRows"]}
@@ -149,7 +149,7 @@ def _opencv_xml(text: str) -> Mapping[str, Any]:
     return {name: value.strip() for name, value in found}
 
 
-def _either(values: Mapping[str, Any], *names: str) -> Any:
+def _first_of(values: Mapping[str, Any], *names: str) -> Any:
     return next(values[name] for name in (*names, names[0]) if name in values or name == names[-1])
 
 

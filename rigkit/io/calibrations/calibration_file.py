@@ -37,7 +37,7 @@ CALIBRATION_SCHEMA = "rigkit.calibration/1"
 CAMERA_KEYS = keys_of(CALIBRATION_FILE, "camera")
 CALIBRATION_KEYS = keys_of(CALIBRATION_FILE)
 Made = Mapping[str, Any]
-"""Provenance of a file: see `rigkit.workflows.outputs.provenance.made`."""
+"""Provenance of a file: see `rigkit.workflows.outputs.provenance.provenance_of`."""
 LATER_KEYS = {"overdispersion", "freedom", "made", "rivals", "pupil"}
 """Optional keys: older files lack them, and central cameras have no pupil."""
 TERMS_OF_PUPIL = ("mm_per_rad2", "mm_per_rad4")
@@ -135,8 +135,8 @@ def _calibration_in(data: dict[str, Any], path: str | Path) -> Calibration:
             sigma_px=positive(data["sigma_px"]),
             views=tuple(_view_in(v, sizes) for v in data["views"]),
             dropped=tuple((str(image), str(reason)) for image, reason in data["dropped"]),
-            outliers=tuple(_entry(Outlier, _finite(v)) for v in data["outliers"]),
-            candidates=tuple(_entry(Candidate, _finite(v, ("rms_px",))) for v in data["candidates"]),
+            outliers=tuple(_entry(Outlier, _null_as_nan(v)) for v in data["outliers"]),
+            candidates=tuple(_entry(Candidate, _null_as_nan(v, ("rms_px",))) for v in data["candidates"]),
             convergence=_entry(Convergence, data["convergence"]),
             boards=boards,
             verdicts=findings_from_json(data["verdicts"]),
@@ -275,7 +275,7 @@ def _shape_in(data: dict[str, Any]) -> BoardShape:
     return _entry(BoardShape, {k: v for k, v in values.items() if k != "target"})
 
 
-def _finite(values: dict[str, Any], nullable: tuple[str, ...] = ("residual_px",)) -> dict[str, Any]:
+def _null_as_nan(values: dict[str, Any], nullable: tuple[str, ...] = ("residual_px",)) -> dict[str, Any]:
     return {k: math.nan if v is None and k in nullable else v for k, v in values.items()}
 
 
@@ -298,12 +298,12 @@ def _dumps(data: dict[str, Any]) -> str:
     lines = []
     for key, value in data.items():
         if isinstance(value, list) and value and isinstance(value[0], dict):
-            text = "[\n  " + ",\n  ".join(_line(v) for v in value) + "\n ]"
+            text = "[\n  " + ",\n  ".join(_json_line(v) for v in value) + "\n ]"
         else:
-            text = _line(value)
+            text = _json_line(value)
         lines.append(f' "{key}": {text}')
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def _line(value: Any) -> str:
+def _json_line(value: Any) -> str:
     return json.dumps(without_nan(value), allow_nan=False)

@@ -145,7 +145,7 @@ def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
                 "cam_from_rig": c.cam_from_rig.matrix()[:3].tolist(),
                 "rms_px": c.rms_px,
                 "outline_px": outline_of_corners(c.calibration).round(1).tolist(),
-                **({} if own is None else {"departures": _rows_of(own)}),
+                **({} if own is None else {"departures": _modes_to_json(own)}),
                 **({} if c.name not in rig.pupils else {"pupil": pupil_to_json(rig.pupils[c.name])}),
                 **({} if c.name not in rig.lags else {"lag": asdict(rig.lags[c.name])}),
                 **({} if c.name not in rig.readouts else {"readout": asdict(rig.readouts[c.name])}),
@@ -226,7 +226,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
     )
 
 
-def _rows_of(own: LensModes) -> dict[str, Any]:
+def _modes_to_json(own: LensModes) -> dict[str, Any]:
     return {"modes": own.modes.T.tolist(), "moves": own.moves.T.tolist()}
 
 

@@ -1,5 +1,5 @@
-"""The files of calibrations (JSON), as JSON Schemas: every key with what it means. The readers take their keys from
-here; results are described by the fields of their own classes."""
+"""JSON Schemas of calibration files. The readers take their keys from here; results are described by the docstrings of
+their classes."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def read_correspondences(path: str | Path, images: Sequence[str] = ()) -> Corres
         if len(images) != 2:
             raise InputError(f"correspondences '{source}': COLMAP's database has many images; give the two of the pair")
         found = read_colmap_matches(source, images)
-        return _built(source, found.pixels1, found.pixels2, found.A21, None, _rough(found.A21))
+        return _correspondences(source, found.pixels1, found.pixels2, found.A21, None, _frame_sigmas(found.A21))
     try:
         text = payload.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -124,7 +124,7 @@ def _from_csv(source: Path) -> Correspondences:
             raise InputError(f"correspondences '{source}': column '{lacking[0]}' is missing; add it")
     points = np.stack([table[name] for name in POINT_COLUMNS], axis=1)
     A21 = np.stack([table[name] for name in AFFINE], axis=1).reshape(-1, 2, 2) if AFFINE[0] in table else None
-    return _built(source, points[:, :2], points[:, 2:], A21, _directions(source, table), table)
+    return _correspondences(source, points[:, :2], points[:, 2:], A21, _directions(source, table), table)
 
 
 def _directions(source: Path, table: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray] | None:
@@ -169,7 +169,7 @@ def _from_extractor(source: Path, lines: list[str]) -> Correspondences:
             f"{EXTRACTOR_COLUMNS}"
         )
     good = off <= MAX_REFINEMENT_PX
-    return _built(source, pixels1[good], pixels2[good], A21[good], None, {})
+    return _correspondences(source, pixels1[good], pixels2[good], A21[good], None, {})
 
 
 def _from_npz(source: Path, payload: bytes) -> Correspondences:
@@ -186,7 +186,7 @@ def _from_npz(source: Path, payload: bytes) -> Correspondences:
         raise InputError(f"correspondences '{source}': {error}") from error
     if matched is not None:
         A21 = matched.get("A21")
-        return _built(source, matched["pixels1"], matched["pixels2"], A21, None, _rough(A21))
+        return _correspondences(source, matched["pixels1"], matched["pixels2"], A21, None, _frame_sigmas(A21))
     unknown = [name for name in table if name not in ARRAYS]
     if unknown:
         raise InputError(f"correspondences '{source}': unknown array {unknown[0]!r}; known: {', '.join(ARRAYS)}")
@@ -197,7 +197,7 @@ def _from_npz(source: Path, payload: bytes) -> Correspondences:
         if name not in table:
             raise InputError(f"correspondences '{source}': array '{name}' is missing; add it")
     directions = (table["directions1"], table["directions2"]) if "directions1" in table else None
-    return _built(source, table["pixels1"], table["pixels2"], table.get("A21"), directions, table)
+    return _correspondences(source, table["pixels1"], table["pixels2"], table.get("A21"), directions, table)
 
 
 def _from_matcher(table: dict[str, FloatArray]) -> dict[str, FloatArray] | None:
@@ -245,7 +245,7 @@ def _index_pairs(table: dict[str, FloatArray], names: tuple[str, str], count0: i
     return pairs
 
 
-def _rough(A21: FloatArray | None) -> dict[str, FloatArray]:
+def _frame_sigmas(A21: FloatArray | None) -> dict[str, FloatArray]:
     """Return the column sigma_A for affinities from features' frames."""
     return {} if A21 is None else {"sigma_A": np.full(len(A21), SIGMA_OF_FRAMES)}
 
@@ -273,7 +273,7 @@ def _arrays(payload: bytes) -> dict[str, FloatArray]:
     return table
 
 
-def _built(
+def _correspondences(
     source: Path,
     pixels1: FloatArray,
     pixels2: FloatArray,

@@ -26,7 +26,11 @@ def parse_json(text: str) -> Any:
     """Return the value of a JSON text; raises ValueError, with the reason, for what is not strict JSON."""
     try:
         return json.loads(
-            text, object_pairs_hook=_once, parse_constant=_no_constant, parse_float=_finite, parse_int=_short
+            text,
+            object_pairs_hook=_without_duplicates,
+            parse_constant=_no_constant,
+            parse_float=_finite_float,
+            parse_int=_short_integer,
         )
     except RecursionError as error:
         raise ValueError("nested too deep") from error
@@ -120,7 +124,7 @@ def whole(value: Any) -> int:
     return int(number)
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     out = dict(pairs)
     if len(out) < len(pairs):
         ((key, _),) = Counter(key for key, _ in pairs).most_common(1)
@@ -132,14 +136,14 @@ def _no_constant(word: str) -> float:
     raise ValueError(f"{word} is no number of JSON")
 
 
-def _finite(text: str) -> float:
+def _finite_float(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(f"{text[:40]} is too large")
     return value
 
 
-def _short(text: str) -> int:
+def _short_integer(text: str) -> int:
     if len(text) > MAX_JSON_DIGITS:
         raise ValueError(f"a number of {len(text)} digits")
     return int(text)

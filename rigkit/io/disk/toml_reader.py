@@ -117,7 +117,7 @@ class TomlTable(Mapping[str, Any]):
             if key not in known:
                 close = difflib.get_close_matches(key, known, n=1)
                 remedy = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
-                raise self.error(f"unknown key {_shown(key)}; {remedy}")
+                raise self.error(f"unknown key {_value_in_words(key)}; {remedy}")
 
     def beside(self, name: str) -> Path:
         """Return the absolute path of `name`, relative to the folder of the file; links are not resolved."""
@@ -140,15 +140,17 @@ class TomlTable(Mapping[str, Any]):
         kind = schema.get("type", "string")
         fault = _fault(value, kind, schema)
         if fault is not None:
-            raise self.error(f"'{key}' must {fault}, got {_shown(value)}; write {_hint(key, schema)}")
+            raise self.error(f"'{key}' must {fault}, got {_value_in_words(value)}; write {_hint(key, schema)}")
         if kind == "object":
             return TomlTable(value, schema, self.path, f"{self.where}, '{key}'" if self.where else f"[{key}]")
         if kind == "array":
             return self._list(key, value, schema)
         if value not in schema.get("enum", (value,)):
-            raise self.error(f"'{key}' is {_shown(value)}, which is unknown; known: {', '.join(schema['enum'])}")
+            raise self.error(
+                f"'{key}' is {_value_in_words(value)}, which is unknown; known: {', '.join(schema['enum'])}"
+            )
         if not re.match(schema.get("pattern", ""), str(value)):
-            raise self.error(f"'{key}' is {_shown(value)}, which is not {schema['description']}")
+            raise self.error(f"'{key}' is {_value_in_words(value)}, which is not {schema['description']}")
         if schema.get("format") == "identifier":
             with self.located():
                 check_identifier(value, f"'{key}'")
@@ -158,7 +160,7 @@ class TomlTable(Mapping[str, Any]):
         least, most, (items,) = schema.get("minItems", 0), schema.get("maxItems", len(value)), _choices(schema, "items")
         if not least <= len(value) <= most:
             count = f"{'' if most == least else 'at least '}{COUNTED[least]} {PLURALS[items.get('type', 'string')]}"
-            fault = f"must be {count}, got {_shown(value)}" if value else "is empty"
+            fault = f"must be {count}, got {_value_in_words(value)}" if value else "is empty"
             raise self.error(f"'{key}' {fault}; write {_hint(key, schema)}")
         if items.get("type") == "object":
             prefix = f"{self.where}, '{key}'" if self.where else f"[[{key}]]"
@@ -214,7 +216,7 @@ def _hint(key: str, schema: Schema) -> str:
     return (f"{shown} ({words})" if words else shown) if shown else words or f"{key} = ..."
 
 
-def _shown(value: object) -> str:
+def _value_in_words(value: object) -> str:
     """Return a value on one line, truncated to MAX_SHOWN characters."""
     try:
         text = ascii(value)
@@ -250,6 +252,8 @@ def read_toml(path: str | Path, schema: Schema) -> TomlTable:
         name, _, version = wanted.partition("/")
         if str(found).partition("/")[0] == name:
             words = f"is of another version; write {name}/{version}, or update rigkit"
-            raise InputError(f"{source}: schema {_shown(found)} {words}")
-        raise InputError(f'{source}: schema is {_shown(found)}, but a file with schema = "{wanted}" is needed here')
+            raise InputError(f"{source}: schema {_value_in_words(found)} {words}")
+        raise InputError(
+            f'{source}: schema is {_value_in_words(found)}, but a file with schema = "{wanted}" is needed here'
+        )
     return TomlTable(values, schema, source)

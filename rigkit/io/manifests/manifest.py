@@ -209,11 +209,11 @@ class Dataset:
 
     def pair(self, pair_id: str) -> Pair:
         """Return the pair of that name; raises InputError that lists the known ones."""
-        return _named(pair_id, {p.pair_id: p for p in self.pairs}, f"{self.manifest}: pair")
+        return _declared(pair_id, {p.pair_id: p for p in self.pairs}, f"{self.manifest}: pair")
 
     def camera(self, camera_id: str) -> CameraEntry:
         """Return the camera of that name; raises InputError that lists the known ones."""
-        return _named(camera_id, {c.camera_id: c for c in self.cameras}, f"{self.manifest}: camera")
+        return _declared(camera_id, {c.camera_id: c for c in self.cameras}, f"{self.manifest}: camera")
 
     def select(self, pair_ids: Iterable[str]) -> Dataset:
         """Return the data set with these pairs only, in the order of the manifest; with all if none is named."""
@@ -293,12 +293,12 @@ def _camera(entry: TomlTable) -> CameraEntry:
 def _pair(entry: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEntry], default_planes: Planes) -> Pair:
     by_camera, by_board = {c.camera_id: c for c in cameras}, {b.board_id: b for b in boards}
     place = f"{entry.path}: {entry.where}"
-    camera1, camera2 = (_named(entry[key], by_camera, f"{place}: {key}") for key in ("camera1", "camera2"))
+    camera1, camera2 = (_declared(entry[key], by_camera, f"{place}: {key}") for key in ("camera1", "camera2"))
     pose_type = PoseType(entry["pose_type"])
-    chosen = tuple(_named(name, by_board, f"{place}: board") for name in entry["boards"])
+    chosen = tuple(_declared(name, by_board, f"{place}: board") for name in entry["boards"])
     layout = dict(entry.get("layout", {}))
     for board_id in layout:
-        _named(board_id, dict.fromkeys(entry["boards"], 0), f"{place}, 'layout': board")
+        _declared(board_id, dict.fromkeys(entry["boards"], 0), f"{place}, 'layout': board")
     level, down = _level(entry["level"], pose_type) if "level" in entry else (None, None)
     return Pair(
         pair_id=entry["id"],
@@ -340,7 +340,7 @@ def _with_table(top: TomlTable, pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
     return tuple(replace(pair, truth=stated.get(pair.pair_id, pair.truth)) for pair in pairs)
 
 
-def _named(name: str, known: Mapping[str, Entry], where: str) -> Entry:
+def _declared(name: str, known: Mapping[str, Entry], where: str) -> Entry:
     if name not in known:
         raise InputError(f"{where} '{name}' is not declared; known: {', '.join(known)}")
     return known[name]

@@ -104,10 +104,10 @@ def group_pairs(shown: Sequence[ImageBoards], root: Path) -> list[FoundPair]:
     """
     free = [s for s in shown if s.boards]
     pairs: list[FoundPair] = []
-    for marked in (_by_first, _by_name, _by_folder):
+    for marks in (SIDES_FIRST, SIDES, SIDE_FOLDERS):
         sides: dict[tuple[Path, str], dict[int, ImageBoards]] = {}
         for one in free:
-            found = marked(one.image, root)
+            found = _by_folder(one.image, root) if marks is SIDE_FOLDERS else _by_name(one.image, marks)
             if found is not None:
                 place, side = found
                 sides.setdefault(place, {})[side] = one
@@ -130,15 +130,9 @@ def group_pairs(shown: Sequence[ImageBoards], root: Path) -> list[FoundPair]:
     return sorted(pairs, key=lambda pair: pair.name)
 
 
-def _by_name(image: Path, root: Path) -> tuple[tuple[Path, str], int] | None:
-    """Return (folder, name without the mark) and the side 1 or 2, by the end of the name; None without a mark."""
-    found = _side(image.stem, SIDES)
-    return None if found is None else ((image.parent, found[0]), found[1])
-
-
-def _by_first(image: Path, root: Path) -> tuple[tuple[Path, str], int] | None:
-    """Return the same by the beginning of the name: for left_1 and right_1, not for left_1 and left_2."""
-    found = _side(image.stem, SIDES_FIRST)
+def _by_name(image: Path, marks: Sequence[tuple[re.Pattern[str], int]]) -> tuple[tuple[Path, str], int] | None:
+    """Return (folder, name without the mark) and the side 1 or 2; None without a mark."""
+    found = _side(image.stem, marks)
     return None if found is None else ((image.parent, found[0]), found[1])
 
 

@@ -101,7 +101,7 @@ class RigSession:
     __repr__ = brief
 
     @property
-    def rig_path(self) -> Path:
+    def result_path(self) -> Path:
         """Default path of the result: a rig file, or the calibration of a single camera."""
         return beside_session(self.path, "rig.json" if len(self.cameras) > 1 else "calibration.json")
 
@@ -196,7 +196,7 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
     alike = None
     for key in (how,) if how else ("name", "number"):
         frames = {name: {image: FRAME_KEYS[key](image) for image in own} for name, own in images.items()}
-        twice = _twice(frames)
+        twice = _duplicate_frame(frames)
         known = sorted(frame for own in frames.values() for frame in set(own.values()))
         if twice is None and any(a == b for a, b in pairwise(known)):
             return frames
@@ -220,7 +220,7 @@ FRAME_KEYS: dict[str, Callable[[str], str]] = {
 }
 
 
-def _twice(frames: Mapping[str, Mapping[str, str]]) -> str | None:
+def _duplicate_frame(frames: Mapping[str, Mapping[str, str]]) -> str | None:
     """Return two images of one camera with the same frame, in words, or None."""
     for name, own in frames.items():
         seen: dict[str, str] = {}

@@ -129,7 +129,7 @@ class Session:
         return "" if self.camera is None else f" of camera '{self.camera}'"
 
     @property
-    def calibration_path(self) -> Path:
+    def result_path(self) -> Path:
         """Default path of the calibration, beside the session (see `beside_session`)."""
         return beside_session(self.path, "calibration.json")
 

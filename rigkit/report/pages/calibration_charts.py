@@ -91,7 +91,7 @@ def images_svg(calibration: Calibration) -> str:
     rms = np.array([view.rms_px for view in calibration.views])
     rms = np.where(np.isfinite(rms), rms, 0.0)
     top = round_up(max(1.1 * float(rms.max(initial=0.0)), 1e-6))
-    names = _short([view.image for view in calibration.views]) if len(rms) <= BARS_NAMED else []
+    names = _short_names([view.image for view in calibration.views]) if len(rms) <= BARS_NAMED else []
     longest = max(map(len, names), default=0)
     upright = longest > LEVEL_NAME
     bottom = LETTER * longest + 14.0 if upright else BOTTOM
@@ -120,7 +120,7 @@ def images_svg(calibration: Calibration) -> str:
     return plot.done()
 
 
-def _short(names: Sequence[str]) -> list[str]:
+def _short_names(names: Sequence[str]) -> list[str]:
     """Return names without endings and without their common prefix (numbers are not split); long ones truncated."""
     stems = [Path(name).stem for name in names]
     if len(set(stems)) > 1:

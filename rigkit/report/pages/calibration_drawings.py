@@ -48,12 +48,12 @@ def residuals_svg(calibration: Calibration) -> str:
     crossed = corners.pixels[~corners.kept]
     zoom = _zoom(calibration)
     out = [
-        _open(calibration, words),
+        _opening(calibration, words),
         f'<path d="{strokes(zoom * q, zoom * times * d)}" stroke="{INK}" stroke-width="1" fill="none"/>',
         f'<path d="{dots(zoom * q)}" stroke="{INK}" stroke-width="2.2" stroke-linecap="round"/>',
         f'<path d="{_crosses(zoom * crossed)}" stroke="{WRONG}" stroke-width="1.2" fill="none"/>',
         _scale(calibration, times),
-        _foot(
+        _ending(
             calibration, words, f"crosses: {len(crossed)} corners left out" if len(crossed) else "no corner left out"
         ),
     ]
@@ -87,13 +87,13 @@ def pattern_svg(calibration: Calibration) -> str:
     words = f"mean residual by part of the image, magnified {times:g} times"
     zoom = _zoom(calibration)
     marks = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.4" fill="{SOFT}"/>' for x, y in zoom * places)
-    out = [_open(calibration, words), marks]
+    out = [_opening(calibration, words), marks]
     for chosen, colour in ((~beyond, SOFT), (beyond, MARK)):
         start, by = zoom * places[chosen], zoom * times * mean[chosen]
         path = strokes(start, by) + _heads(start, by)
         out.append(f'<path d="{path}" stroke="{colour}" stroke-width="1.6" fill="none"/>')
     expected = f"{int(beyond.sum())} of {len(beyond)} coloured: beyond chance, which makes {CHANCE * len(beyond):.1f}"
-    return "".join([*out, _scale(calibration, times), _foot(calibration, words, expected)])
+    return "".join([*out, _scale(calibration, times), _ending(calibration, words, expected)])
 
 
 def coverage_svg(calibration: Calibration) -> str:
@@ -106,7 +106,7 @@ def coverage_svg(calibration: Calibration) -> str:
     count = np.bincount(i * rows + j, minlength=columns * rows).reshape(columns, rows)
     zoom = _zoom(calibration)
     w, h = zoom * width / columns, zoom * height / rows
-    out = [_open(calibration, "coverage of the image by corners")]
+    out = [_opening(calibration, "coverage of the image by corners")]
     for i, j in np.ndindex(columns, rows):
         if count[i, j]:
             shade = 0.08 + 0.42 * min(count[i, j] / max(np.quantile(count[count > 0], 0.9), 1.0), 1.0)
@@ -119,7 +119,7 @@ def coverage_svg(calibration: Calibration) -> str:
     empty = int((seen & (count == 0)).sum())
     words = f"{len(pixels)} corners of {len(calibration.views)} boards seen"
     return "".join(
-        [*out, _foot(calibration, words, f"{empty} of the {int(seen.sum())} cells that the lens sees are empty")]
+        [*out, _ending(calibration, words, f"{empty} of the {int(seen.sum())} cells that the lens sees are empty")]
     )
 
 
@@ -129,14 +129,16 @@ def uncertainty_svg(calibration: Calibration) -> str:
     grid = uncertainty_map(calibration, grid=MAP_GRID)
     known = np.isfinite(grid.worst_px)
     if not known.any() or not np.nanmin(grid.worst_px) > 0.0:
-        return "".join([_open(calibration, "uncertainty"), _foot(calibration, "the projection has no uncertainty", "")])
+        return "".join(
+            [_opening(calibration, "uncertainty"), _ending(calibration, "the projection has no uncertainty", "")]
+        )
     low, high = MAP_PX
     level = np.log(np.where(known, grid.worst_px, low) / low) / np.log(high / low)
     zoom = _zoom(calibration)
     w, h = zoom * width / MAP_GRID[0], zoom * height / MAP_GRID[1]
     best, worst = float(np.nanmin(grid.worst_px)), float(np.nanmax(grid.worst_px))
     words = f"{best:.3g} px at best, {worst:.3g} px at worst (a point at infinity, worst direction)"
-    out = [_open(calibration, "projection uncertainty, px"), '<g shape-rendering="crispEdges">']
+    out = [_opening(calibration, "projection uncertainty, px"), '<g shape-rendering="crispEdges">']
     for j, i in np.argwhere(known):
         place = f'x="{i * w:.1f}" y="{j * h:.1f}" width="{w + 0.2:.1f}" height="{h + 0.2:.1f}"'
         out.append(f'<rect {place} fill="{_colour(float(level[j, i]))}"/>')
@@ -145,7 +147,7 @@ def uncertainty_svg(calibration: Calibration) -> str:
     out.append(f'<polygon points="{outline}" fill="none" stroke="#fff" stroke-width="1.5" stroke-dasharray="6 4"/>')
     out += _numbers(calibration)
     return "".join(
-        [*out, _foot(calibration, words, "dashed: around all corners that were seen; outside only lens models tell")]
+        [*out, _ending(calibration, words, "dashed: around all corners that were seen; outside only lens models tell")]
     )
 
 
@@ -239,7 +241,7 @@ def _colour(level: float) -> str:
     return f"#{round(float(red)):02x}{round(float(green)):02x}{round(float(blue)):02x}"
 
 
-def _open(calibration: Calibration, title: str) -> str:
+def _opening(calibration: Calibration, title: str) -> str:
     height = _zoom(calibration) * calibration.camera.size_px[1]
     return (
         svg.opened(title, f"-1 -1 {DRAWN_WIDTH + 2:g} {height + FOOT:.1f}")
@@ -247,7 +249,7 @@ def _open(calibration: Calibration, title: str) -> str:
     )
 
 
-def _foot(calibration: Calibration, *lines: str) -> str:
+def _ending(calibration: Calibration, *lines: str) -> str:
     """Return the end of the drawing with a frame, and the caption as HTML, which stays legible in small drawings."""
     height = _zoom(calibration) * calibration.camera.size_px[1]
     words = "<br>".join(escape(line) for line in lines if line)

@@ -87,8 +87,8 @@ def build_calibration_page(
         "calibration.html",
         title=title,
         lead=lead,
-        shared=None if rig is None else _shared(rig, checks),
-        sections=[_shown(section) for section in sections],
+        shared=None if rig is None else _rig_context(rig, checks),
+        sections=[_section_context(section) for section in sections],
         provenance=provenance,
     )
 
@@ -114,7 +114,7 @@ def thumbnail_jpeg(image: Image, views: Sequence[ViewResult] = (), *, count: int
     return bytes(cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, PAGE_JPEG_QUALITY])[1])
 
 
-def _shared(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
+def _rig_context(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
     """Return the rig for the template."""
     facts = rig_facts(rig, checks, {})
     return {
@@ -124,7 +124,7 @@ def _shared(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
     }
 
 
-def _shown(section: CalibrationSection) -> dict[str, Any]:
+def _section_context(section: CalibrationSection) -> dict[str, Any]:
     """Return one camera for the template."""
     c = section.calibration
     facts = camera_facts(c, section.plan)

@@ -73,9 +73,9 @@ def history_page(entries: Sequence[HistoryEntry], title: str, provenance: Mappin
         whose = f"{edition.name}: " if len(kept) > 1 else ""
         for name in _names(edition):
             drawings.append((f"{whose}{name}", drift_svg(edition.entries, name)))
-            heat = _heat_of(edition, name)
+            heat = _temperature_drift(edition, name)
             if heat is not None:
-                own = _warm(edition, name)
+                own = _entries_by_temperature(edition, name)
                 drawings.append((f"{whose}{name}: over the temperature", heat_svg(own, name, heat)))
     return build_facts_page(title, history_facts(entries), provenance, drawings=drawings)
 
@@ -84,14 +84,14 @@ def _names(edition: Edition) -> list[str]:
     return list(dict.fromkeys(name for entry in edition.entries for name in entry.amounts))
 
 
-def _warm(edition: Edition, name: str) -> list[HistoryEntry]:
+def _entries_by_temperature(edition: Edition, name: str) -> list[HistoryEntry]:
     """Return the entries with this amount and a temperature, sorted by temperature."""
     own = [entry for entry in edition.entries if name in entry.amounts and entry.temperature_c is not None]
     return sorted(own, key=lambda entry: entry.temperature_c or 0.0)
 
 
-def _heat_of(edition: Edition, name: str) -> HeatDrift | None:
-    own = _warm(edition, name)
+def _temperature_drift(edition: Edition, name: str) -> HeatDrift | None:
+    own = _entries_by_temperature(edition, name)
     if not own:
         return None
     value, sigma = np.array([entry.amounts[name] for entry in own]).T
@@ -107,7 +107,7 @@ def _heat_tables(kept: Sequence[Edition]) -> tuple[Table, ...]:
     rows: list[tuple[Cell, ...]] = []
     for edition in kept:
         for name in _names(edition):
-            heat, own = _heat_of(edition, name), _warm(edition, name)
+            heat, own = _temperature_drift(edition, name), _entries_by_temperature(edition, name)
             if heat is not None:
                 low, high = own[0].temperature_c, own[-1].temperature_c
                 what, _, unit = name.rpartition(", ")
@@ -127,8 +127,8 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
     days = np.array([entry.moment.timestamp() / 86400.0 for entry in own])
     value, sigma = np.array([entry.amounts[name] for entry in own]).T
     limit = CONTROL_SIGMAS * sigma
-    top = _top(float(limit.max()), value, sigma)
-    x = _across(days)
+    top = _upper_limit(float(limit.max()), value, sigma)
+    x = _x_coordinates(days)
     out = [svg.opened(name, f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
     # The limits depend on the number of pictures: every entry has its own, up to halfway to its neighbours.
     ends = np.concatenate([[LEFT_MARGIN], 0.5 * (x[1:] + x[:-1]), [DRAWN_WIDTH - 6.0]])
@@ -141,15 +141,15 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
         )
     y = ZERO_HEIGHT * (1.0 - value / top)
     out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{INK}" stroke-opacity="0.4"/>')
-    return "".join([*out, *_points(own, name, x, top), *_below(x, [entry.date[:10] for entry in own]), "</svg>"])
+    return "".join([*out, *_points(own, name, x, top), *_x_labels(x, [entry.date[:10] for entry in own]), "</svg>"])
 
 
 def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str:
     """Draw an amount over temperature, with standard deviations and the fitted line; `entries` by temperature."""
     celsius = _celsius(entries)
     value, sigma = np.array([entry.amounts[name] for entry in entries]).T
-    top = _top(0.0, value, sigma)
-    x, y = _across(celsius), ZERO_HEIGHT * (1.0 - heat.at(celsius) / top)
+    top = _upper_limit(0.0, value, sigma)
+    x, y = _x_coordinates(celsius), ZERO_HEIGHT * (1.0 - heat.at(celsius) / top)
     out = [svg.opened(f"{name} over the temperature", f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
     for amount in (-top / 1.1, 0.0, top / 1.1):
         height = ZERO_HEIGHT * (1.0 - amount / top)
@@ -160,21 +160,21 @@ def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str
         )
     out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{INK}" stroke-opacity="0.6"/>')
     labels = [f"{c:g} °C" for c in celsius]
-    return "".join([*out, *_points(entries, name, x, top), *_below(x, labels), "</svg>"])
+    return "".join([*out, *_points(entries, name, x, top), *_x_labels(x, labels), "</svg>"])
 
 
-def _top(limit: float, value: FloatArray, sigma: FloatArray) -> float:
+def _upper_limit(limit: float, value: FloatArray, sigma: FloatArray) -> float:
     """Return the amount at the upper edge of a drawing."""
     return 1.1 * max(limit, float((np.abs(value) + sigma).max()), np.finfo(float).tiny)
 
 
-def _across(values: FloatArray) -> FloatArray:
+def _x_coordinates(values: FloatArray) -> FloatArray:
     """Return x coordinates of values, from the left to the right of a drawing; a single one in the middle."""
     part = (values - values[0]) / max(float(np.ptp(values)), 1e-9) if len(values) > 1 else np.full(1, 0.5)
     return np.asarray(LEFT_MARGIN + (DRAWN_WIDTH - LEFT_MARGIN - 14.0) * part)
 
 
-def _below(x: FloatArray, labels: Sequence[str]) -> list[str]:
+def _x_labels(x: FloatArray, labels: Sequence[str]) -> list[str]:
     """Return the labels below the first and the last point."""
     if len(labels) == 1:
         return [svg.words(x[0], DRIFT_HEIGHT - 6, labels[0], "middle")]
@@ -190,12 +190,12 @@ def _points(entries: Sequence[HistoryEntry], name: str, x: FloatArray, top: floa
         out.append(
             f'<line x1="{a:.1f}" x2="{a:.1f}" y1="{b - s:.1f}" y2="{b + s:.1f}" stroke="{colour}"/>'
             f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.4" fill="{colour}">'
-            f"<title>{escape(_of(entry, name))}</title></circle>"
+            f"<title>{escape(_point_words(entry, name))}</title></circle>"
         )
     return out
 
 
-def _of(entry: HistoryEntry, name: str) -> str:
+def _point_words(entry: HistoryEntry, name: str) -> str:
     value, sigma = entry.amounts[name]
     heat = "" if entry.temperature_c is None else f", {entry.temperature_c:g} °C"
     return f"{entry.date[:16]}{heat}: {value:+.3g} ± {sigma:.2g}; {entry.verdict}"

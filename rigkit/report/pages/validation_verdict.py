@@ -94,7 +94,7 @@ def failed_facts(
     for report in reports:
         for c in report.checks:
             if not c.passed:
-                found.setdefault(("FAILED", report.pair_id, _in_words(c)), []).append(report.affine_method)
+                found.setdefault(("FAILED", report.pair_id, _check_words(c)), []).append(report.affine_method)
         for words in report.unchecked:
             found.setdefault(("NOT CHECKED", report.pair_id, words), []).append(report.affine_method)
     facts = [FailedFact(what=w, pair_id=p, methods=tuple(m), words=words) for (w, p, words), m in found.items()]
@@ -106,7 +106,7 @@ def failed_facts(
     return tuple(facts)
 
 
-def _in_words(c: Check) -> str:
+def _check_words(c: Check) -> str:
     return (
         f"{c.name}: {c.ours:.3f} {c.unit}, measured {c.measured:g} ± {c.measured_sigma:g} ({c.how}), off "
         f"by {c.k:.1f} combined sigmas"

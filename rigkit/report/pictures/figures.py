@@ -286,13 +286,13 @@ def pair_axes(image1: NDArray[Any], image2: NDArray[Any]) -> tuple[Figure, Seque
     figure.subplots_adjust(left=PAIR_RIM, right=1.0 - PAIR_RIM, bottom=PAIR_RIM, top=PAIR_TOP, wspace=0.01)
     for axis, image in zip(axes, (image1, image2), strict=True):
         height, width = image.shape[:2]
-        fitted = _fitted(image, axis.bbox.width, axis.bbox.height)
+        fitted = _reduced_rgb(image, axis.bbox.width, axis.bbox.height)
         axis.imshow(fitted, interpolation="antialiased", extent=(-0.5, width - 0.5, height - 0.5, -0.5))
         axis.set_axis_off()
     return figure, axes
 
 
-def _fitted(image: NDArray[Any], width: float, height: float) -> NDArray[np.uint8]:
+def _reduced_rgb(image: NDArray[Any], width: float, height: float) -> NDArray[np.uint8]:
     """Return the image as 8-bit RGB, reduced to `width` x `height` px: matplotlib is ten times slower at that.
 
     Grey images are stretched to full contrast.

@@ -33,7 +33,7 @@ from rigkit.workflows.inputs.identify_board import misread
 from rigkit.workflows.inputs.interlaced import interlaced
 from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths
-from rigkit.workflows.outputs.provenance import made
+from rigkit.workflows.outputs.provenance import provenance_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,7 +101,7 @@ def calibrate_session(
     calibration = calibration_from(session, corners, pupil=options.pupil, progress=progress)
     files: dict[Path, str] = {}
     if options.output is not None:
-        files[options.output] = calibration_text(calibration, made(session.path, {"": session.images}))
+        files[options.output] = calibration_text(calibration, provenance_of(session.path, {"": session.images}))
         files |= foreign_files(calibration, options.output, options.exports)
     if options.report is not None:
         files[options.report] = session_page(session, calibration, corners, files)

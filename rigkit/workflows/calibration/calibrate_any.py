@@ -91,7 +91,7 @@ def calibrate_session_file(
     """
     listed = load_rig_session(path) if is_rig_session(path) else load_session(path)
     session = with_frames(listed, progress)
-    output = options.output or default_output(session)
+    output = options.output or session.result_path
     report = output.with_suffix(".html") if options.report == Path() else options.report
     options = replace(options, output=output, report=report)
     if session is not listed:
@@ -103,11 +103,6 @@ def calibrate_session_file(
         if isinstance(session, RigSession):
             return calibrate_rig_session(session, options, progress=progress)
         return calibrate_session(session, options, progress=progress)
-
-
-def default_output(session: Session | RigSession) -> Path:
-    """Return the default path of the result, beside the session."""
-    return session.rig_path if isinstance(session, RigSession) else session.calibration_path
 
 
 def calibrate_folders(

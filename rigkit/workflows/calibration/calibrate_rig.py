@@ -32,7 +32,7 @@ from rigkit.workflows.inputs.corners import SessionCorners, session_corners, ses
 from rigkit.workflows.inputs.identify_board import misread
 from rigkit.workflows.inputs.known_cameras import known_cameras, with_known, with_known_first
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
-from rigkit.workflows.outputs.provenance import made
+from rigkit.workflows.outputs.provenance import provenance_of
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -88,16 +88,16 @@ def calibrate_rig_session(
         checks = measured_checks(session, rig)
     files: dict[Path, str] = {}
     if options.output is not None:
-        origin = made(session.path, {name: own.images for name, own in session.cameras.items()})
+        origin = provenance_of(session.path, {name: own.images for name, own in session.cameras.items()})
         if len(session.cameras) > 1:
             files[options.output] = rig_text(rig, origin)
             mounted = {c.name: (c.camera, c.cam_from_rig) for c in rig.cameras}
             outlines = {c.name: outline_of_corners(c.calibration) for c in rig.cameras}
             files |= foreign_rig_files(mounted, options.output, options.exports, outlines)
         for camera in rig.cameras:
-            own = _beside(session, options.output, camera.name)
+            own = _camera_file(session, options.output, camera.name)
             files[own] = calibration_text(judged(camera.calibration, session.cameras[camera.name]), origin)
-            files |= foreign_files(camera.calibration, own, _of_cameras(session, options))
+            files |= foreign_files(camera.calibration, own, _camera_exports(session, options))
         if session.rigid_boards:
             files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)
     if options.report is not None:
@@ -114,27 +114,27 @@ def _targets(session: RigSession, options: CalibrateOptions) -> list[Path]:
     out = []
     if options.output is not None:
         out += [options.output] if len(session.cameras) > 1 else []
-        own = [_beside(session, options.output, name) for name in session.cameras]
-        out += [*own, *(path for one in own for path in foreign_paths(one, _of_cameras(session, options)))]
-        out += [path for places in _of_the_rig(session, options).values() for path in places]
+        own = [_camera_file(session, options.output, name) for name in session.cameras]
+        out += [*own, *(path for one in own for path in foreign_paths(one, _camera_exports(session, options)))]
+        out += [path for places in _rig_exports(session, options).values() for path in places]
         out += [_boards_file(options.output)] if session.rigid_boards else []
     return out if options.report is None else [*out, options.report]
 
 
-def _of_the_rig(session: RigSession, options: CalibrateOptions) -> dict[str, list[Path]]:
+def _rig_exports(session: RigSession, options: CalibrateOptions) -> dict[str, list[Path]]:
     """Return, by requested format that holds a whole rig, its files."""
     if options.output is None or len(session.cameras) < 2:
         return {}
     return foreign_rig_paths(list(session.cameras), options.output, options.exports)
 
 
-def _of_cameras(session: RigSession, options: CalibrateOptions) -> list[str]:
+def _camera_exports(session: RigSession, options: CalibrateOptions) -> list[str]:
     """Return the requested formats that hold one camera a file; a rig's file has the lenses already."""
-    whole = _of_the_rig(session, options)
+    whole = _rig_exports(session, options)
     return [kind for kind in options.exports if kind not in whole]
 
 
-def _beside(session: RigSession, target: Path, name: str) -> Path:
+def _camera_file(session: RigSession, target: Path, name: str) -> Path:
     """Return the path of one camera's calibration."""
     return own_file(target, name) if len(session.cameras) > 1 else target
 

@@ -1,4 +1,4 @@
-"""A new manifest from a folder of images: the pairs that the images show, and the file with what else was told."""
+"""`rigkit init`: pairs among the images of a folder, and the manifest file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from rigkit.workflows.inputs.identify_board import suggestion
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FoundPairs:
-    """The pairs of a folder, and why the images that are left out could not be read."""
+    """The pairs of a folder, and the errors of images that cannot be read."""
 
     pairs: tuple[FoundPair, ...]
     unreadable: tuple[InputError, ...]
@@ -38,9 +38,9 @@ class FoundPairs:
 def find_pairs(
     root: Path, images: Sequence[Path], boards: Sequence[Board] = (), *, progress: Progress = silent
 ) -> FoundPairs:
-    """Return the pairs among `images`, which lie below `root`, that show `boards`, or any chessboards.
+    """Return the pairs among `images` below `root` that show `boards`, by default chessboards of any size.
 
-    Raises InputError where no image can be read, or none shows a board that was looked for.
+    Raises InputError if no image can be read, or none shows such a board.
     """
     shown: list[ImageBoards] = []
     unreadable: list[InputError] = []
@@ -55,17 +55,17 @@ def find_pairs(
     if not shown and unreadable:
         raise unreadable[0]
     if not any(image.boards for image in shown):
-        what = "of the boards told is" if boards else "chessboard is"
+        what = "none of the boards given" if boards else "no chessboard"
         seen = suggestion(images).words
-        such = f"they show --board {seen}, with MM measured" if seen else "other boards must be told: --board"
-        raise InputError(f"init: no {what} found in {counted(len(shown), 'image')}; {such}")
+        such = f"they show --board {seen}, with MM measured" if seen else "give other boards with --board"
+        raise InputError(f"init: {what} is found in {counted(len(shown), 'image')}; {such}")
     return FoundPairs(tuple(group_pairs(shown, root)), tuple(unreadable))
 
 
 def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> InputError | None:
-    """Write the manifest and return what it still lacks to be loaded, or None.
+    """Write the manifest; return the error of loading it if it is incomplete, else None.
 
-    Raises InputError where the file exists, unless `force`, or cannot be written.
+    Raises InputError if the file exists, unless `force`, or cannot be written.
     """
     write_atomic(path, manifest_text(new, path.parent.resolve()), force=force)
     try:
@@ -76,5 +76,5 @@ def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> Inpu
 
 
 def name_of_folder(folder: Path) -> str:
-    """Return the folder's name without the letters that no data set's name has."""
+    """Return the folder's name without characters that names of data sets cannot have."""
     return re.sub(r"[^\w .+()-]|^\W+|\.(?=\.)", "", folder.name)[:MAX_IDENTIFIER].strip() or "data"

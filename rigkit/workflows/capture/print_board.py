@@ -1,4 +1,4 @@
-"""A board to print, true to scale, and its measured print back into the board's file."""
+"""`rigkit board`: a board to print true to scale, and the size of the measured print in the board's file."""
 
 from __future__ import annotations
 
@@ -15,45 +15,45 @@ from rigkit.report.pictures.board_sheet import board_sheet, pdf_bytes, svg_text
 from rigkit.workflows.inputs.paths import NamesFiles
 
 MAX_UNEVEN = 1.05
-"""Ratio of the stretches along and across a sheet: printers are a per cent apart, misread rulers more."""
+"""Maximum ratio of the scales along and across a sheet: printers differ by a per cent, misread rulers by more."""
 MAX_STRETCH = 2.0
-"""Of a ruler: nobody prints so far from the true scale and wants it kept."""
+"""Maximum scale of a print, and its inverse: larger ones are misread rulers."""
 ENDINGS = (".pdf", ".svg", ".toml")
-"""Of what is written; a name that is given with one of them is meant without it, "board-25.4" is one as it is."""
+"""Endings of written files, which are removed from a given name."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrintOptions(NamesFiles):
-    """Where a board to print goes."""
+    """Output of a board to print."""
 
     output: Path
-    """Name of the files, which get the endings .pdf, .svg and, of a new board, .toml, once."""
+    """Name of the files, to which .pdf, .svg and, for a new board, .toml are appended."""
     paper: str = "a4"
     """a4, a3, a2, a1, a0, letter or tabloid."""
     force: bool = False
-    """Replace files that exist; a board that was read is never replaced."""
+    """Replace existing files; the board's file that was read is never replaced."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredPrint:
-    """What a rule shows on the two rulers of a print."""
+    """Measured lengths of the two printed rulers."""
 
     ruler_x_mm: float
     """Length of the lower ruler."""
     ruler_y_mm: float
     """Length of the right ruler."""
     sigma_mm: float | None = None
-    """How well the rule could be read."""
+    """Standard deviation of the readings."""
     paper: str = "a4"
-    """What it was printed on, which decides how long the rulers are."""
+    """Paper of the print, which determines the nominal lengths of the rulers."""
 
     __repr__ = brief
 
 
 def print_board(board: Board | str | Path, options: PrintOptions) -> tuple[Path, ...]:
-    """Write a board as PDF and SVG, with its file beside them where it is a new one; return what was written.
+    """Write a board as PDF and SVG, and a new board also as a board file; return the written files.
 
-    A board's file is printed as it was laid out first, whatever was measured of a print since.
+    The board of a file is printed with its original layout, even if a print was measured since.
 
     Raises InputError for a board that does not fit on the paper, or a file that cannot be written.
     """
@@ -71,9 +71,9 @@ def print_board(board: Board | str | Path, options: PrintOptions) -> tuple[Path,
 
 
 def store_measured_print(path: str | Path, measured: MeasuredPrint) -> Board:
-    """Write the size that squares have on a print into the board's file; return the board as it is now.
+    """Write the square size of a measured print into the board's file; return the updated board.
 
-    Raises InputError for readings that no print has, or a file that cannot be written.
+    Raises InputError for implausible readings, or a file that cannot be written.
     """
     board = load_layout(path)
     sheet = board_sheet(board, measured.paper)

@@ -126,13 +126,6 @@ def warn_if_bad(path: str | Path, verdicts: Iterable[Finding] | None = None) -> 
         _log.warning("'%s': %s", path, bad.message)
 
 
-def pupil_note(calibration: Calibration) -> str | None:
-    """Return the note that a moving entrance pupil is neglected; None for a central calibration."""
-    if calibration.pupil is None:
-        return None
-    return _neglected_pupil("this lens", calibration.camera, calibration.pupil.terms, calibration.corners.used[0])
-
-
 def _neglected_pupil(which: str, camera: Camera, pupil: FloatArray, pixels: Pixels) -> str:
     """Return the note on a camera, with the largest displacement of its rays at `pixels`, mm."""
     rays = camera.unproject(pixels)[0]
@@ -153,7 +146,8 @@ def warn_of_pupils(path: str | Path, rig: SavedRig) -> None:
 
 def warn_of_pupil(path: str | Path, calibration: Calibration) -> None:
     """Warn if the moving entrance pupil of a file's camera is neglected."""
-    if (note := pupil_note(calibration)) is not None:
+    if (pupil := calibration.pupil) is not None:
+        note = _neglected_pupil("this lens", calibration.camera, pupil.terms, calibration.corners.used[0])
         _log.warning("'%s': %s", path, note)
 
 

@@ -108,7 +108,7 @@ def session_of_folders(
         "# Images, relative to this file: names, or patterns such as *.jpg.",
     ]
     if len(cameras) == 1:
-        lines.append(f"images = {_listed(cameras[''], place)}")
+        lines.append(f"images = {_patterns_toml(cameras[''], place)}")
     else:
         lines += _cameras_in_words(cameras, place, known or Known())
     files[path] = "\n".join(lines).rstrip() + "\n"
@@ -123,7 +123,7 @@ def _cameras_in_words(cameras: Mapping[str, Sequence[tuple[Path, str]]], place: 
         lines += ["# Its cameras stay as they are, lens and mount.", f"rig = {rig}", ""]
     lenses = known.of_cameras(list(cameras))
     for name, patterns in cameras.items():
-        lines += ["[[cameras]]", f"id = {toml_text(name)}", f"images = {_listed(patterns, place)}"]
+        lines += ["[[cameras]]", f"id = {toml_text(name)}", f"images = {_patterns_toml(patterns, place)}"]
         lines += [f"calibration = {toml_text(relative_path(lenses[name], place))}", ""] if name in lenses else [""]
     lines += [
         "# What a rule says of the distance of two cameras is compared with the result:",
@@ -163,7 +163,7 @@ def boards_seen(places: Sequence[Path], side_mm: float, progress: Progress = sil
 
     Raises InputError if none is recognised.
     """
-    shown = _shown(places, progress)
+    shown = _board_suggestion(places, progress)
     if shown.words is None:
         if shown.fault is not None:
             raise InputError(f"calibrate: {shown.fault}")
@@ -174,7 +174,7 @@ def boards_seen(places: Sequence[Path], side_mm: float, progress: Progress = sil
     return tuple(with_length(words, side_mm) for words in shown.words.split(" --board "))
 
 
-def _shown(places: Sequence[Path], progress: Progress = silent) -> Suggestion:
+def _board_suggestion(places: Sequence[Path], progress: Progress = silent) -> Suggestion:
     if any(is_video(place) for place in places):
         return suggestion(places, progress)
     entries = [entry for found in cameras_in(places).values() for entry in found]
@@ -183,7 +183,7 @@ def _shown(places: Sequence[Path], progress: Progress = silent) -> Suggestion:
 
 def _missing_board_message(folders: Sequence[Path]) -> str:
     """Return the error message for a missing --board, with the board that the images show."""
-    shown = _shown(folders)
+    shown = _board_suggestion(folders)
     if shown.fault is not None:
         return f"calibrate: {shown.fault}"
     if shown.words is None:
@@ -262,11 +262,11 @@ def _board_file(words: str, place: Path, files: dict[Path, str]) -> str:
     if board_in_words(words) is None:
         return relative_path(Path(words), place)
     path = place / f"{board.board_id}.toml"
-    files[path] = board_text(board, f"as told by --board {words}; squares are best measured over many", path)
+    files[path] = board_text(board, f"as given by --board {words}; squares are best measured over many", path)
     return path.name
 
 
-def _listed(patterns: Sequence[tuple[Path, str]], place: Path) -> str:
+def _patterns_toml(patterns: Sequence[tuple[Path, str]], place: Path) -> str:
     texts = []
     for folder, pattern in patterns:
         inside = relative_path(folder, place)

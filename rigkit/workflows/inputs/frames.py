@@ -80,24 +80,6 @@ def timestamps_next_to(sources: Sequence[Path]) -> Path | None:
     return path if len(sources) > 1 and path.is_file() else None
 
 
-def frames_of_video(
-    source: Path,
-    folder: Path,
-    boards: Sequence[Board] = (),
-    *,
-    max_frames: int = MAX_FRAMES,
-    progress: Progress = silent,
-) -> VideoFrames:
-    """Write selected frames of a video, a numbered sequence or a live camera (until `max_frames` or Ctrl-C) as PNG.
-
-    Frames that an earlier call kept of the same video for the same boards are used again.
-
-    Raises InputError: the video cannot be read, no frame shows a board, or `folder` cannot be written or holds other
-    files.
-    """
-    return frames_of_videos({"": source}, folder, boards, max_frames=max_frames, progress=progress)
-
-
 def frames_of_videos(
     sources: Mapping[str, Path],
     folder: Path,
@@ -107,10 +89,16 @@ def frames_of_videos(
     max_frames: int = MAX_FRAMES,
     progress: Progress = silent,
 ) -> VideoFrames:
-    """Write selected moments of several cameras' videos (by camera name) as `frames_of_video` does.
+    """Write selected frames of one video (named ""), or selected moments of several cameras' videos, as PNG files.
+
+    A source is a video, a numbered sequence, or a live camera, which is read until `max_frames` or Ctrl-C. Frames that
+    an earlier call kept of the same videos for the same boards are used again.
 
     `timestamps` is a file that assigns frames to moments (`io.media.video.read_timestamps`). None: frames of the same
     number are of one moment.
+
+    Raises InputError: a video cannot be read, no frame shows a board, or `folder` cannot be written or holds other
+    files.
     """
     asked = _request(sources, boards, timestamps, max_frames)
     kept = _kept_before(folder, asked)
@@ -120,7 +108,7 @@ def frames_of_videos(
     looked_at = with_boards = 0
     with _opened(sources, timestamps) as (videos, moments):
         live = any(video.live for video in videos.values())
-        _take_folder(folder, live)
+        _claim_folder(folder, live)
         if moments is None:
             _warn_of_clocks(videos)
         total = min((v.count for v in videos.values() if v.count), default=0) if moments is None else len(moments)
@@ -314,7 +302,7 @@ def _request(
     }
 
 
-def _take_folder(folder: Path, live: bool) -> None:
+def _claim_folder(folder: Path, live: bool) -> None:
     """Mark the folder as one of kept frames.
 
     Raises InputError if it holds anything else, or frames of a live camera, which cannot be taken again.

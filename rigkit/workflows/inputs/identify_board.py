@@ -95,7 +95,7 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     if not guess.determined:
         raise CheckFailed(f"{counted(len(guess.images), 'image')} of {len(names)} show {_partial_board_words(guess)}")
     pictures = list(images.values())
-    elsewhere = _elsewhere([(names[k], pictures[k]) for k in range(len(names)) if k not in guess.images])
+    elsewhere = _other_board([(names[k], pictures[k]) for k in range(len(names)) if k not in guess.images])
     twice = tuple(names[k] for k in guess.images if duplicate_boards(pictures[k], [guess.board]) is not None)
     return IdentifiedBoard(
         board=guess.board,
@@ -110,7 +110,7 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     )
 
 
-def _elsewhere(rest: Sequence[tuple[str, GreyImage]]) -> tuple[str, tuple[str, ...]] | None:
+def _other_board(rest: Sequence[tuple[str, GreyImage]]) -> tuple[str, tuple[str, ...]] | None:
     """Return the board in words that most of the remaining images show, and their names; None if there is none."""
     if len(rest) < MIN_IMAGES_OF_GUESS:
         return None
@@ -150,10 +150,10 @@ def misread(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     """
     if not any(board.identified for board in boards):
         return None
-    return explained(paths, boards) or _alike(paths, boards)
+    return explained(paths, boards) or _duplicate_board(paths, boards)
 
 
-def _alike(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
+def _duplicate_board(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     """Return a message if an image shows two boards with the same marks, else None."""
     for name, image in _pictures(paths, EXPLAINING_IMAGES):
         message = None if isinstance(image, InputError) else duplicate_boards(image, boards)
@@ -251,7 +251,7 @@ def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion
         return Suggestion(doubt=_doubtful(pictures))
     if not guess.determined:
         return Suggestion(part=_partial_board_words(guess))
-    # Chessboards beside it may hang on a wall.
+    # Other chessboards may be background.
     boards = [guess.board, *(board for board in guess.beside if board.identified)]
     return Suggestion(" --board ".join(map(words_of_board, boards)))
 

@@ -48,7 +48,7 @@ def with_known_first(session: RigSession) -> RigSession:
     """
     if session.known_rig is None:
         return session
-    of_rig = list(_saved(session.known_rig, list(session.cameras)).cameras)
+    of_rig = list(_rig_with_names(session.known_rig, list(session.cameras)).cameras)
     known = [name for name in of_rig if name in session.cameras]
     if len(known) < len(of_rig):
         without = ", ".join(name for name in of_rig if name not in known)
@@ -69,7 +69,11 @@ def known_cameras(session: RigSession) -> KnownCameras | None:
     if session.known_rig is None and not session.lenses:
         return None
     names = list(session.cameras)
-    rig = SavedRig(cameras={}, covariance=None) if session.known_rig is None else _saved(session.known_rig, names)
+    rig = (
+        SavedRig(cameras={}, covariance=None)
+        if session.known_rig is None
+        else _rig_with_names(session.known_rig, names)
+    )
     if session.known_rig is not None:
         warn_if_bad(session.known_rig, rig.verdicts)
     mounted = [name for name in rig.cameras if name in names]
@@ -89,7 +93,7 @@ def known_cameras(session: RigSession) -> KnownCameras | None:
     alone: dict[str, FloatArray | None] = {}
     for name, path in session.lenses.items():
         if name not in cameras:
-            lens, alone[name] = _lens(path, name, names)
+            lens, alone[name] = _camera_and_covariance(path, name, names)
             cameras[name] = (lens, None)
     if rig.covariance is None and all(covariance is None for covariance in alone.values()):
         return KnownCameras(cameras)
@@ -108,7 +112,7 @@ def _covariance(
     total = layout.cameras[-1].stop + 6 * max(len(mounted) - 1, 0)
     out = np.zeros((total, total))
     if rig.covariance is not None:
-        here, there = _places_in(cameras, mounted), _places_in(rig.cameras, mounted)
+        here, there = _covariance_indices(cameras, mounted), _covariance_indices(rig.cameras, mounted)
         out[np.ix_(here, here)] = rig.covariance[np.ix_(there, there)]
     for name, covariance in alone.items():
         if covariance is not None:
@@ -116,7 +120,7 @@ def _covariance(
     return out
 
 
-def _places_in(cameras: Mapping[str, tuple[Camera, object]], mounted: Sequence[str]) -> IntArray:
+def _covariance_indices(cameras: Mapping[str, tuple[Camera, object]], mounted: Sequence[str]) -> IntArray:
     """Return the indices, in the covariance of `cameras`, of the lenses and mounts of those named `mounted`."""
     layout = Layout.of_cameras(camera for camera, _ in cameras.values())
     chosen = [list(cameras).index(name) for name in mounted]
@@ -124,7 +128,7 @@ def _places_in(cameras: Mapping[str, tuple[Camera, object]], mounted: Sequence[s
     return np.concatenate([np.arange(run.start, run.stop) for run in runs])
 
 
-def _saved(path: Path, names: Sequence[str]) -> SavedRig:
+def _rig_with_names(path: Path, names: Sequence[str]) -> SavedRig:
     """Return a saved rig; the numbered cameras of another tool's get the first of `names`."""
     rig = saved_rig(path)
     warn_of_pupils(path, rig)
@@ -133,14 +137,14 @@ def _saved(path: Path, names: Sequence[str]) -> SavedRig:
     return replace(rig, cameras=dict(zip(names, rig.cameras.values(), strict=False)))
 
 
-def _lens(path: Path, name: str, names: Sequence[str]) -> tuple[Camera, FloatArray | None]:
+def _camera_and_covariance(path: Path, name: str, names: Sequence[str]) -> tuple[Camera, FloatArray | None]:
     """Return the camera of a file (of a rig's file, the one called `name`) and its covariance, or None."""
     if is_rig(path):
-        rig = _saved(path, names)
+        rig = _rig_with_names(path, names)
         if name not in rig.cameras:
             raise InputError(f"'{path}' has no camera '{name}'; there are {', '.join(rig.cameras)}")
         warn_if_bad(path, rig.verdicts)
-        own = _places_in(rig.cameras, [name])
+        own = _covariance_indices(rig.cameras, [name])
         return rig.cameras[name][0], None if rig.covariance is None else rig.covariance[np.ix_(own, own)]
     if (calibration := own_calibration(path)) is not None:
         warn_if_bad(path, calibration.verdicts)

@@ -86,7 +86,7 @@ def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedC
     with about(source):
         known = own_calibration(source)
         outline = None if known is None else outline_of_corners(known)
-        done = _foreign(camera, kind, outline)
+        done = _written_camera(camera, kind, outline)
     write_atomic(options.output, done.text, force=options.force)
     if done.note:
         _log.info(done.note)
@@ -121,7 +121,7 @@ def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence
     with about(source):
         outlines = load_saved_rig(source).outlines if is_rig_file(source) else {}
         foreign = write_rig(rig, kind, outlines)
-    files = {_of_camera(options.output, key): text for key, text in foreign.files.items()}
+    files = {_camera_path(options.output, key): text for key, text in foreign.files.items()}
     ensure_writable(list(files), force=options.force, inputs=[source])
     write_together(dict(files), force=options.force)
     for note in foreign.notes:
@@ -154,11 +154,11 @@ def foreign_rig_paths(names: Sequence[str], beside: Path, kinds: Sequence[str]) 
         known = RIG_FORMATS.get(kind)
         if known is not None and not (known.stereo_only and len(names) != 2):
             whole = beside.with_name(f"{beside.stem}-{kind}{RIG_ENDINGS.get(kind, FOREIGN_ENDINGS[kind])}")
-            out[kind] = [_of_camera(whole, key) for key in known.keys(names)]
+            out[kind] = [_camera_path(whole, key) for key in known.keys(names)]
     return out
 
 
-def _of_camera(path: Path, name: str) -> Path:
+def _camera_path(path: Path, name: str) -> Path:
     """Return the path for one camera; `path` itself for "", which stands for all cameras."""
     return path.with_name(f"{path.stem}-{name}{path.suffix}") if name else path
 
@@ -173,7 +173,7 @@ def foreign_files(calibration: Calibration, beside: Path, kinds: Sequence[str]) 
     outline = outline_of_corners(calibration) if kinds else None
     for kind, path in zip(kinds, foreign_paths(beside, kinds), strict=True):
         warn_of_pupil(path, calibration)
-        done = _foreign(calibration.camera, kind, outline)
+        done = _written_camera(calibration.camera, kind, outline)
         files[path] = done.text
         if done.note:
             _log.info(f"{path}: {done.note}")
@@ -188,7 +188,7 @@ def foreign_paths(beside: Path, kinds: Sequence[str]) -> list[Path]:
     return [beside.with_name(f"{beside.stem}-{kind}{FOREIGN_ENDINGS[kind]}") for kind in kinds]
 
 
-def _foreign(camera: Camera, kind: str, outline: Pixels | None) -> Written:
+def _written_camera(camera: Camera, kind: str, outline: Pixels | None) -> Written:
     """Return the camera in another format, compared with the original inside the `outline`."""
     write = FOREIGN_FORMATS[kind].write
     assert write is not None

@@ -25,7 +25,7 @@ def software_facts(*packages: str) -> dict[str, str]:
     return facts | {"written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")}
 
 
-def made(session: Path, images: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
+def provenance_of(session: Path, images: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
     """Return the provenance that a calibration file states: rigkit's version, the time, the SHA-256 of the session, and
     for each camera the SHA-256 of what `sha256sum` prints for its readable images."""
     inputs = {} if not session.is_file() else {session.name: hashlib.sha256(session.read_bytes()).hexdigest()}

@@ -279,7 +279,7 @@ def _attempt(work: Callable[[PairJob[Options]], Result], job: PairJob[Options]) 
             return error
         if isinstance(error, MemoryError):
             return InputError(f"{error or 'out of memory'}; use fewer processes (-j 1), or smaller images")
-        # A fault of ours in one pair must not lose the others' results; the traceback says where it is.
+        # A bug that one pair triggers must not lose the others' results; the traceback locates it.
         return InternalError(
             f"{traceback.format_exc()}this is a bug in rigkit ({error!r}); please report the lines above"
         )

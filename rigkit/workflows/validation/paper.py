@@ -93,7 +93,7 @@ def validate_as_paper(
     known = ready_dataset(dataset, options, measured=True)
     printed = printed_tables(known) or PaperTables()
     found, failures, cameras = over_pairs(
-        _repeat, known, options, what="repeating the paper on pairs", progress=progress
+        _paper_reports, known, options, what="repeating the paper on pairs", progress=progress
     )
     reports = tuple(report for of_pair in found for report in of_pair)
     tables = _tables(reports, printed, known.images)
@@ -115,10 +115,10 @@ def load_paper_tables(folder: str | Path) -> PaperTables:
 
     Raises InputError if one is missing, a row and the head differ in length, or a cell is not a number.
     """
-    return PaperTables(_read(Path(folder) / PLANES_FILE), _read(Path(folder) / BASELINES))
+    return PaperTables(_read_table(Path(folder) / PLANES_FILE), _read_table(Path(folder) / BASELINES))
 
 
-def _read(path: Path) -> dict[str, dict[str, str]]:
+def _read_table(path: Path) -> dict[str, dict[str, str]]:
     head, rows = csv_table(path, "the paper's table")
     out: dict[str, dict[str, str]] = {}
     for line, row in rows:
@@ -137,7 +137,7 @@ def _without_unit(name: str) -> str:
     return name.split("[")[0].strip()
 
 
-def _repeat(job: PairJob[PaperOptions]) -> tuple[ValidationReport, ...]:
+def _paper_reports(job: PairJob[PaperOptions]) -> tuple[ValidationReport, ...]:
     """Return the reports of one pair; warns of estimators that fail on it."""
     pair = job.pair
     camera1, camera2 = (loaded.near for loaded in job.cameras.of(pair))

@@ -184,7 +184,7 @@ def _validated(
         m: reconstruct_from(geometry, affine_method=m, scale=scale, image1=image1) for m in AFFINE_METHODS
     }
     shifts = _shifts(reconstructions, job)
-    fitted = _fitted(geometry, job)
+    fitted = _fitted_planes(geometry, job)
     known = [shifts[m] for m in reconstructions]
     reports = validate_each(list(reconstructions.values()), pair.truth, known, fitted, pair.layout)
     best = best_report(reports)
@@ -207,7 +207,7 @@ def _validated(
     return PairValidation(reports=reports, best=best, crosscheck=compared, causes=causes, files=files, section=section)
 
 
-def _fitted(geometry: PairGeometry, job: PairJob[ValidateOptions]) -> FittedPlanes:
+def _fitted_planes(geometry: PairGeometry, job: PairJob[ValidateOptions]) -> FittedPlanes:
     """Return the boards' planes fitted to both images; only the planes that are checked must exist."""
     judging = job.options.planes or job.pair.planes
     found: dict[Planes, BoardPlanes] = {}

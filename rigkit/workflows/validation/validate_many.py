@@ -91,7 +91,7 @@ def validate_datasets(
             f"two data sets are called '{twice[0]}', as is the folder of results; change `name` in one's dataset.toml"
         )
     require_folder(options.output, force=options.force)
-    work = partial(_one, options=replace(options, output=options.output.resolve(), jobs=1))
+    work = partial(_validate_one, options=replace(options, output=options.output.resolve(), jobs=1))
     found: dict[int, SetOutcome] = {}
     for place, outcome in over_items(work, named, jobs=jobs, cluster=cluster):
         found[place] = outcome
@@ -111,7 +111,7 @@ def _name_of(path: str | Path) -> str:
         return (whole.parent if whole.suffix == ".toml" else whole).name
 
 
-def _one(named: tuple[str, Path], *, options: ValidateOptions) -> SetOutcome:
+def _validate_one(named: tuple[str, Path], *, options: ValidateOptions) -> SetOutcome:
     name, path = named
     assert options.output is not None
     try:
