@@ -14,8 +14,8 @@ as well: other cameras, and slightly moved lenses, must be found.
 out, to see whether a ratio comes from one of them. --twins N: halves of N SIMULATED sessions like the real one, with
 equal errors of all images (`honesty.twins`): if these agree with their sigmas and the real one does not, one of its
 images has another error. --small N: N random draws of 3, 4, 5, 7 and 10 images against all others (`honesty.small`;
-with --twins of SIMULATED sessions), with the sigmas and verdicts of small sessions; --model auto is what a user gets. Sets of frames
-of several cameras are compared as rigs (`halves.rigs`).
+with --twins of SIMULATED sessions), with the sigmas and verdicts of small sessions; --model auto is what a user gets.
+Sets of frames of several cameras are compared as rigs (`halves.rigs`).
 """
 
 from __future__ import annotations

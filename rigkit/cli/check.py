@@ -15,7 +15,11 @@ from rigkit.core.errors import ExitCode, InputError
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("calibration", type=Path, metavar="CALIBRATION|RIG.json")
     parser.add_argument(
-        "images", nargs="+", type=Path, metavar="IMAGE|FOLDER", help="a rig: a folder a camera, or moment by moment"
+        "images",
+        nargs="+",
+        type=Path,
+        metavar="IMAGE|FOLDER",
+        help="a rig: a folder a camera, one with all of them, or images",
     )
     parser.add_argument(
         "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="default: those of the calibration"

@@ -19,7 +19,6 @@ from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, npz_bytes, write_atomic, write_together
-from rigkit.io.manifests.rig_session import frames_of_images
 from rigkit.io.media.images import Image, quiet_opencv, read_image_of, require_pixels, require_size
 from rigkit.io.media.video import Video, is_video
 from rigkit.rectification.crop import cropped
@@ -30,6 +29,7 @@ from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_camera, import_pair
 from rigkit.workflows.inputs.folder_session import cameras_in
 from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.moments import together
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -226,21 +226,9 @@ def _pairs(
         return [sources[:count] for sources in own], {}
     else:
         found = [list(images_in([Path(image)])) for image in images]
-    try:
-        of_moment = frames_of_images({str(k): [path.name for path in own] for k, own in enumerate(found)})
-    except InputError:
-        if len(found[0]) != len(found[1]):
-            raise
-        return found, {}
-    frames = [{of_moment[str(k)][path.name]: path for path in own} for k, own in enumerate(found)]
-    both = [frame for frame in frames[0] if frame in frames[1]]
-    single = {
-        str(path): InputError(f"'{path}': the other camera has no image of its name or number")
-        for own in frames
-        for frame, path in own.items()
-        if frame not in both
-    }
-    return [[own[frame] for frame in both] for own in frames], single
+    moments, single = together(found)
+    alone = {str(path): InputError(f"'{path}': the other camera has no image of its name or number") for path in single}
+    return list(zip(*moments, strict=True)), alone
 
 
 def _sources(source: Path, stack: ExitStack) -> Sequence[Path | _VideoFrame]:

@@ -34,15 +34,15 @@ from rigkit.report.pages.check_page import _could_have_found
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.validation.sentinel.judge import SentinelCheck
 from rigkit.validation.sentinel.power import Power
-from rigkit.workflows.checks.check import CheckOptions, _frames, _require_right_order, check_pictures
+from rigkit.workflows.checks.check import CheckOptions, _as_known, _require_right_order, check_pictures
 
 BOARD = Board("board", 9, 6, 25.0, 25.0)
 CAMERA = Brown((640, 480), np.array([620.0, 621.0, 322.0, 236.0, -0.12, 0.05, 0.0, 0.0, 0.0]))
 FOCUS_PERCENT = 0.5
 NOISE_PX = 0.03
+MARKS = "marker_mm=20,dictionary=DICT_5X5_100"
 LENGTH = ["--length", "100", "--distance", "500"]
 
 
@@ -158,8 +158,8 @@ def test_flipped_pictures_of_a_rig_are_named(
     register = tmp_path / "rig.jsonl"
     options = CheckOptions(boards=(board,), history=register)
     assert check_pictures(rig, pictures, options).check.holds
-    for path in pictures:
-        if path.stem[:-1] in whose:
+    for path, side in zip(pictures, ("left", "right") * 2, strict=True):
+        if side in whose:
             cv2.imwrite(str(path), cv2.flip(np.asarray(read_image(path)), flip))
     if board.looks_same_turned and len(whose) == 2:
         with pytest.raises(InputError, match=f"'left' and 'right' are exchanged, or {words}: put right"):
@@ -182,11 +182,11 @@ def test_squares_of_another_size_are_a_change_of_scale(tmp_path: Path) -> None:
 
 
 def _rig_of_two(folder: Path, board: Board) -> tuple[Path, list[Path]]:
-    """Return the file of a rig and four pictures of a board, left and right in turns."""
+    """Return the file of a rig and four pictures of a board, left and right in turns, whose names do not say so."""
     poses = (Rigid3.identity(), Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), [-60.0, 0.0, 0.0]))
     camera, optics = Pinhole((320, 240), np.array([260.0, 260.0, 160.3, 119.1])), Optics(0.6, supersample=2)
     places = [Rigid3(exp_so3(np.array([0.2, tilt, 0.0])), [-70.0, -60.0, 400.0]) for tilt in (0.3, -0.3)]
-    pictures = [folder / f"{name}{k}.png" for k in range(2) for name in ("left", "right")]
+    pictures = [folder / f"{name}{k}.png" for k in range(2) for name in ("one", "two")]
     for path, (place, pose) in zip(pictures, [(a, b) for a in places for b in poses], strict=True):
         cv2.imwrite(str(path), render([PlacedBoard(board, place)], camera, pose, optics=optics))
     cameras = [
@@ -303,24 +303,6 @@ def test_what_was_wrong_before_is_no_change(home: Path, tmp_path: Path, capsys: 
     assert "both a fresh image and one of before" in capsys.readouterr().err
 
 
-def test_folders_of_a_rig_are_its_cameras_by_their_names_or_in_its_order(tmp_path: Path) -> None:
-    rig = cast(Monitored, SimpleNamespace(cameras=(CAMERA, CAMERA), names=("left", "right")))
-    folders = [tmp_path / name for name in ("right", "left", "day")]
-    for folder in folders:
-        folder.mkdir()
-        for k in range(2):
-            (folder / f"{k}.png").touch()
-    right, left, day = folders
-    by_name = [[left / f"{k}.png", right / f"{k}.png"] for k in range(2)]
-    assert _frames(rig, [right, left]) == by_name == _frames(rig, [path for pair in by_name for path in pair])
-    assert _frames(rig, [right, day]) == [[right / f"{k}.png", day / f"{k}.png"] for k in range(2)]
-    with pytest.raises(InputError, match="2 folders, got 3"):
-        _frames(rig, folders)
-    (left / "2.png").touch()
-    with pytest.raises(InputError, match=r"3 in '.*left'"):
-        _frames(rig, [left, right])
-
-
 def test_what_would_have_been_found_needs_no_more_pictures() -> None:
     sure = Power(
         kind="focal length", camera="left", size=0.1, unit="px", chance=0.97, found_from=0.08, frames=3, both=None
@@ -332,3 +314,25 @@ def test_a_pose_on_another_board_names_the_one_that_is_seen(home: Path, capsys: 
     one = str(sorted((home / "same").iterdir())[0])
     assert main(["pose", one, "--camera", str(home / "cam.json"), "--board", "8x5x25"]) == 1
     assert "does not show board 'board-8x5x25'; in 1 image 9 x 6 inner corners are seen" in capsys.readouterr().err
+
+
+def test_a_board_is_known_by_whatever_name_and_way_up(caplog: pytest.LogCaptureFixture) -> None:
+    known = [
+        Board("ours", 9, 6, 29.99, 30.01),
+        Board("copy", 9, 6, 30.0, 30.0),
+        board_of_words(f"charuco:5x7x30,{MARKS}"),
+    ]
+    for words, expected in (("9x6x30", "ours"), ("6x9x30", "ours"), (f"charuco:5x7x30,{MARKS}", known[2].board_id)):
+        (board,) = _as_known([board_of_words(words)], known)
+        assert board.board_id == expected
+    # By its own name first; each but once.
+    assert [b.board_id for b in _as_known([Board("copy", 9, 6, 30.0, 30.0)], known)] == ["copy"]
+    assert [b.board_id for b in _as_known([board_of_words("9x6x30"), board_of_words("6x9x30")], known)] == [
+        "ours",
+        "copy",
+    ]
+    assert not caplog.records
+    for words in ("9x6x31", "8x6x30", f"charuco:7x5x30,{MARKS}", "circles:9x6x30"):
+        (board,) = _as_known([board_of_words(words)], known)
+        assert board.board_id == board_of_words(words).board_id
+        assert f"board '{board.board_id}' is none of the calibration's" in caplog.text

@@ -11,13 +11,14 @@ from helpers.sentinel_scenes import NOISE_PX, poses_held
 
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.report.pages.check_page import check_facts
 from rigkit.validation.sentinel.baseline import judge_since
 from rigkit.validation.sentinel.epipolar import PairMatches, evidence_of_matches
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Monitored, evidence_of
-from rigkit.validation.sentinel.judge import Look, evaluate_evidence
+from rigkit.validation.sentinel.judge import ALARM_CHANCE, Look, evaluate_evidence
 
 MOUNT = Rigid3(exp_so3(np.array([0.01, -0.08, 0.02])), [-120.0, 2.0, 3.0])
 MATCH_NOISE_PX = 0.1
@@ -76,12 +77,35 @@ def test_a_rig_that_never_held_is_checked_for_what_moved_since(seed: int) -> Non
     quiet, check = (judge_since(_file(), before, look) for look in (same, moved))
     assert quiet.holds and quiet.baseline is not None and quiet.baseline.frames == 2
     assert quiet.baseline.rms_corrected_px < 0.5 * quiet.baseline.rms_px
+    assert quiet.baseline.chance < ALARM_CHANCE
+    assert any(
+        "make sure that the pictures of before are of the same camera" in s for s in check_facts(quiet).sentences
+    )
     assert check_facts(quiet).headline.startswith("Nothing moved since")
     assert not check.holds and check.change is not None and check.change.hypothesis.kind == "rotation"
     sigmas = check.change.sigmas
     assert check.change.amounts == pytest.approx([TURN_DEG, 0.0, 0.0], abs=4.0 * float(sigmas.max()))
     assert sigmas[0] < 0.1 * TURN_DEG
     assert check_facts(check).headline.startswith("Moved since (")
+
+
+def test_pictures_of_before_of_two_moments_are_refused() -> None:
+    """They disagree so much that nothing would pass for a change since."""
+    rng = np.random.default_rng(3)
+    camera, poses = lens("wide"), poses_held("wide", 3)
+    rig = _file()
+
+    def boards(shift: int) -> Look:
+        views = []
+        for k in range(2):
+            views.append(FreshView(f"{k}", 0, noisy_view(rig.cameras[0], poses[k], f"{k}", rng, NOISE_PX)))
+            held = rig.cam_from_rig[1] @ poses[k + shift]
+            views.append(FreshView(f"{k}", 1, noisy_view(camera, held, f"{k}", rng, NOISE_PX)))
+        return lambda now: evidence_of(now, views)
+
+    assert judge_since(rig, boards(0), boards(0)).holds
+    with pytest.raises(InputError, match="the pictures of before do not fit"):
+        judge_since(rig, boards(1), boards(0))
 
 
 def _known(focus: float) -> tuple[Camera, Monitored]:

@@ -93,10 +93,16 @@ def _since_words(then: Baseline | None) -> list[str]:
     """Return a sentence about the earlier frames; [] without them."""
     if then is None:
         return []
-    return [
+    said = [
         f"Since {counted(then.frames, 'frame')} of before: these lay {then.rms_px:.3f} px rms from where the file has "
         f"them, {then.rms_corrected_px:.3f} px once it is corrected to them; that is no change."
     ]
+    if then.chance < ALARM_CHANCE:
+        said.append(
+            f"The file was off by more than it says even then (p = {then.chance:.2g}): make sure that the pictures of "
+            "before are of the same camera, and that nothing had moved yet."
+        )
+    return said
 
 
 def _cost_words(check: SentinelCheck, change: Change) -> str:

@@ -17,10 +17,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import fdtrc
 
+from rigkit.core.errors import InputError
 from rigkit.planning.goal import Goal
 from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
-from rigkit.validation.sentinel.judge import Baseline, Look, SentinelCheck, evaluate_evidence
+from rigkit.validation.sentinel.judge import (
+    Baseline,
+    Look,
+    SentinelCheck,
+    evaluate_evidence,
+    exceeds_expected,
+    unchanged_px,
+)
 from rigkit.validation.sentinel.whitened import Whitened, disagreement
 
 CORRECTIONS = 4
@@ -31,9 +40,9 @@ def judge_since(monitored: Monitored, before: Look, look: Look, cost: Sequence[G
     """Return the verdict on what `look` finds in fresh frames, against the cameras as what `before` finds in frames of
     the time when they were trusted corrects them.
 
-    Raises DegenerateError where the frames of before do not go together with the cameras at all.
+    Raises InputError where frames of before do not fit the cameras even once these are corrected to them.
     """
-    trusted, now, change = monitored, monitored, np.zeros(monitored.layout.count)
+    trusted, now, change, chance = monitored, monitored, np.zeros(monitored.layout.count), 1.0
     first = evidence = before(monitored)
     for k in range(CORRECTIONS):
         evidence = before(now)
@@ -41,16 +50,24 @@ def judge_since(monitored: Monitored, before: Look, look: Look, cost: Sequence[G
         whitened = Whitened.of(trusted, wider.of_frames(evidence))
         if k == 0:
             score = whitened.score
-            beyond = float(score @ np.linalg.solve(whitened.covariance, score)) - len(score)
-            trusted = replace(monitored, covariance=max(beyond, 1.0) * monitored.covariance)
+            squares = float(score @ np.linalg.solve(whitened.covariance, score))
+            chance = float(fdtrc(len(score), whitened.freedom, squares / len(score)))
+            trusted = replace(monitored, covariance=max(squares - len(score), 1.0) * monitored.covariance)
             whitened = Whitened.of(trusted, wider.of_frames(evidence))
         gain = np.linalg.solve(whitened.covariance, whitened.by_theta @ trusted.covariance).T
         change = gain @ (whitened.score + whitened.by_theta @ change)
         now = monitored.changed(change)
     left = np.eye(len(change)) - gain @ whitened.by_theta
     corrected = replace(now, covariance=gain @ gain.T + left @ trusted.covariance @ left.T)
+    left_px, expected_px = before(corrected).rms_px, unchanged_px(corrected, first)
+    if exceeds_expected(left_px, expected_px):
+        raise InputError(
+            f"check: the pictures of before do not fit: {left_px:.2f} px rms are left once the calibration is "
+            f"corrected to them, {expected_px:.2f} px are expected; give those of these cameras, and of a rig those "
+            "taken together"
+        )
     check = evaluate_evidence(corrected, lambda now: wider.of_frames(look(now)), cost)
-    return replace(check, baseline=Baseline(len(first.score), first.rms_px, before(corrected).rms_px))
+    return replace(check, baseline=Baseline(len(first.score), first.rms_px, left_px, chance))
 
 
 @dataclass(frozen=True, slots=True)

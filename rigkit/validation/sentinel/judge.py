@@ -90,12 +90,19 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
-    """What frames of the time when a calibration was trusted say of it: how many there were, and how far their points
-    lie from where it has them, rms in px, as it is and once it is corrected to them."""
+    """What frames of the time when a calibration was trusted say of it.
+
+    Attributes
+    ----------
+    frames : how many there were.
+    rms_px, rms_corrected_px : how far their points lie from where it has them, as it is and once it is corrected.
+    chance : probability that a calibration as sure as it says is off by so much.
+    """
 
     frames: int
     rms_px: float
     rms_corrected_px: float
+    chance: float
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -140,7 +147,7 @@ class SentinelCheck:
     @property
     def unexplained(self) -> bool:
         """Nothing that may happen to these cameras explains the pictures: another camera, or another board."""
-        return _exceeds_expected(self.rms_fixed_px, self.expected_px)
+        return exceeds_expected(self.rms_fixed_px, self.expected_px)
 
     @property
     def holds(self) -> bool:
@@ -150,7 +157,7 @@ class SentinelCheck:
         return self.change is None or self.chance >= ALARM_CHANCE or self.change.max_px < ALARM_PX
 
 
-def _exceeds_expected(rms_px: float, expected_px: float) -> bool:
+def exceeds_expected(rms_px: float, expected_px: float) -> bool:
     """Say whether residuals are beyond all that is expected; those that are no numbers are."""
     return not rms_px <= max(MAX_OF_EXPECTED * expected_px, ALARM_PX)
 
@@ -167,13 +174,13 @@ def check_views(monitored: Monitored, views: Sequence[FreshView], cost: Sequence
 def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
     """Return the verdict on what `look` finds in fresh frames."""
     evidence = look(monitored)
-    expected_px, known, chance = _expected_px(monitored, evidence), list[Change](), 1.0
+    expected_px, known, chance = unchanged_px(monitored, evidence), list[Change](), 1.0
     try:
         whitened = Whitened.of(monitored, evidence)
         known = [c for c in (_fitted(whitened, hypothesis) for hypothesis in hypotheses_of(monitored)) if c is not None]
     except DegenerateError:
         # Pictures of something else are far from all that can be linearised: that is the verdict.
-        if not _exceeds_expected(evidence.rms_px, expected_px):
+        if not exceeds_expected(evidence.rms_px, expected_px):
             raise
         chance = 0.0
     step, covariance, change = np.zeros(monitored.layout.count), monitored.covariance, None
@@ -211,14 +218,14 @@ def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = (
         corners=evidence.corners,
         tried=tuple(known),
         powers=()
-        if _exceeds_expected(after.rms_px, expected_px)
+        if exceeds_expected(after.rms_px, expected_px)
         else powers_of(monitored, evidence, [c.hypothesis for c in known], ALARM_CHANCE),
         cost=float(np.sqrt(max([0.0, *(float(step @ g.weight @ step) for g in goals)]))),
         cost_unit=goals[0].unit,
     )
 
 
-def _expected_px(monitored: Monitored, evidence: FreshEvidence) -> float:
+def unchanged_px(monitored: Monitored, evidence: FreshEvidence) -> float:
     """Return the rms that corners of unchanged cameras show: their scatter, and what the calibration leaves open."""
     shown = evidence.information.sum(axis=0) / evidence.corners
     # Pictures of something else may be too far off for any derivative: they say nothing of that.

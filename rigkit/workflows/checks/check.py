@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -24,6 +25,7 @@ from rigkit.core.findings import Finding
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
+from rigkit.detection.unknown import difference
 from rigkit.io.calibrations.calibration_file import (
     camera_to_json,
     findings_to_json,
@@ -42,16 +44,19 @@ from rigkit.report.pages.page_facts import PageFacts
 from rigkit.validation.certificate.contracts import Task
 from rigkit.validation.sentinel.baseline import judge_since
 from rigkit.validation.sentinel.epipolar import evidence_of_matches, matches_of_scenes
-from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_of
+from rigkit.validation.sentinel.evidence import SAME_BOARD, FreshView, Monitored, evidence_of
 from rigkit.validation.sentinel.flipped import counted_alike, flipped_pictures
 from rigkit.validation.sentinel.judge import Look, SentinelCheck, check_views, evaluate_evidence
 from rigkit.validation.sentinel.watch import monitored_camera, with_pupils
 from rigkit.workflows.calibration.next_pictures import length_goals
-from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import require_sure, warn_if_bad
 from rigkit.workflows.inputs.identify_board import explained
 from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.moments import moments_of
 from rigkit.workflows.outputs.provenance import digest_line, digest_of, digest_of_images, software_facts
+
+NO_PARTNER = "the other cameras have no image of its name or number"
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,9 +104,8 @@ def check_pictures(
 ) -> CheckedPictures:
     """Check a calibration, or a rig, with fresh images (or folders of them).
 
-    Of a rig give one folder a camera, in the rig's order or called as its cameras are, with as many images each, taken
-    together in the order of their names; or the images themselves, moment by moment, each in the rig's order. An image
-    that cannot be read does not end the rest; its error is raised where there is no other.
+    Of a rig give them as `moments_of` takes them. An image that cannot be read does not end the rest; its error is
+    raised where there is no other.
 
     Raises InputError: no covariance, no images, none with a board, boards of another size, images of two cameras
     exchanged, or a file that cannot be written; DegenerateError: pictures that say nothing of the camera.
@@ -111,8 +115,8 @@ def check_pictures(
     warn_if_bad(source)
     if not images:
         raise InputError("check: give fresh images, or a folder of them")
-    now = _frames(monitored, [Path(image) for image in images])
-    before = _frames(monitored, options.before) if options.before else []
+    now, single = moments_of(monitored.names, [Path(image) for image in images])
+    before, alone = moments_of(monitored.names, options.before) if options.before else ([], [])
     inputs = [source, *(image for frame in (*now, *before) for image in frame)]
     ensure_writable((options.fix, options.report), force=options.force, inputs=inputs)
     if options.history is not None:
@@ -121,9 +125,9 @@ def check_pictures(
     if both:
         raise InputError(f"check: '{min(both)}' is both a fresh image and one of before")
     goals = [] if options.length is None else length_goals(monitored.cameras, monitored.cam_from_rig, options.length)
-    pictures = _Pictures(
-        source=source, monitored=monitored, boards=options.boards or known, known=known, progress=progress
-    )
+    boards = _as_known(options.boards, known) or known
+    pictures = _Pictures(source=source, monitored=monitored, boards=boards, known=known, progress=progress)
+    pictures.left_out.extend((f"{path}", NO_PARTNER) for path in (*single, *alone))
     with about(source):
         look, views = pictures.seen(now, scene=options.scene)
         if before:
@@ -201,29 +205,25 @@ def _monitored_rig(known: SavedRig, source: Path) -> Monitored:
     return with_pupils(central, known.pupils)
 
 
-def _frames(monitored: Monitored, sources: Sequence[Path]) -> list[list[Path]]:
-    """Return the images of every moment, one a camera."""
-    count = len(monitored.cameras)
-    if count == 1:
-        return [[image] for image in images_in(sources)]
-    if all(source.is_dir() for source in sources):
-        if len(sources) != count:
-            names = ", ".join(monitored.names)
-            raise InputError(f"check: a rig of {count} cameras ({names}) needs {count} folders, got {len(sources)}")
-        by_name = {source.name: source for source in sources}
-        ordered = [by_name[name] for name in monitored.names] if set(by_name) == set(monitored.names) else sources
-        columns = [list(images_in([source])) for source in ordered]
-        if len({len(column) for column in columns}) > 1:
-            counts = ", ".join(f"{len(column)} in '{s}'" for column, s in zip(columns, ordered, strict=True))
-            raise InputError(f"check: as many images of each camera are needed, taken together: {counts}")
-        return [list(frame) for frame in zip(*columns, strict=True)]
-    images = list(images_in(sources))
-    if len(images) % count:
-        raise InputError(
-            f"check: {len(images)} different images, which are not moments of {count} cameras each "
-            f"({', '.join(monitored.names)}); give as many of each camera"
-        )
-    return [images[k : k + count] for k in range(0, len(images), count)]
+def _as_known(boards: Sequence[Board], known: Sequence[Board]) -> tuple[Board, ...]:
+    """Return boards, one that the calibration knows as it knows it, by whatever name and way up it is given."""
+    out: list[Board] = []
+    for board in boards:
+        alike = [own for own in known if difference(own, board) is None and _as_large(own, board) and own not in out]
+        named = [own for own in alike if own.board_id == board.board_id]
+        out.append((named or alike or [board])[0])
+        if known and not alike:
+            _log.warning(
+                "board '%s' is none of the calibration's: it is taken to be flat, with squares as stated, and what it "
+                "is otherwise passes for a change",
+                board.board_id,
+            )
+    return tuple(out)
+
+
+def _as_large(one: Board, other: Board) -> bool:
+    sides = np.array([sorted(one.squares_mm), sorted(other.squares_mm)])
+    return bool((np.abs(sides[0] / sides[1] - 1.0) < SAME_BOARD).all())
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -1,0 +1,100 @@
+"""Which images of several cameras were taken together: by the names of files and folders, else in the order given."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from rigkit.core.errors import InputError
+from rigkit.io.manifests.rig_session import frames_of_images
+from rigkit.workflows.detect import images_in
+from rigkit.workflows.inputs.folder_session import cameras_in
+
+Moments = list[list[Path]]
+"""The images of every moment, one a camera."""
+
+
+def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[Moments, list[Path]]:
+    """Return the moments that cameras called `names` saw, and images without a partner.
+
+    Sources are a folder a camera, called as the cameras or in their order; one folder, as `cameras_in` takes it; or the
+    images themselves: where their names, or those of their folders, are one but for the camera's, so; else moment by
+    moment, each in the order of the cameras. Raises InputError where they are not as many of each camera.
+    """
+    if len(names) == 1:
+        return [[image] for image in images_in(sources)], []
+    if not all(source.is_dir() for source in sources):
+        images = list(images_in(sources))
+        return _by_names(names, images) or _in_order(names, images), []
+    if len(sources) == 1:
+        found = {
+            name: sorted(path for folder, pattern in own for path in folder.glob(pattern))
+            for name, own in cameras_in(sources).items()
+        }
+    else:
+        found = {f"{k}": list(images_in([source])) for k, source in enumerate(sources)}
+        if {source.name for source in sources} == set(names):
+            found = {source.name: own for source, own in zip(sources, found.values(), strict=True)}
+    if len(found) != len(names):
+        raise InputError(
+            f"a rig of {len(names)} cameras ({', '.join(names)}) needs a folder of images for each, got {len(found)}"
+        )
+    return together([found[name] for name in names] if set(found) == set(names) else list(found.values()))
+
+
+def together(columns: Sequence[Sequence[Path]]) -> tuple[Moments, list[Path]]:
+    """Return the moments of which every camera has an image of one name, or number, and the images without a partner;
+    where names tell nothing, in their order.
+
+    Raises InputError where the names tell nothing, and there are not as many images of each camera.
+    """
+    try:
+        known = frames_of_images({f"{k}": [path.name for path in own] for k, own in enumerate(columns)})
+    except InputError:
+        if len({len(own) for own in columns}) > 1:
+            raise
+        return [list(moment) for moment in zip(*columns, strict=True)], []
+    frames = [{known[f"{k}"][path.name]: path for path in own} for k, own in enumerate(columns)]
+    shared = [frame for frame in frames[0] if all(frame in own for own in frames)]
+    if not shared:
+        raise InputError("of no moment every camera has an image of one name or number; give those taken together")
+    single = [path for own in frames for frame, path in own.items() if frame not in shared]
+    return [[own[frame] for own in frames] for frame in shared], single
+
+
+def _by_names(names: Sequence[str], images: Sequence[Path]) -> Moments:
+    """Return the moments of images whose names, or else their folders' names, are one but for the camera's; none where
+    that is not so of all."""
+    found: dict[tuple[str, str], dict[str, Path]] = {}
+    for image in images:
+        own = _sides(names, image.stem, f"{image.parent}") or _sides(names, image.parent.name, image.stem)
+        if len(own) != 1:
+            return []
+        ((name, moment),) = own.items()
+        if name in found.setdefault(moment, {}):
+            return []
+        found[moment][name] = image
+    if any(len(moment) < len(names) for moment in found.values()):
+        return []
+    return [[moment[name] for name in names] for moment in found.values()]
+
+
+def _sides(names: Sequence[str], text: str, beside: str) -> dict[str, tuple[str, str]]:
+    """Return the cameras whose names stand in a text, and the text without it, with what is beside it."""
+    out = {}
+    for name in names:
+        more = r"\d" if name[-1].isdigit() else "[a-z]"
+        parts = re.split(rf"(?<![a-z]){re.escape(name)}(?!{more})", text, maxsplit=1, flags=re.IGNORECASE)
+        if len(parts) == 2:
+            out[name] = ("*".join(parts), beside)
+    return out
+
+
+def _in_order(names: Sequence[str], images: Sequence[Path]) -> Moments:
+    if len(images) % len(names):
+        raise InputError(
+            f"{len(images)} different images, which are not moments of {len(names)} cameras each "
+            f"({', '.join(names)}); give as many of each camera"
+        )
+    return [list(images[k : k + len(names)]) for k in range(0, len(images), len(names))]

@@ -1,0 +1,102 @@
+"""Which images of a rig were taken together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rigkit.core.errors import InputError
+from rigkit.workflows.moments import moments_of
+
+NAMES = ("left", "right")
+
+
+def _images(folder: Path, *names: str) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.png" for name in names]
+    for path in paths:
+        path.touch()
+    return paths
+
+
+def test_folders_are_the_cameras_by_their_names_or_in_their_order(tmp_path: Path) -> None:
+    right, left, day = (_images(tmp_path / name, "0", "1") for name in ("right", "left", "day"))
+    by_name = [list(pair) for pair in zip(left, right, strict=True)]
+    folders = [own[0].parent for own in (right, left, day)]
+    assert moments_of(NAMES, folders[:2]) == (by_name, [])
+    assert moments_of(NAMES, [folders[0], folders[2]])[0] == [list(pair) for pair in zip(right, day, strict=True)]
+    with pytest.raises(InputError, match=r"a rig of 2 cameras \(left, right\) needs a folder .*, got 3"):
+        moments_of(NAMES, folders)
+
+
+@pytest.mark.parametrize("inside", [True, False], ids=["left/01", "left01"])
+def test_one_folder_holds_a_rig(inside: bool, tmp_path: Path) -> None:
+    for side in NAMES:
+        _images(tmp_path / side, "01", "02") if inside else _images(tmp_path, f"{side}01", f"{side}02")
+    moments, single = moments_of(NAMES, [tmp_path])
+    assert [[str(path.relative_to(tmp_path)) for path in moment] for moment in moments] == [
+        [f"{side}/{k}.png" if inside else f"{side}{k}.png" for side in NAMES] for k in ("01", "02")
+    ]
+    assert not single
+    with pytest.raises(InputError, match="needs a folder of images for each, got 2"):
+        moments_of(("left", "right", "top"), [tmp_path])
+
+
+def test_images_without_a_partner_are_told(tmp_path: Path) -> None:
+    left, right = _images(tmp_path / "left", "a1", "a2", "a4"), _images(tmp_path / "right", "b1", "b3", "b4")
+    moments, single = moments_of(NAMES, [tmp_path / "left", tmp_path / "right"])
+    assert moments == [[left[0], right[0]], [left[2], right[2]]] and single == [left[1], right[1]]
+
+
+def test_names_that_tell_nothing_leave_the_order(tmp_path: Path) -> None:
+    left, right = _images(tmp_path / "left", "a", "b"), _images(tmp_path / "right", "c", "d")
+    folders = [tmp_path / "left", tmp_path / "right"]
+    assert moments_of(NAMES, folders)[0] == [[left[0], right[0]], [left[1], right[1]]]
+    _images(tmp_path / "right", "e")
+    with pytest.raises(InputError, match="no two cameras have an image of the same name or number"):
+        moments_of(NAMES, folders)
+
+
+def test_every_camera_must_have_some_moment(tmp_path: Path) -> None:
+    for name, images in (("a", ("1", "2")), ("b", ("2", "3")), ("c", ("3", "1"))):
+        _images(tmp_path / name, *images)
+    with pytest.raises(InputError, match="of no moment every camera has an image"):
+        moments_of(("a", "b", "c"), [tmp_path / name for name in "abc"])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("left04", "left08", "right04", "right08"),
+        ("right08", "left04", "left08", "right04"),
+        ("now_left_4", "now_left_8", "now_right_4", "now_right_8"),
+    ],
+)
+def test_images_are_sorted_by_the_cameras_in_their_names(names: tuple[str, ...], tmp_path: Path) -> None:
+    moments, _ = moments_of(NAMES, _images(tmp_path / "left-right", *names))
+    assert len(moments) == 2
+    for moment in moments:
+        one, two = (path.stem for path in moment)
+        assert one.replace("left", "right") == two and one in names and two in names
+
+
+def test_images_are_sorted_by_the_cameras_in_their_folders_names(tmp_path: Path) -> None:
+    images = [path for name in ("cam10", "cam1") for path in _images(tmp_path / name, "1", "2")]
+    assert moments_of(("cam1", "cam10"), images)[0] == [[images[2], images[0]], [images[3], images[1]]]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("a", "b", "c", "d"),
+        ("left_tilt_1", "right_tilt_2", "left_tilt_3", "right_tilt_4"),
+        ("left1", "left_right1", "right1", "x"),
+        ("left1", "LEFT1", "right1", "x"),
+    ],
+)
+def test_other_names_leave_images_moment_by_moment(names: tuple[str, ...], tmp_path: Path) -> None:
+    images = _images(tmp_path, *names)
+    assert moments_of(NAMES, images)[0] == [images[:2], images[2:]]
+    with pytest.raises(InputError, match="3 different images, which are not moments of 2 cameras"):
+        moments_of(NAMES, images[:3])
