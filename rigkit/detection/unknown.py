@@ -60,10 +60,11 @@ class BoardGuess:
     beside : other boards in the images; of chessboards the visible part.
     sizes : empty if the size of the board is known. Otherwise a lower bound of its columns and rows, or several
         possible sizes.
-    rough : light or ink has shifted the edges of tags in all images, so that the spacing is known to some hundredths
-    only. either : another possible board, if the edges of tags are shifted so much that the width of their border is
-    ambiguous. either_pattern : the images do not show the column in which the current pattern of a ChArUco board
-    differs from that
+    rough : light or ink has shifted the edges of tags in all images, so that the spacing is known only to some
+        hundredths.
+    either : another possible board, if the edges of tags are shifted so much that the width of their border is
+        ambiguous.
+    either_pattern : the images do not show the column in which the current pattern of a ChArUco board differs from that
         before OpenCV 4.6.
     marked : no image shows that the squares of this chessboard are empty: there may be markers that were not read.
     """

@@ -213,9 +213,9 @@ def _showing(plain: Sequence[Sequence[GridSeen]], size: Size) -> tuple[int, ...]
 def _more(plain: Sequence[Sequence[GridSeen]], size: Size) -> Counter[Size]:
     """Return the numbers of images without a grid of this size by the sizes of their larger grids, except those of
     other boards, which occur together with it."""
-    beside = {grid.size for k in _showing(plain, size) for grid in plain[k]}
+    joint = {grid.size for k in _showing(plain, size) for grid in plain[k]}
     seen = ({grid.size for grid in grids} for grids in plain)
-    return Counter(other for sizes in seen if size not in sizes for other in sizes - beside if not _within(other, size))
+    return Counter(other for sizes in seen if size not in sizes for other in sizes - joint if not _within(other, size))
 
 
 def _size_of_parts(plain: Sequence[Sequence[GridSeen]]) -> tuple[Size, tuple[int, ...]] | None:

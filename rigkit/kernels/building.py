@@ -12,9 +12,9 @@ from pathlib import Path
 
 FLAGS = (
     *("-O3", "-std=c11", "-g0", "-fvisibility=hidden", "-Wall", "-Wno-unknown-pragmas"),
-    # Nothing here reads errno or the flags of floating-point exceptions.
+    # The kernels do not read errno or the flags of floating-point exceptions.
     *("-fno-math-errno", "-fno-trapping-math"),
-    # Products that feed sums are fused where the processor can; compilers differ in what they do if they are not told.
+    # Multiplications and additions are fused if the processor can; the defaults of compilers differ.
     *("-ffp-contract=fast", "-fopenmp-simd"),
 )
 """For gcc and clang. No -ffast-math: missing corners are NaN."""

@@ -64,10 +64,10 @@ def has_mosaic(image: GreyImage, step: int, min_level: float, share: float) -> b
     return bool(kernels().has_mosaic(image, step, min_level, share))
 
 
-def bad_pixels(image: GreyImage, first: int, apart: int, step: float, share: float) -> tuple[int, float]:
-    """Return the number of inner pixels, in every `apart`-th row from the `first`, that differ from all of their
+def bad_pixels(image: GreyImage, first: int, stride: int, step: float, share: float) -> tuple[int, float]:
+    """Return the number of inner pixels, in every `stride`-th row from the `first`, that differ from all of their
     neighbours by more than `step` and by more than `share` of the range of brightness in these rows, and that range."""
-    count, span = kernels().count_bad_pixels(image, first, apart, step, share)
+    count, span = kernels().count_bad_pixels(image, first, stride, step, share)
     return count, float(span[0])
 
 

@@ -1,1 +1,1 @@
-"""Where a second camera stands: solvers, their refinement by maximum likelihood, robust estimation."""
+"""The relative pose of two cameras: solvers, maximum likelihood refinement, robust estimation."""

@@ -143,8 +143,8 @@ class Guide:
         """Return the local geometry at the M `cells` (R, C), and which of them are predicted well enough."""
         if self.camera is None or self.cam_from_board is None:
             shape = fit_cells(state.pixels, cells, degree=3, ridge=(1e-3, 1e-2), leave_out=True)
-            beside = cv2.dilate(state.known.astype(np.uint8), CROSS)[cells] > 0
-            return shape, np.asarray(beside & (shape.support >= 6) & (shape.gain < MAX_GUIDE_GAIN))
+            adjacent = cv2.dilate(state.known.astype(np.uint8), CROSS)[cells] > 0
+            return shape, np.asarray(adjacent & (shape.support >= 6) & (shape.gain < MAX_GUIDE_GAIN))
         shape, valid = self._projected(self.camera, self.cam_from_board, cells)
         sound = state.known & (state.sigma_px < MAX_RESIDUAL_RATIO * state.typical_sigma)
         if sound.any():

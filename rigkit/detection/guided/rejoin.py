@@ -146,8 +146,7 @@ def _flat(both: RefinedLattice, two: RefinedLattice, shift: IntArray, side_mm: f
     for pose in _poses(both.lattice, side_mm, camera):
         projected, _ = camera.project(pose.apply(points))
         off = float(np.median(np.linalg.norm(projected - pixels, axis=1)))
-        beside = np.diff(two.lattice.pixels, axis=1)
-        side = float(np.nanmedian(np.linalg.norm(beside, axis=-1)))
+        side = float(np.nanmedian(np.linalg.norm(np.diff(two.lattice.pixels, axis=1), axis=-1)))
         if off < max(OFF_PLANE_PX, OFF_PLANE * side):
             return True
     return False

@@ -348,6 +348,6 @@ def _united(one: Lattice, two: Lattice, shift: IntArray, near: bool, far: bool) 
     first, second = (item.padded(*m) for item, m in zip((one, two), margins(one.size, two.size, shift), strict=True))
     if first.rising != second.rising or (first.known & second.known).any():
         return None
-    beside = near and (_facing(first, second, GAP) or _facing(first, second, GAP, cv2.MORPH_RECT) >= SLANTED)
-    beyond = far and _facing(first, second, FAR_GAP) >= FAR_FACING
-    return first.filled(second) if beside or beyond else None
+    close = near and (_facing(first, second, GAP) or _facing(first, second, GAP, cv2.MORPH_RECT) >= SLANTED)
+    across_gap = far and _facing(first, second, FAR_GAP) >= FAR_FACING
+    return first.filled(second) if close or across_gap else None

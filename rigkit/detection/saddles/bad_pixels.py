@@ -47,17 +47,17 @@ def without_bad_pixels(grey: GreyImage) -> GreyImage:
 def _evident(grey: GreyImage) -> float | None:
     """Return the threshold on the difference of bad pixels from their neighbours, None if there are hardly any."""
     height, width = grey.shape
-    apart = max(3, width * height // LOOKED_AT)
-    first = 1 + (height - 3) % apart // 2
-    count, span = front.bad_pixels(grey, first, apart, 0.0, SPAN_SHARE)
+    stride = max(3, width * height // LOOKED_AT)
+    first = 1 + (height - 3) % stride // 2
+    count, span = front.bad_pixels(grey, first, stride, 0.0, SPAN_SHARE)
     if count < MIN_EVIDENT:
         return None
-    above, here, below = (grey[first + k : height - 1 + k : apart].astype(np.float64) for k in (-1, 0, 1))
+    above, here, below = (grey[first + k : height - 1 + k : stride].astype(np.float64) for k in (-1, 0, 1))
     rough = np.abs(here - 0.5 * above - 0.5 * below).ravel()
     # The difference of a pixel and the mean of two has a median of 0.6745 sqrt(1.5) sigma.
     sigma = float(np.partition(rough, len(rough) // 2)[len(rough) // 2]) / 0.826
     step = max(BAD_PIXEL_SIGMAS * sigma, SPAN_SHARE * span)
-    return step if front.bad_pixels(grey, first, apart, step, 0.0)[0] >= MIN_EVIDENT else None
+    return step if front.bad_pixels(grey, first, stride, step, 0.0)[0] >= MIN_EVIDENT else None
 
 
 def _repair(image: GreyImage, step: float) -> None:

@@ -63,6 +63,6 @@ def line_curvatures_to_fit(
     lengths = np.maximum(np.hypot(sides[..., 0], sides[..., 1]), 1.0)
     curvature, curvature_sigma = line_curvature(pixels, sigma_px, cells, lengths)
     # The mean of a parabola k / 2 t^2 over |t| < r is k / 6 r^2.
-    beside = curvature_sigma * np.minimum(radius_px, WINDOW_REACH * lengths) ** 2 / 6.0
-    curvature_sigma[(beside <= LOOSE_CURVATURE * sigma_px[cells][:, None]).all(axis=1)] = 0.0
+    shift = curvature_sigma * np.minimum(radius_px, WINDOW_REACH * lengths) ** 2 / 6.0
+    curvature_sigma[(shift <= LOOSE_CURVATURE * sigma_px[cells][:, None]).all(axis=1)] = 0.0
     return curvature, curvature_sigma

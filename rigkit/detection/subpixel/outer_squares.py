@@ -74,9 +74,9 @@ def fitted_beside_paper(
     again = again if wanted is None else again & wanted
     moving = again
     for _ in range(PAPER_ROUNDS if again.any() else 0):
-        beside = with_paper(image, geometry.of(again), fit.of(again), signs[again], owner[again])
+        on_paper = with_paper(image, geometry.of(again), fit.of(again), signs[again], owner[again])
         before, which = fit.pixels[moving], moving[again]
-        fit = fit.with_part(moving, fitted(moving, beside.of(which)))
+        fit = fit.with_part(moving, fitted(moving, on_paper.of(which)))
         moving = moving.copy()
         moving[moving] = np.linalg.norm(fit.pixels[moving] - before, axis=1) >= SETTLED_PX
         if not moving.any():
