@@ -164,6 +164,8 @@ def rig_trial(lenses: Sequence[Camera], session: Session, rng: np.random.Generat
         pose = found.cam_from_rig[1] @ found.cam_from_rig[0].inverse()
         points, valid = triangulate_rays(sights[0], sights[1], pose, jacobians1=slopes[0], jacobians2=slopes[1])
         good = (valid & seen[0][1] & seen[1][1]).all(axis=-1)
+        if not good.any():
+            continue  # Nothing is certified where the rig says that it is too unsure.
         exact, weights = exact[good], weights[good]
         off = read_off(quantity, points[good]) - read_off(quantity, exact)
         covered = [
