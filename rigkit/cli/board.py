@@ -7,13 +7,14 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigkit.core.errors import ExitCode, InputError
+from rigkit.cli.board_identify import identify
+from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
     from rigkit.core.patterns.base import Pattern
 
 MARKER_SHARE = 0.75
-"""Default side of a marker in squares: large enough to be read, with white around it for the corners."""
+"""Side of a marker in squares: large enough to be read, with white left around it for the corners."""
 
 BOARD_SIZE = re.compile(r"^(\d+)[xX](\d+)$")
 
@@ -50,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.capture.print_board import PrintOptions, print_board
 
     if args.size == "identify":
-        return _identify(args)
+        return identify(args)
     if args.images:
         raise InputError(f"board: '{args.images[0]}' after the board; give images to rigkit board identify alone")
     size = BOARD_SIZE.match(args.size)
@@ -96,53 +97,3 @@ def _pattern(args: argparse.Namespace) -> Pattern:
         return Chessboard()
     side = args.marker_mm if args.marker_mm is not None else MARKER_SHARE * args.square_mm
     return Charuco(args.charuco, side, args.first_marker, args.legacy)
-
-
-def _identify(args: argparse.Namespace) -> int:
-    """Print which board the images show, write its file if requested, and return the exit code."""
-    from rigkit.cli.console import note, progress_on_stderr
-    from rigkit.detection.duplicate_marks import DUPLICATES_REMEDY
-    from rigkit.io.boards.board_file import board_text
-    from rigkit.io.disk.writing import ensure_writable, write_atomic
-    from rigkit.io.media.video import is_video
-    from rigkit.workflows.detect import images_in
-    from rigkit.workflows.inputs.identify_board import identify_board
-
-    if args.square_mm is not None and not 0.0 < args.square_mm < float("inf"):
-        raise InputError(f"board: --square-mm {args.square_mm:g} must be positive")
-    path = None if args.output is None else Path(args.output).with_suffix(".toml")
-    if path is not None and args.square_mm is None:
-        raise InputError("board identify: images cannot tell the scale; give --square-mm, the side of a square or tag")
-    images = [one for path in map(Path, args.images) for one in ([path] if is_video(path) else images_in([path]))]
-    ensure_writable(path, force=args.force, inputs=images)
-    found = identify_board(images, progress=progress_on_stderr())
-    board = found.board
-    print(f"{board.pattern.type}: {without_scale(board.describe())}")
-    print(f"seen in {len(found.seen)} of {len(found.looked_at)} images")
-    print(f"--board {found.words}   (MM: {board.pattern.size_meaning}, measured with a rule)")
-    if found.beside:
-        seen = "" if board.identified else "   (as far as it is seen)"
-        print(f"beside it: {', '.join(f'--board {words}' for words in found.beside)}{seen}")
-    if found.elsewhere:
-        words, others = found.elsewhere
-        print(f"{len(others)} other images, such as '{others[0]}', show another board: --board {words}")
-    if path is not None:
-        text = board_text(board.with_squares(args.square_mm, args.square_mm), "as seen in images", path)
-        write_atomic(path, text, force=args.force)
-        print(path)
-    if found.alike:
-        seen = f"{len(found.alike)} of {len(found.looked_at)} images, such as '{found.alike[0]}'"
-        note(f"two boards alike in {seen}: detect and calibrate find only one of them; {DUPLICATES_REMEDY}")
-    if found.either_pattern:
-        note(
-            "the pattern of OpenCV before 4.6 and the one of today differ in one column, which no image shows well: if "
-            "OpenCV made the board, set legacy_pattern by its version"
-        )
-    for error in found.unreadable:
-        note(f"left out: {error}")
-    return ExitCode.BAD_INPUT if found.unreadable else ExitCode.WELL
-
-
-def without_scale(words: str) -> str:
-    """Return the description of a board with squares of 1 mm, with the unknown scale in words."""
-    return re.sub(r"([\d.]+) mm\b", r"\1 of that", words.replace(" 1 x 1 mm", " of unknown size"))

@@ -11,7 +11,7 @@ import pytest
 
 from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.cameras import registry
-from rigkit.cli import calibrate, reconstruct
+from rigkit.cli import calibrate_arguments, reconstruct
 from rigkit.cli.examples import EXAMPLES, FIRST_STEPS
 from rigkit.cli.main import VERBS, build_parser
 
@@ -50,5 +50,5 @@ def test_without_a_verb_the_first_steps_are_shown() -> None:
 
 
 def test_help_lists_the_camera_models_and_the_affine_estimators() -> None:
-    assert tuple(registry.MODELS) == calibrate.MODEL_NAMES
+    assert tuple(registry.MODELS) == calibrate_arguments.MODEL_NAMES
     assert AFFINE_METHODS == reconstruct.METHODS

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rigkit.cli.board import without_scale
+from rigkit.cli.board_identify import without_scale
 from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.circles import Circles

@@ -92,13 +92,10 @@ def frames_of_videos(
     """Write selected frames of one video (named ""), or selected moments of several cameras' videos, as PNG files.
 
     A source is a video, a numbered sequence, or a live camera, which is read until `max_frames` or Ctrl-C. Frames that
-    an earlier call kept of the same videos for the same boards are used again.
+    an earlier call kept of the same videos for the same boards are used again. `timestamps` is a file that assigns
+    frames to moments (`io.media.video.read_timestamps`); None: frames of the same number are of one moment.
 
-    `timestamps` is a file that assigns frames to moments (`io.media.video.read_timestamps`). None: frames of the same
-    number are of one moment.
-
-    Raises InputError: a video cannot be read, no frame shows a board, or `folder` cannot be written or holds other
-    files.
+    Raises InputError: unreadable video, no frame with a board, `folder` not writable or with other files in it.
     """
     asked = _request(sources, boards, timestamps, max_frames)
     kept = _kept_before(folder, asked)

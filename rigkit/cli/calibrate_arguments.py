@@ -1,0 +1,129 @@
+"""The arguments of `rigkit calibrate`, and the options that they make."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rigkit.core.errors import InputError
+from rigkit.workflows.inputs.formats import FOREIGN_ENDINGS
+
+if TYPE_CHECKING:
+    from rigkit.workflows.calibration.calibrate import CalibrateOptions
+    from rigkit.workflows.calibration.calibrate_any import FolderOptions
+
+MODEL_NAMES = ("pinhole", "brown", "kannala_brandt", "scaramuzza", "ucm", "eucm", "double_sphere")
+"""Names of `rigkit.cameras.registry`, which takes too long to import for a help text."""
+
+PUPILS = ("auto", "central", "moving")
+"""Choices of `rigkit.calibration.with_pupil`."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "source",
+        nargs="+",
+        type=Path,
+        metavar="SESSION.toml|FOLDER|VIDEO",
+        help="a session, folders of images, videos, camera:0",
+    )
+    parser.add_argument("-o", "--output", type=Path, help="default: calibration.json (rig.json) beside the session")
+    parser.add_argument(
+        "-r",
+        "--report",
+        nargs="?",
+        const="",
+        metavar="FILE.html",
+        help="write a page to look at; without a name beside the output",
+    )
+    parser.add_argument(
+        "--export",
+        nargs="+",
+        default=[],
+        choices=sorted(FOREIGN_ENDINGS),
+        metavar="FORMAT",
+        help=f"also for other tools, beside it: {', '.join(sorted(FOREIGN_ENDINGS))}",
+    )
+    parser.add_argument(
+        "--pupil",
+        choices=PUPILS,
+        default="auto",
+        help="whether lenses look from one point (central), or their entrance pupils move; default: auto, moving where "
+        "images show it",
+    )
+    parser.add_argument("--corners", type=Path, metavar="FILE", help="use these: corners.csv, corners.json, .vnl")
+    parser.add_argument(
+        "--no-cache", action="store_true", help="find all corners anew, and keep none beside the session"
+    )
+    parser.add_argument("--force", action="store_true", help="replace existing results")
+    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    _add_known(parser)
+    _add_of_folders(parser)
+
+
+def _add_known(parser: argparse.ArgumentParser) -> None:
+    rigs = parser.add_argument_group("rigs", "what is known stays; how unsure it is counts in all results")
+    rigs.add_argument(
+        "--only-extrinsics",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="CALIB",
+        help="lenses stay as these files have them (one a camera, or one rig): only the mounts are found",
+    )
+    rigs.add_argument(
+        "--add-camera",
+        type=Path,
+        metavar="RIG",
+        help="cameras of this rig stay, lens and mount: the others are added to it",
+    )
+
+
+def _add_of_folders(parser: argparse.ArgumentParser) -> None:
+    folders = parser.add_argument_group("folders", "the session used is kept as session.toml for the next time")
+    folders.add_argument(
+        "--board",
+        action="append",
+        default=[],
+        metavar="BOARD",
+        help="9x6x25 (inner corners, mm a square), circles:10x8x25,diameter_mm=15, a board file, ... (repeatable)",
+    )
+    folders.add_argument(
+        "--square-mm",
+        type=float,
+        metavar="MM",
+        help="instead: the board is what the images show, with squares (tags, distances of circles) of so many mm",
+    )
+    folders.add_argument("--timestamps", type=Path, metavar="FILE.csv", help="which frames of videos are of one moment")
+    folders.add_argument("--model", help=f"{', '.join(MODEL_NAMES)} (default: auto, the one that predicts best)")
+
+
+def calibrate_options(args: argparse.Namespace) -> CalibrateOptions:
+    """Return the options of outputs, cache and known parameters."""
+    from rigkit.workflows.calibration.calibrate import CalibrateOptions
+    from rigkit.workflows.inputs.corners import Cache
+    from rigkit.workflows.inputs.folder_session import Known
+
+    return CalibrateOptions(
+        output=args.output,
+        report=None if args.report is None else Path(args.report),
+        force=args.force,
+        cache=Cache.OFF if args.no_cache else Cache.UPDATE,
+        corners=args.corners,
+        pupil=args.pupil,
+        exports=tuple(dict.fromkeys(args.export)),
+        known=Known(tuple(args.only_extrinsics), args.add_camera),
+    )
+
+
+def folder_options(args: argparse.Namespace) -> FolderOptions:
+    """Return the options for folders of images: boards, model, time stamps."""
+    from rigkit.workflows.calibration.calibrate_any import FolderOptions
+
+    if args.square_mm is not None and not (math.isfinite(args.square_mm) and args.square_mm > 0.0):
+        raise InputError(f"calibrate: --square-mm {args.square_mm}: a positive number of mm is needed")
+    return FolderOptions(
+        boards=tuple(args.board), square_mm=args.square_mm, model=args.model, timestamps=args.timestamps
+    )
