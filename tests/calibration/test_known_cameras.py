@@ -15,7 +15,6 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import log_so3
 
-NAMES = ("reg", "wide", "fish")
 LINEAR = 0.002
 """Terms of the second order, of the errors of a mount: 4e-4 was seen."""
 BOW_ERROR_MM = 0.05

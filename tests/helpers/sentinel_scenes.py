@@ -16,7 +16,7 @@ from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
-from rigkit.validation.sentinel.evidence import FreshView
+from rigkit.validation.sentinel.evidence import FreshView, Monitored
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import monitored_camera
 
@@ -42,6 +42,31 @@ def checked(calibration: Calibration, camera: Camera, rng: np.random.Generator) 
     poses = poses_held("reg", 3)
     views = [FreshView(f"{k}", 0, noisy_view(camera, pose, f"{k}", rng, NOISE_PX)) for k, pose in enumerate(poses)]
     return check_views(monitored_camera(calibration, "cam"), views)
+
+
+def known_rig(mount: Rigid3, lens_sigmas: list[float], rotation_sigma_rad: float, freedom: float) -> Monitored:
+    """Return a rig of two wide lenses, whose second camera is placed to 0.01 mm."""
+    camera = lens("wide")
+    return Monitored(
+        names=("left", "right"),
+        cameras=(camera, camera),
+        cam_from_rig=(Rigid3.identity(), mount),
+        covariance=np.diag([*lens_sigmas, *lens_sigmas, *[rotation_sigma_rad] * 3, *[0.01] * 3]) ** 2,
+        sigma_px=NOISE_PX,
+        freedom=freedom,
+    )
+
+
+def scene_pixels(pose: Rigid3, count: int, noise_px: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return where both cameras of such a rig see up to `count` points of a scene."""
+    camera = lens("wide")
+    rays, valid = camera.unproject(rng.uniform([100.0, 100.0], [1500.0, 1100.0], (count, 2)))
+    points = rays[valid] * rng.uniform(700.0, 4000.0, (int(valid.sum()), 1))
+    pixels1, seen1 = camera.project(points)
+    pixels2, seen2 = camera.project(pose.apply(points))
+    both = seen1 & seen2 & camera.on_image(pixels2)
+    one, two = (p[both] + noise_px * rng.standard_normal((int(both.sum()), 2)) for p in (pixels1, pixels2))
+    return one, two
 
 
 def changed_lens(what: Callable[[np.ndarray], np.ndarray]) -> Camera:

@@ -9,8 +9,23 @@ import cv2
 import numpy as np
 
 from rigkit.cameras.base import Camera
+from rigkit.cameras.kannala_brandt import KannalaBrandt
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
+
+SIZE, SMALL_SIZE = (480, 360), (320, 240)
+LENSES: dict[str, Camera] = {
+    "pinhole": Pinhole(SIZE, np.array([420.0, 420.0, 239.5, 179.5])),
+    "fisheye": KannalaBrandt(SIZE, np.array([230.0, 230.0, 240.0, 180.0, -0.02, 0.002, 0.0, 0.0])),
+}
+SMALL_LENSES: dict[str, Camera] = {
+    "pinhole": Pinhole(SMALL_SIZE, np.array([280.0, 280.0, 159.5, 119.5])),
+    "fisheye": KannalaBrandt(SMALL_SIZE, np.array([150.0, 150.0, 160.0, 120.0, -0.02, 0.002, 0.0, 0.0])),
+}
+TURN = exp_so3(np.array([0.05, -0.25, 0.1]))
+CAM2_FROM_CAM1 = Rigid3(TURN, -TURN @ [320.0, -60.0, 60.0])
+"""Of two views of `Corner.of_a_room`."""
 
 OVERSAMPLING = 2
 TEXEL_MM = 1.0

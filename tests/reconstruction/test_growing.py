@@ -7,17 +7,16 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.epipolar_scenes import pose_errors_deg
-from helpers.textured_scene import Corner
+from helpers.textured_scene import CAM2_FROM_CAM1, LENSES, Corner
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import TILTS, match_affine_features
 from rigkit.affine.refine_patches import FLOOR_PX
-from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.progress import silent
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import angle_between, exp_so3, log_so3
+from rigkit.geometry.rotation import angle_between, log_so3
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
 from rigkit.reconstruction.growing.grow import GrowingView, LineKnowledge, grow, grow_in_both_directions
 from rigkit.reconstruction.growing.surface import PairRays
@@ -25,13 +24,6 @@ from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.workflows.reconstruction.reconstruct_scene import _grown
 
-SIZE = (480, 360)
-LENSES = {
-    "pinhole": Pinhole(SIZE, np.array([420.0, 420.0, 239.5, 179.5])),
-    "fisheye": KannalaBrandt(SIZE, np.array([230.0, 230.0, 240.0, 180.0, -0.02, 0.002, 0.0, 0.0])),
-}
-TURN = exp_so3(np.array([0.05, -0.25, 0.1]))
-CAM2_FROM_CAM1 = Rigid3(TURN, -TURN @ [320.0, -60.0, 60.0])
 BASELINE_MM = float(np.linalg.norm(CAM2_FROM_CAM1.translation_mm))
 SEAM_PX = 12.0
 """Nodes nearer to where two walls meet have them both in their patches."""

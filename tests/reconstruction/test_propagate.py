@@ -6,22 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.textured_scene import Corner
+from helpers.textured_scene import CAM2_FROM_CAM1, SMALL_LENSES, Corner
 
 from rigkit.affine.features import match_affine_features
-from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.arrays import BoolArray
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3
 from rigkit.reconstruction.growing import dense as dense_module
 from rigkit.reconstruction.growing import propagate
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
 from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 
-CAMERA = Pinhole((320, 240), np.array([280.0, 280.0, 159.5, 119.5]))
-TURN = exp_so3(np.array([0.05, -0.25, 0.1]))
-POSE = Rigid3(TURN, -TURN @ [320.0, -60.0, 60.0])
+CAMERA = SMALL_LENSES["pinhole"]
 HOLES = np.zeros((80, 107), dtype=bool)
 HOLES[8:-8:14, 8:-8:14] = HOLES[9:-7:14, 8:-8:14] = HOLES[9:-7:14, 9:-7:14] = True
 
@@ -31,9 +27,9 @@ def corner() -> tuple[Corner, DenseScene, DenseScene]:
     """A corner of a room as it is reconstructed, and with planes taken away."""
     rng = np.random.default_rng(5)
     room = Corner.of_a_room()
-    images = [np.asarray(room.image(CAMERA, pose, rng)) for pose in (Rigid3.identity(), POSE)]
+    images = [np.asarray(room.image(CAMERA, pose, rng)) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)]
     seeds = match_affine_features(*images)
-    length, known = float(np.linalg.norm(POSE.translation_mm)), KnownPose(POSE)
+    length, known = float(np.linalg.norm(CAM2_FROM_CAM1.translation_mm)), KnownPose(CAM2_FROM_CAM1)
     sparse = reconstruct_scene(seeds, CAMERA, CAMERA, baseline_mm=length, known_pose=known, image1=images[0])
     whole = grow_scene(sparse, seeds, *images, pose_is_known=True)
 
@@ -62,7 +58,7 @@ def test_filled_points_have_pairs_normals_and_sigmas_as_others_have(
     new = HOLES.ravel()[filled.nodes]
     assert new.sum() > 30 and len(r.pixels1) == len(r.cloud)
     # The pair's affinity is that of its plane.
-    pixels, seen = CAMERA.project(POSE.apply(r.cloud.points_mm))
+    pixels, seen = CAMERA.project(CAM2_FROM_CAM1.apply(r.cloud.points_mm))
     assert seen.all()
     assert np.abs(pixels - r.pixels2)[new].max() < 1e-6
     assert (np.sum(r.cloud.normals * r.cloud.points_mm, axis=1) < 0.0).all()

@@ -9,17 +9,15 @@ from typing import cast
 import numpy as np
 import pytest
 from helpers.epipolar_scenes import FISHEYE, REGULAR, pair, pose_errors_deg
-from helpers.textured_scene import Corner
+from helpers.textured_scene import CAM2_FROM_CAM1, LENSES, Corner
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import match_affine_features
-from rigkit.cameras.kannala_brandt import KannalaBrandt
-from rigkit.cameras.pinhole import Pinhole
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import angle_between, exp_so3
+from rigkit.geometry.rotation import angle_between
 from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
 from rigkit.reconstruction.scene import _notes, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose, ScenePose
@@ -170,15 +168,6 @@ def test_chance_agreement_of_wrong_matches_is_refused(rng, kind):
     found, *_ = contaminated(rng, kind, outliers=1.0, count=60)
     with pytest.raises(DegenerateError, match="agree"):
         reconstruct_scene(found, REGULAR, REGULAR, pose_type=kind)
-
-
-SIZE = (480, 360)
-LENSES = {
-    "pinhole": Pinhole(SIZE, np.array([420.0, 420.0, 239.5, 179.5])),
-    "fisheye": KannalaBrandt(SIZE, np.array([230.0, 230.0, 240.0, 180.0, -0.02, 0.002, 0.0, 0.0])),
-}
-TURN = exp_so3(np.array([0.05, -0.25, 0.1]))
-CAM2_FROM_CAM1 = Rigid3(TURN, -TURN @ [320.0, -60.0, 60.0])
 
 
 def test_points_beside_their_place_are_found_though_their_affinities_are_right(rng):

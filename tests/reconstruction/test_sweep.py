@@ -8,15 +8,13 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
-from helpers.textured_scene import Corner, texture
+from helpers.textured_scene import CAM2_FROM_CAM1, SMALL_LENSES, SMALL_SIZE, Corner, texture
 from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import match_affine_features
-from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3
 from rigkit.kernels.sweep import swept_costs, swept_surfaces
 from rigkit.reconstruction.growing import sweep as sweep_module
 from rigkit.reconstruction.growing.dense import grow_scene
@@ -27,13 +25,6 @@ from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 
-SIZE = (320, 240)
-LENSES = {
-    "pinhole": Pinhole(SIZE, np.array([280.0, 280.0, 159.5, 119.5])),
-    "fisheye": KannalaBrandt(SIZE, np.array([150.0, 150.0, 160.0, 120.0, -0.02, 0.002, 0.0, 0.0])),
-}
-TURN = exp_so3(np.array([0.05, -0.25, 0.1]))
-CAM2_FROM_CAM1 = Rigid3(TURN, -TURN @ [320.0, -60.0, 60.0])
 STEP = 3
 HOLE = np.s_[25:55, 35:75]
 """Nodes that patches are taken from."""
@@ -44,7 +35,7 @@ FLAT = np.s_[45:70, 190:230]
 @cache
 def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, tuple[GrowingView, GrowingView], Corner]:
     rng = np.random.default_rng(5)
-    corner, camera = Corner.of_a_room(), LENSES[lens]
+    corner, camera = Corner.of_a_room(), SMALL_LENSES[lens]
     images: list[NDArray[np.generic]] = [
         np.asarray(corner.image(camera, pose, rng)) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)
     ]
@@ -66,7 +57,7 @@ def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, tuple[Gr
     return grown, measured, (view1, view2), corner
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("lens", SMALL_LENSES)
 def test_what_patches_leave_open_is_filled_as_well_as_stated(lens: str) -> None:
     grown, measured, views, corner = grown_with_hole(lens)
     done, _ = filled(grown, measured, *views, CAM2_FROM_CAM1)
@@ -76,9 +67,9 @@ def test_what_patches_leave_open_is_filled_as_well_as_stated(lens: str) -> None:
     np.testing.assert_array_equal(done.pixels2[kept], grown.pixels2[kept])
     hole = np.zeros(done.valid.shape, dtype=bool)
     hole[HOLE] = True
-    camera = LENSES[lens]
+    camera = SMALL_LENSES[lens]
     place, _ = camera.project(CAM2_FROM_CAM1.apply(corner.surface(camera, views[0].nodes(STEP)[hole])[0]))
-    inside = ((place > 10.0) & (place < np.array(SIZE) - 11.0)).all(axis=1)
+    inside = ((place > 10.0) & (place < np.array(SMALL_SIZE) - 11.0)).all(axis=1)
     filling = done.swept & hole
     assert inside.sum() > 400
     assert filling[hole][inside].mean() > 0.9
@@ -102,8 +93,8 @@ def test_pairs_that_the_sweep_contradicts_give_way_to_its_own() -> None:
     done, sweep = filled(grown, replace(measured, z=z), *views, CAM2_FROM_CAM1)
     assert wrong.sum() > 200 and sweep is not None
     assert done.swept[wrong].mean() > 0.95
-    expected, _ = LENSES["pinhole"].project(
-        CAM2_FROM_CAM1.apply(corner.surface(LENSES["pinhole"], done.pixels1[wrong])[0])
+    expected, _ = SMALL_LENSES["pinhole"].project(
+        CAM2_FROM_CAM1.apply(corner.surface(SMALL_LENSES["pinhole"], done.pixels1[wrong])[0])
     )
     assert np.median(np.linalg.norm(done.pixels2[wrong] - expected, axis=1)) < 0.5
     # Nor is a plane there distinct, whatever lies in it.
@@ -239,5 +230,5 @@ def test_no_light_falls_around_the_circle_of_a_fisheye_but_does_on_its_dark_spot
     spot = np.hypot(u - 180.0, v - 100.0) < 12.0
     rng = np.random.default_rng(3)
     image = np.where(around | spot, 0.0, 120.0) + rng.uniform(0.0, 5.0, around.shape)
-    lit = sweep_module._lit(GrowingView.of(image.astype(np.uint8), LENSES["fisheye"]))
+    lit = sweep_module._lit(GrowingView.of(image.astype(np.uint8), SMALL_LENSES["fisheye"]))
     np.testing.assert_array_equal(lit == 0.0, around)

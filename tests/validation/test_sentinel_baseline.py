@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.calibration_scenes import lens, noisy_view
-from helpers.sentinel_scenes import NOISE_PX, poses_held
+from helpers.sentinel_scenes import NOISE_PX, poses_held, scene_pixels
 
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
@@ -47,19 +47,8 @@ def _file() -> Monitored:
     )
 
 
-def _scene(pose: Rigid3, rng: np.random.Generator) -> PairMatches:
-    camera = lens("wide")
-    rays, valid = camera.unproject(rng.uniform([100.0, 100.0], [1500.0, 1100.0], (300, 2)))
-    points = rays[valid] * rng.uniform(700.0, 4000.0, (int(valid.sum()), 1))
-    pixels1, seen1 = camera.project(points)
-    pixels2, seen2 = camera.project(pose.apply(points))
-    both = seen1 & seen2 & camera.on_image(pixels2)
-    noisy = [p[both] + MATCH_NOISE_PX * rng.standard_normal((int(both.sum()), 2)) for p in (pixels1, pixels2)]
-    return PairMatches(0, 1, *noisy)
-
-
 def _scenes(pose: Rigid3, count: int, rng: np.random.Generator) -> Look:
-    matches = [_scene(pose, rng) for _ in range(count)]
+    matches = [PairMatches(0, 1, *scene_pixels(pose, 300, MATCH_NOISE_PX, rng)) for _ in range(count)]
     return lambda now: evidence_of_matches(now, matches)
 
 

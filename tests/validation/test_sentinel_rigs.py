@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.calibration_scenes import lens, noisy_view
-from helpers.sentinel_scenes import NOISE_PX, poses_held
+from helpers.sentinel_scenes import NOISE_PX, known_rig, poses_held, scene_pixels
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.refine_patches import HALF_WIDTH_OF_FEATURE, WINDOW_OF_PATCH
@@ -37,15 +37,7 @@ LENS_SIGMAS = [0.1, 0.1, 0.1, 0.1, 2e-5, 2e-5, 2e-5, 2e-5]
 
 
 def _rig() -> Monitored:
-    camera = lens("wide")
-    return Monitored(
-        names=("left", "right"),
-        cameras=(camera, camera),
-        cam_from_rig=(Rigid3.identity(), MOUNT),
-        covariance=np.diag([*LENS_SIGMAS, *LENS_SIGMAS, *[2e-5] * 3, *[0.01] * 3]) ** 2,
-        sigma_px=NOISE_PX,
-        freedom=20.0,
-    )
+    return known_rig(MOUNT, LENS_SIGMAS, 2e-5, 20.0)
 
 
 BENT = Brown((1280, 960), np.array([640.0, 640.0, 639.5, 479.5, -0.22, 0.06, 2e-4, -2e-4, -0.006]))
@@ -101,13 +93,7 @@ def test_a_longer_baseline_is_a_change_of_scale_or_shift(rng: np.random.Generato
 
 
 def _matches(pose: Rigid3, rng: np.random.Generator, noise_px: float = MATCH_NOISE_PX) -> PairMatches:
-    camera = lens("wide")
-    rays, valid = camera.unproject(rng.uniform([100.0, 100.0], [1500.0, 1100.0], (600, 2)))
-    points = rays[valid] * rng.uniform(700.0, 4000.0, (int(valid.sum()), 1))
-    pixels1, seen1 = camera.project(points)
-    pixels2, seen2 = camera.project(pose.apply(points))
-    both = seen1 & seen2 & camera.on_image(pixels2)
-    noisy = [p[both] + noise_px * rng.standard_normal((int(both.sum()), 2)) for p in (pixels1, pixels2)]
+    noisy = scene_pixels(pose, 600, noise_px, rng)
     # One match in ten is wrong.
     wrong = rng.random(len(noisy[0])) < 0.1
     noisy[1][wrong] += rng.uniform(-60.0, 60.0, (int(wrong.sum()), 2))

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, lens, noisy_view
+from helpers.sentinel_scenes import known_rig
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
@@ -77,15 +78,7 @@ LENS_SIGMAS = [0.05, 0.05, 0.05, 0.05, 2e-5, 2e-5, 2e-5, 2e-5]
 
 
 def _rig(mount: Rigid3) -> Monitored:
-    camera = lens("wide")
-    return Monitored(
-        names=("left", "right"),
-        cameras=(camera, camera),
-        cam_from_rig=(Rigid3.identity(), mount),
-        covariance=np.diag([*LENS_SIGMAS, *LENS_SIGMAS, *[1e-5] * 3, *[0.01] * 3]) ** 2,
-        sigma_px=NOISE_PX,
-        freedom=50.0,
-    )
+    return replace(known_rig(mount, LENS_SIGMAS, 1e-5, 50.0), sigma_px=NOISE_PX)
 
 
 def _turn(powers: tuple[Power, ...]) -> float:
