@@ -305,7 +305,8 @@ def _with_markers_masked(
         fitted = _fitted(picture, given, empty, before)
         if turn > 0 and some_more:
             fitted = fitted.without(_too_unlike(fitted, sure))
-        narrow = placed_together(picture, fitted)
+        # What ink is left the first time is in no picture of empty squares, and this takes longest.
+        narrow = placed_together(picture, fitted) if turn > 0 else fitted
         after = float(np.median(narrow.blur_px[narrow.lattice.known]))
     # Wide windows see how crookedly the squares are printed, as those of plain chessboards do.
     alone = narrow.sigma_px / narrow.scatter / (1.0 + _drawn_by_markers(image, light, given, narrow, board, before))
