@@ -14,9 +14,10 @@ scene: a rig in front of rendered textured walls; the extrinsics rotate by 0.05 
 pairs: real pairs of textured scenes with known cameras and pose; without change, or with extrinsics rotated by 0.05
 degrees, checked as published, or against the rig's other pairs (`--before`).
 real: real captures; three, or half, of the images are checked against a calibration from the others.
+since: the same, and real rigs whose mount turned, since others of these images (`--before`).
 
-    python scripts/bench_sentinel.py [lens] [rig] [departs] [pupil] [rendered] [scene] [pairs] [real] [--seeds 20]
-        [--lens NAME ...] [--board 9x6x25] [--parameters-alone]
+    python scripts/bench_sentinel.py [lens] [rig] [departs] [pupil] [rendered] [scene] [pairs] [real] [since]
+        [--seeds 20] [--lens NAME ...] [--board 9x6x25] [--parameters-alone]
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from scipy.special import ndtr, ndtri
 from sentinel.captures import SAID, left_out, real
 from sentinel.pupils import pupils
 from sentinel.scenes import pairs
+from sentinel.since import RIGS, since_cameras, since_rigs
 from sentinel.tally import CHANGED_PX, COUNTED, FRESH, KINDS, SCENE_TURNED_DEG, TALLY, checked, tell, turned, unchanged
 
 from rigkit.calibration.calibrate import calibrate
@@ -345,7 +347,7 @@ REAL = ("caliper", "camodocal", "ov-plane", "ocam", "fisheye-chess", "cylinder",
 
 
 def main() -> None:
-    kinds = ("lens", "rig", "departs", "pupil", "rendered", "scene", "pairs", "real")
+    kinds = ("lens", "rig", "departs", "pupil", "rendered", "scene", "pairs", "real", "since")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kinds", nargs="*", choices=[*kinds, []], help="default all")
     parser.add_argument("--seeds", type=int, default=20)
@@ -369,6 +371,10 @@ def main() -> None:
         "scene": [partial(scene, args.seeds, args.noise, n) for n in args.lens],
         "pairs": [partial(pairs, args.data, args.seeds)],
         "real": [partial(real, n, args.data, args.cache, args.seeds) for n in args.sets],
+        "since": [
+            *(partial(since_rigs, n, args.data, args.cache, args.seeds) for n in RIGS),
+            *(partial(since_cameras, n, args.data, args.cache, args.seeds) for n in args.sets),
+        ],
     }
     for kind in args.kinds or kinds:
         TALLY.clear()

@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         print_json(check_to_dict(check) | left_out)
     else:
         print_statement(done.facts)
-        if not check.holds:
+        if not (check.holds or check.unexplained):
             print(tables_to_text([check_table(check)]))
     for image, reason in done.left_out:
         note(f"left out: {image}: {reason}")

@@ -117,8 +117,13 @@ def _camera_in(data: dict[str, Any], path: str | Path) -> Camera:
 
 def _calibration_in(data: dict[str, Any], path: str | Path) -> Calibration:
     missing = sorted(CALIBRATION_KEYS - LATER_KEYS - set(data))
+    if "covariance" in missing and "camera" in data:
+        raise InputError(
+            f"'{path}': a camera without its calibration, as of another program's file, which does not say how sure it "
+            "is; `rigkit calibrate` pictures of that camera, and give what that writes"
+        )
     if missing:
-        raise InputError(f"'{path}': no {', '.join(missing)}: a camera without its calibration; calibrate again")
+        raise InputError(f"'{path}': no {', '.join(missing)}; calibrate again")
     with damage_named(path):
         camera = camera_from_json(data["camera"], path)
         size = camera.parameters.size

@@ -52,10 +52,10 @@ def show_history(
     earlier = sum(one.moment - two.moment > MAX_CLOCK_DIFFERENCE for one, two in pairwise(kept))
     if earlier:
         _log.warning(
-            "register '%s': %s follow one of a later day: a clock was wrong, or registers were joined; they are shown "
+            "register '%s': %s one of a later day: a clock was wrong, or registers were joined; the entries are shown "
             "by their dates",
             register,
-            "1 entry" if earlier == 1 else f"{earlier} entries",
+            "1 entry follows" if earlier == 1 else f"{earlier} entries follow",
         )
     to_come = [entry.date for entry in kept if entry.moment - datetime.now(UTC) > MAX_CLOCK_DIFFERENCE]
     if to_come:
