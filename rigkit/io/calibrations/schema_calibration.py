@@ -152,9 +152,10 @@ RIG_FILE = file(
                     "much its pictures lag differently, in the usual time between two frames",
                 ),
                 "readout?": described(
-                    obj({"frames": NUMBER, "sigma": NUMBER}),
-                    "how long it takes from the first row of an image to the last, in the usual time between two "
-                    "frames, and the standard deviation of that",
+                    obj(
+                        {"frames": described(NUMBER, "that time"), "sigma": described(NUMBER, "its standard deviation")}
+                    ),
+                    "how long it takes from the first row of an image to the last, in the time between two frames",
                 ),
             },
             "the first is the rig's frame",
