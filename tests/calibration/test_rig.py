@@ -107,7 +107,7 @@ def _lagging(state: RigState, rng: np.random.Generator) -> RigState:
     ways = np.concatenate([axis * [[0.2], [0.1]], 30.0 * rng.normal(size=(poses, 2, 3))], axis=-1)
     own, information = np.zeros((2, poses)), np.full((2, poses), np.inf)
     own[1], information[1] = 0.1 * rng.normal(size=poses), 1e6 * rng.uniform(1.0, 2.0, poses)
-    return replace(state, moments=Moments(np.array([0.0, 0.3]), ways, own, information))
+    return replace(state, moments=Moments(np.array([0.0, 0.3]), ways, own, information, np.zeros(2)))
 
 
 @pytest.mark.parametrize("kind", ["flat", "warp", "released"])
