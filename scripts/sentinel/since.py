@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from split_halves import load
+from halves.captures import load
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig.calibrate import calibrate_rig
@@ -96,9 +97,7 @@ def _draws(
         if degrees:
             fresh = [_after_turn(v, monitored.cameras[1], degrees, len(checks)) if v.camera == 1 else v for v in fresh]
         try:
-            check = judge_since(
-                monitored, lambda now, own=before: evidence_of(now, own), lambda now, own=fresh: evidence_of(now, own)
-            )
+            check = judge_since(monitored, partial(evidence_of, views=before), partial(evidence_of, views=fresh))
         except RigkitError as error:
             print(f"{name}: {error}")
             continue
