@@ -1,1 +1,1 @@
-"""Does a calibration still hold? Fresh pictures against what it says, and against how sure it says it is."""
+"""Monitoring: whether a calibration still holds for fresh images, given its covariance, and what changed if not."""

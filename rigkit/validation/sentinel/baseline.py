@@ -1,14 +1,14 @@
-"""What moved since a calibration was trusted: pictures of then correct it, and fresh ones are held against that.
+"""Changes since a calibration was trusted: images of that time correct it, and fresh ones are tested against it.
 
-With C the covariance of theta, and w = L^T e + noise the whitened score of pictures of before (`whitened`), theta was
-off by e = G w then, G = C L (I + L^T C L)^-1: that is taken back, and what is left open, P = G G^T + (I - G L^T) C
-(I - G L^T)^T, is the scatter of these pictures, and C where they show nothing. A file may be off by more than C says: C
-counts as many times as what they show of it beyond chance, w^T (I + L^T C L)^-1 w - R, so that it is off by no more in
-any direction. And frames of one camera may disagree by more than their points tell (what lens and scene share in each):
-by how much those of before do among themselves, and the fresh ones, counts against all.
+theta are the parameters, C their covariance, and e the error of the calibration. The earlier images have the whitened
+score w = L^T e + noise (`whitened`). The estimate is e = G w with the gain G = C L (I + L^T C L)^-1; theta is corrected
+by it and keeps the covariance P = G G^T + (I - G L^T) C (I - G L^T)^T. A calibration from a file may have larger errors
+than C states, so C is inflated by w^T (I + L^T C L)^-1 w - R, the excess of chi-squared over its R degrees of freedom.
+Frames of one camera may also disagree by more than their points predict, because all points of a frame share errors of
+lens and scene. The variance is inflated by the disagreement within the earlier and within the fresh frames.
 
 Reference: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001),
-section 5.2.3 (the gain, and the covariance as a sum that cannot become negative).
+section 5.2.3 (the gain, and the Joseph form of the covariance, which stays positive semidefinite).
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from rigkit.validation.sentinel.judge import (
 from rigkit.validation.sentinel.whitened import Whitened, disagreement
 
 CORRECTIONS = 4
-"""Times that the correction is linearised anew: published lenses are off by up to 2 px."""
+"""Gauss-Newton iterations of the correction: published lenses are off by up to 2 px."""
 
 
 def judge_since(monitored: Monitored, before: Look, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
-    """Return the verdict on what `look` finds in fresh frames, against the cameras as what `before` finds in frames of
-    the time when they were trusted corrects them.
+    """Return the verdict on the evidence of fresh frames, `look`, against the cameras corrected by the evidence of
+    frames from the time when they were trusted, `before`.
 
-    Raises InputError where frames of before do not fit the cameras even once these are corrected to them.
+    Raises InputError where the earlier frames do not fit the cameras even after the correction.
     """
     trusted, now, change, chance = monitored, monitored, np.zeros(monitored.layout.count), 1.0
     first = evidence = before(monitored)
@@ -72,14 +72,14 @@ def judge_since(monitored: Monitored, before: Look, look: Look, cost: Sequence[G
 
 @dataclass(frozen=True, slots=True)
 class _Disagreement:
-    """By how much more frames disagree than their points tell, a ratio of variances, and its degrees of freedom."""
+    """Variance of the scores of frames over that predicted from their points, and its degrees of freedom."""
 
     ratio: float
     freedom: float
 
     @classmethod
     def of(cls, *times: FreshEvidence) -> _Disagreement:
-        """Return that of frames of several times, between which something may have changed."""
+        """Return that within each of several times; changes between the times do not count."""
         count = times[0].score.shape[1]
         information, score = [], []
         for k, evidence in enumerate(times):
@@ -97,7 +97,7 @@ class _Disagreement:
         return cls(*disagreement(np.concatenate(information), np.concatenate(score)))
 
     def of_frames(self, evidence: FreshEvidence) -> FreshEvidence:
-        """Return what frames say, counted so much less."""
+        """Return the evidence with its variance inflated by the ratio."""
         if self.ratio <= 1.0:
             return evidence
         return replace(

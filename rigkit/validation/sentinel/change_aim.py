@@ -1,8 +1,8 @@
-"""Which pictures to check a camera or a rig with: those that would tell changes of its lenses and mounts best.
+"""Which images to check a camera or a rig with: those that estimate changes of lenses and mounts most precisely.
 
-With P = (C^-1 + A)^-1, C the covariance of the calibration and A what fresh frames say, changes a of a hypothesis D
-scatter by N^-1, N = D^T (C + A^-1)^-1 D = D^T (C^-1 - C^-1 P C^-1) D. Frames that make this small for every hypothesis
-are not those that improve the calibration most: what a lens needs known least may be what changes.
+With C the covariance of the calibration, A the information of the fresh frames and P = (C^-1 + A)^-1, the estimated
+amounts of a hypothesis D have the covariance N^-1, N = D^T (C + A^-1)^-1 D = D^T (C^-1 - C^-1 P C^-1) D. Frames that
+make it small for every hypothesis are not those that improve the calibration most: well-known parameters may change.
 
 Reference: A. C. Atkinson, A. N. Donev, R. D. Tobias, "Optimum Experimental Designs, with SAS" (2007), section 10.3
 (the designs for parts of the parameters).
@@ -31,12 +31,12 @@ from rigkit.validation.sentinel.whitened import NULL_RANK
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ChangeAim:
-    """How surely the size of a change is told.
+    """The precision with which the size of a change is estimated.
 
     Attributes
     ----------
     shown : for each hypothesis C^-1 D (T, m), D in px over the image, and D^T C^-1 D (m, m).
-    what : in words.
+    what : description of `error`.
     """
 
     shown: tuple[tuple[FloatArray, FloatArray], ...]
@@ -45,8 +45,8 @@ class ChangeAim:
 
     @classmethod
     def of(cls, monitored: Monitored, inverse: FloatArray, of_all: FloatArray) -> ChangeAim:
-        """Return the aim for all lenses and mounts, whose covariance has the `inverse` (T, T); hypotheses of which even
-        `of_all` (T, T), what all frames say that could be taken, tells nothing are left out."""
+        """Return the aim for all lenses and mounts, from the `inverse` (T, T) of their covariance. Hypotheses on which
+        even `of_all` (T, T), the information of all candidate frames, has no effect are left out."""
         several = len(monitored.cameras) > 1
         by_all, shown = covariance_of(inverse + of_all), []
         for hypothesis in hypotheses_of(monitored):
@@ -63,8 +63,8 @@ class ChangeAim:
         return cls(tuple(shown), f"standard error of a change of {changes}, over the image")
 
     def error(self, covariance: FloatArray) -> FloatArray:
-        """Return the root of the hypotheses' variances together, each the geometric mean over its directions, so that
-        none is told at the cost of all others; huge where there is one of which the frames say nothing."""
+        """Return the root of the summed variances of all hypotheses, each the geometric mean over its directions, so
+        that none is neglected for the others; very large where the frames do not show one of the hypotheses."""
         variance = np.zeros(covariance.shape[:-2])
         for by_theta, whole in self.shown:
             gained = np.maximum(_explained_variances(by_theta, whole, covariance), NULL_RANK * np.trace(whole))
@@ -78,8 +78,8 @@ def _explained_variances(by_theta: FloatArray, whole: FloatArray, covariance: Fl
 
 
 def _metric(monitored: Monitored, hypothesis: Hypothesis) -> FloatArray | None:
-    """Return the mean square over the image, px^2, that amounts of a hypothesis move it by, (m, m): of a lens after the
-    best rotation, of a mount's turn what is far away; None for what is not looked for."""
+    """Return the quadratic form (m, m), px^2, that maps amounts of a hypothesis to the mean square displacement over
+    the image: after the best rotation for a lens, of distant points for a turned mount; None for other hypotheses."""
     c = monitored.names.index(hypothesis.camera or monitored.names[0])
     if hypothesis.kind in LENS_KINDS:
         return np.asarray(hypothesis.directions.T @ lens_goals(monitored)[c].weight @ hypothesis.directions)
@@ -89,11 +89,11 @@ def _metric(monitored: Monitored, hypothesis: Hypothesis) -> FloatArray | None:
 def informative_views(
     monitored: Monitored, boards: Sequence[Board], count: int, reach: Reach | None = None
 ) -> tuple[Plan, tuple[Power, ...]]:
-    """Return the pictures to check a camera or a rig with, and how well they would find what changed. Of a rig a
-    picture is one of every camera at one moment, of one board.
+    """Return the images to check a camera or a rig with, and the power of the check with them. An image of a rig is
+    one of every camera at one moment, of one board.
 
-    Raises InputError: no board, or no picture asked for; DegenerateError: no board fits into any image at the distances
-    allowed, or nothing can be told of the calibration.
+    Raises InputError without boards or for a `count` below 1, DegenerateError where no board fits into any image at the
+    allowed distances or the covariance cannot be inverted.
     """
     if not boards or count < 1:
         raise InputError("plan: at least one board and one picture are needed")
@@ -113,7 +113,7 @@ def informative_views(
         overdispersion=monitored.overdispersion,
         freedom=monitored.freedom,
     )
-    # Without any picture nothing is told.
+    # Without any image the error is infinite.
     knowledge = Knowledge(monitored.cameras[0], inverse, CornerError(sigma))
     return Plan(knowledge, aim, float("inf"), tuple(views)), powers_of(
         monitored, evidence, hypotheses_of(monitored), ALARM_CHANCE

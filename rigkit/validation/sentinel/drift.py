@@ -1,4 +1,4 @@
-"""How an amount that was watched over months goes with the temperature."""
+"""The dependence of a monitored amount on temperature, over months."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 
 MIN_ENTRIES = 3
-"""Two points lie on a line, whatever they err by."""
+"""Two points always lie on a line, whatever their errors."""
 MIN_RANGE_C = 1.0
-"""Temperatures that differ by less are those of one room."""
+"""Temperatures within a smaller range are constant: those of one room."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeatDrift:
-    """The straight line amount = `at_mean` + `per_degree` (T - `mean_c`), with the standard deviation of its slope, and
-    the chance of such a slope where the temperature changes nothing."""
+    """The straight line amount = `at_mean` + `per_degree` (T - `mean_c`), with the standard deviation `sigma` of its
+    slope, and the p-value `chance` of the slope."""
 
     mean_c: float
     at_mean: float
@@ -31,9 +31,9 @@ class HeatDrift:
 
 
 def heat_drift(temperature_c: FloatArray, value: FloatArray, sigma: FloatArray) -> HeatDrift | None:
-    """Return the line through amounts (N,) with their standard deviations, by weighted least squares; None where fewer
-    than three, or temperatures within a degree, tell of none. Where the amounts scatter about it more than they state,
-    this scatter counts."""
+    """Return the weighted least-squares line through amounts (N,) with their standard deviations; None for fewer than
+    three or for temperatures within a degree. Residuals larger than the standard deviations state inflate the standard
+    deviation of the slope."""
     if len(value) < MIN_ENTRIES or np.ptp(temperature_c) < MIN_RANGE_C or not (sigma > 0.0).all():
         return None
     # Imported here: registers without temperatures are shown without it.

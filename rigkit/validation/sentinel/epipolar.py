@@ -1,12 +1,12 @@
-"""What any textured scene says of a rig: matches that leave the epipolar geometry. No board, and no scale.
+"""Checking a rig with images of any textured scene, by the epipolar geometry of matches. No board, and no scale.
 
-Of a pair of cameras every match has a Sampson distance r with derivatives J by theta: a change d moves r by J d, so
-scores -J^T r have the mean J^T J d, as those of boards have. How much matches scatter is what is left once everything
-that theta could explain is taken away: else a change would hide behind the scatter that it makes. Matches of one part
-of the image share their errors: by how much more the parts disagree than independent matches would, counts against all
-of them. What they share alike all over the image would pass for a change. Patches are aligned by affine warps, and
-between lenses that distort the map is none: that moved matches by up to 0.02 px where their noise is 0.007, and by
-0.007 degrees of a mount between lenses of 90 degrees. The rig as it is known tells by how much: that is taken back.
+Every match of a pair of cameras has a Sampson distance r with derivatives J by theta. A change d of theta changes r by
+J d, so the scores -J^T r have the mean J^T J d, as those of boards have. The scatter of matches is estimated from the
+residuals after the best fit of theta: otherwise a change would hide behind the scatter that it causes. Matches in one
+part of the image have correlated errors: their variance is inflated by the disagreement of the parts relative to
+independent matches. Errors common to the whole image would look like a change. One is known: patches are aligned by
+affine warps, but the map between lenses with distortion is not affine. It moved matches by up to 0.02 px where their
+noise is 0.007 px, and a mount between 90 degree lenses by 0.007 degrees. It is predicted from the rig and subtracted.
 """
 
 from __future__ import annotations
@@ -40,27 +40,27 @@ from rigkit.validation.sentinel.whitened import MIN_FREE_VARIANCE, disagreement
 
 FEATURES = 2500
 MIN_FRAME_MATCHES = 40
-"""Fewer matches of a frame may be of one surface, or wrong."""
+"""Fewer matches of a frame may all lie on one surface, or be wrong."""
 PARTS = 4
-"""Columns and rows of the parts of an image that are taken as independent."""
+"""Columns and rows of the parts of an image whose errors are treated as independent."""
 WELSCH_SIGMAS = 2.985
-"""Matches that lie farther off hardly count (J. E. Dennis, R. E. Welsch, 1978; of Gaussian noise 95 % is used): up to a
-quarter of them is wrong where things repeat, and not by far."""
+"""Matches with larger residuals get almost no weight (J. E. Dennis, R. E. Welsch, 1978: efficiency 95 % for Gaussian
+noise). In repetitive scenes up to a quarter of the matches are outliers, and not by far."""
 FIT_ROUNDS, FIT_CUT = 15, 1e-5
-"""Of the fit of everything to the matches; directions that move them by less beside others are none."""
+"""Of the fit of theta to the matches; FIT_CUT is the smallest singular value used, relative to the largest."""
 MATCHES_OF_DIRECTION = 5
-"""A fit follows one direction for so many matches, those that move them most: what is left of fewer tells no scatter.
-SIMULATED, 6 to 24 directions, none to a quarter of the matches wrong: of 1.5 matches a direction 5 % of the scatters
-found are below a twentieth of what is true, of 3 below two thirds, of 5 none are below half."""
+"""Matches needed for each fitted direction, the strongest directions first: with fewer, residuals underestimate the
+scatter. SIMULATED, 6 to 24 directions, none to a quarter of the matches wrong: of 1.5 matches a direction 5 % of the
+estimated scatters are below a twentieth of the true one, of 3 below two thirds, of 5 none are below half."""
 REACH_SIGMAS = 0.2
-"""Derivatives are differences over this part of the standard deviations of theta."""
+"""Steps of the central differences, in standard deviations of theta."""
 
 Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairMatches:
-    """Matches of cameras number `first` and `second` in one frame: pixels (N, 2) in either."""
+    """Matches between the cameras of index `first` and `second` in one frame: pixels (N, 2) in each."""
 
     first: int
     second: int
@@ -71,7 +71,7 @@ class PairMatches:
 def check_scene(
     monitored: Monitored, frames: Sequence[Sequence[Any]], cost: Sequence[Goal] = (), *, progress: Progress = silent
 ) -> SentinelCheck:
-    """Return the verdict on images of a textured scene, one a camera in every frame.
+    """Return the verdict on images of a textured scene, one per camera in every frame.
 
     Raises DegenerateError where too few matches are found.
     """
@@ -81,8 +81,8 @@ def check_scene(
 def matches_of_scenes(
     monitored: Monitored, frames: Sequence[Sequence[Any]], *, progress: Progress = silent
 ) -> list[PairMatches]:
-    """Return the matches of the first camera with each other one in images of textured scenes, one a camera in every
-    frame; frames with too few are left out."""
+    """Return the matches of the first camera with each other camera in images of textured scenes, one per camera in
+    every frame; pairs with too few matches are left out."""
     found = []
     for k, images in enumerate(frames):
         progress("matches", k, len(frames))
@@ -98,7 +98,7 @@ def matches_of_scenes(
 
 
 def scene_matches(monitored: Monitored, numbers: tuple[int, int], image1: Any, image2: Any) -> PairMatches:
-    """Return matches, by cameras of these numbers, of what is not repeated in either image.
+    """Return matches between the cameras of these indices, only of features that are unique in both images.
 
     Raises as `match_affine_features`.
     """
@@ -107,7 +107,7 @@ def scene_matches(monitored: Monitored, numbers: tuple[int, int], image1: Any, i
 
 
 def straightened(monitored: Monitored, numbers: tuple[int, int], found: Correspondences) -> PairMatches:
-    """Return aligned patches of two cameras, without what an affine warp leaves of the map between the images."""
+    """Return the matches of two cameras without the bias of affine alignment, the curvature of the map."""
     assert found.A21 is not None
     first, second = numbers
     cameras = monitored.cameras[first], monitored.cameras[second]
@@ -132,9 +132,9 @@ def check_matches(monitored: Monitored, matches: Sequence[PairMatches], cost: Se
 
 
 def evidence_of_matches(monitored: Monitored, matches: Sequence[PairMatches]) -> FreshEvidence:
-    """Return what matches of a rig's cameras say of theta.
+    """Return the evidence of matches of a rig's cameras about theta.
 
-    Raises DegenerateError where there are none, or the lenses see none of them.
+    Raises DegenerateError without matches, or where they are outside the lenses' fields of view.
     """
     if not matches:
         raise DegenerateError(
@@ -157,7 +157,7 @@ def evidence_of_matches(monitored: Monitored, matches: Sequence[PairMatches]) ->
         ratio, free = disagreement(own / sigma**2, score / sigma**2)
         disagreements.append(ratio)
         variances.append(sigma**2 * ratio)
-        # Parts that err as a whole count once each.
+        # Parts with correlated errors count as one value each.
         freedom += min(free, np.count_nonzero(own.any(axis=(1, 2))) - 1.0)
         squares, count = squares + float((weight * residual**2).sum()), count + len(residual)
         left_squares += float((weight * left**2).sum())
@@ -177,8 +177,8 @@ def evidence_of_matches(monitored: Monitored, matches: Sequence[PairMatches]) ->
 
 
 def _linearised(monitored: Monitored, matches: Sequence[PairMatches]) -> list[tuple[FloatArray, FloatArray, BoolArray]]:
-    """Return, for each of `matches`, the Sampson distances (M,) px of those that the cameras see, their derivatives
-    (M, T), and which of N these are."""
+    """Return for each of `matches` the Sampson distances (M,) px of those that both cameras see, their derivatives
+    (M, T), and the mask (N,) of these matches."""
     found = {}
     for numbers in dict.fromkeys((pair.first, pair.second) for pair in matches):
         own = [k for k, pair in enumerate(matches) if (pair.first, pair.second) == numbers]
@@ -204,7 +204,7 @@ def _derivatives(
     def differ(k: int, ends: list[FloatArray]) -> None:
         jacobian[:, k] = (ends[0] - ends[1]) / (2.0 * reach[k])
 
-    # A lens changes its rays alone, and its mount none.
+    # A lens affects only its own rays, a mount no rays.
     for side, c in enumerate(numbers):
         camera, lens, mount = monitored.cameras[c], layout.cameras[c], layout.mounts[c]
         for k, step in _steps(lens, reach):
@@ -217,7 +217,7 @@ def _derivatives(
 
 
 def _steps(own: slice, reach: FloatArray) -> Iterator[tuple[int, FloatArray]]:
-    """Yield the numbers of the parameters in `own` that may differ, each with a step along it alone."""
+    """Yield the index of each parameter in `own` with a standard deviation, and a step along it."""
     for k, size in enumerate(reach[own].tolist()):
         if size > 0.0:
             step = np.zeros(own.stop - own.start)
@@ -226,16 +226,16 @@ def _steps(own: slice, reach: FloatArray) -> Iterator[tuple[int, FloatArray]]:
 
 
 def _but(items: Sequence[Item], at: int, item: Item) -> list[Item]:
-    """Return `items` with `item` in the place `at`."""
+    """Return `items` with `item` at index `at`."""
     return [*items[:at], item, *items[at + 1 :]]
 
 
 def _unexplained(residual: FloatArray, jacobian: FloatArray, mount: slice) -> tuple[FloatArray, FloatArray, float]:
-    """Return what is left of residuals (M,) after the best change of theta of all, the weights of the matches, and
-    their standard deviation: wrong matches count little."""
+    """Return the residuals (M,) after the best change of theta, the weights of the matches, robust to outliers, and
+    their standard deviation."""
     left, sigma = residual, float(np.median(np.abs(residual))) * SIGMA_OF_MEDIAN
-    # A wrong match far from all others bends the fit to itself: what lies out before it counts no more after it, nor
-    # what lies out after the best change of the mount alone, which bends little.
+    # A gross outlier pulls the fit towards itself. A match that is an outlier before the fit, or after a fit of the
+    # mount alone, which follows outliers little, therefore keeps its low weight.
     weight = _weights(residual, sigma)
     for part in (mount, slice(None)):
         if jacobian[:, part].any():
@@ -244,8 +244,8 @@ def _unexplained(residual: FloatArray, jacobian: FloatArray, mount: slice) -> tu
 
 
 def _fitted(residual: FloatArray, jacobian: FloatArray, before: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return what is left of residuals after the best step along all columns, the weights, none higher than `before`,
-    and their standard deviation."""
+    """Return the residuals after the best step along all columns, the weights, at most `before`, and the standard
+    deviation."""
     size = np.linalg.norm(jacobian, axis=0)
     design = jacobian[:, size > 0.0] / size[size > 0.0]
     left, weight, sigma = residual, before, 0.0
@@ -258,7 +258,7 @@ def _fitted(residual: FloatArray, jacobian: FloatArray, before: FloatArray) -> t
         left = residual - design @ step
         freedom = max(len(residual) - rank, 1) / len(residual)
         sigma = float(np.median(np.abs(left))) * SIGMA_OF_MEDIAN / np.sqrt(freedom)
-        # Of a match that the fit follows, alone in its part of the image, little is left, right or wrong.
+        # A match with high leverage, alone in its part of the image, has a small residual, inlier or outlier.
         free = np.sqrt(np.maximum(1.0 - (basis[:, :rank] ** 2).sum(axis=1), MIN_FREE_VARIANCE))
         weight = np.minimum(before, _weights(left / free, sigma))
     return left, weight, sigma
@@ -270,7 +270,7 @@ def _weights(left: FloatArray, sigma_px: float) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _SeenRays:
-    """Rays (N, 3) of a camera's pixels, their derivatives (N, 3, 2) by the pixels, and where there are any (N,)."""
+    """Rays (N, 3) of a camera's pixels, their derivatives (N, 3, 2) by the pixels, and their validity (N,)."""
 
     rays: Rays
     jacobians: RayJacobians
@@ -283,8 +283,8 @@ class _SeenRays:
 
 
 def _distances(poses: Sequence[Rigid3], seen: Sequence[_SeenRays]) -> FloatArray:
-    """Return the Sampson distances (N,) px of matches of two cameras in `poses` cam_from_rig, NaN where one of them
-    does not see them."""
+    """Return the Sampson distances (N,) px of matches of two cameras with `poses` cam_from_rig, NaN outside the field
+    of view of one of them."""
     motion = poses[1] @ poses[0].inverse()
     essential = skew(motion.translation_mm) @ motion.rotation
     first, second = seen
@@ -297,6 +297,6 @@ def _motion(monitored: Monitored, first: int, second: int) -> Rigid3:
 
 
 def _parts(pixels: Pixels, size_px: tuple[int, int]) -> IntArray:
-    """Return the number of the part of the image in which each of `pixels` (N, 2) lies."""
+    """Return the index of the part of the image that contains each of `pixels` (N, 2)."""
     place = np.clip((pixels + 0.5) / np.array(size_px) * PARTS, 0, PARTS - 1).astype(np.int64)
     return np.asarray(place[:, 1] * PARTS + place[:, 0])

@@ -1,7 +1,7 @@
-"""What fresh views of boards say about a camera or a rig: information and score of everything calibrated.
+"""The evidence of fresh views of boards about a camera or a rig: information matrix and score of all parameters.
 
-theta are the intrinsics of all cameras, then the mounts of all but the first. Every board in every frame has a pose of
-its own, one for all cameras that see it then, and is eliminated; a change of theta by d leaves scores of mean I d.
+theta are the intrinsics of all cameras, then the mounts of all but the first. Every board in every frame has its own
+pose, common to all cameras that see it in the frame, and eliminated. A change d of theta gives scores of mean I d.
 """
 
 from __future__ import annotations
@@ -32,28 +32,28 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.information import MIN_SIGMA_PX, observations_of
 
 SAME_BOARD = 0.02
-"""A board of the calibration's name whose corners lie farther from where it found them than this part of its size is
-another one."""
+"""As a part of the board's size: a board whose stated corners differ by more from those of the calibration's board of
+the same name is another board."""
 POSE_ROUNDS = 3
-"""Gauss-Newton steps of a board that several cameras see: the best single view is where they start."""
+"""Gauss-Newton steps of a board that several cameras see, starting from the view with most corners."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Monitored:
-    """What is to be checked.
+    """The camera or rig to check.
 
     Attributes
     ----------
-    names, cameras, cam_from_rig : of one camera or of all of a rig, the first its frame: cameras of points in mm, a
-        `NearCamera` where the pupil moves. What a lens may do beyond its model is among the parameters of a camera
-        (`rigkit.calibration.certainty.displaced`), after those of the model and before those of the pupil.
+    names, cameras, cam_from_rig : of one camera or of all cameras of a rig, whose frame is that of the first. Cameras
+        take points in mm; a `NearCamera` has a moving pupil. The parameters of a camera are those of the model, then
+        those of the model's inadequacy (`rigkit.calibration.certainty.displaced`), then those of the pupil.
     covariance : (T, T) of theta.
-    sigma_px, overdispersion : of a corner, and by how much more images disagree than independent corners would.
-    scale_sigma : relative standard deviation of all lengths, from how well the boards' squares were measured; 0 where
-        nobody stated it.
+    sigma_px, overdispersion : standard deviation of a corner, and the factor by which images disagree more than
+        independent corners would.
+    scale_sigma : relative standard deviation of all lengths, from the tolerance of the boards' squares; 0 where not
+        stated.
     freedom : degrees of freedom of the covariance.
-    boards_mm : corners (N, 3) of boards, by name, as the calibration found them; others, and boards of another size
-        that have the name, are as stated.
+    boards_mm : corners (N, 3) of boards, by name, as calibrated; other boards, also of the same name, are as stated.
     """
 
     names: tuple[str, ...]
@@ -68,18 +68,18 @@ class Monitored:
 
     @property
     def fresh_sigma_px(self) -> float:
-        """What corners of fresh views count with: images disagree more than independent corners would. Images that
-        agree better would do so by chance."""
+        """Standard deviation of a corner in fresh views, overdispersion included. A factor below 1 is chance, and is
+        not used."""
         return max(self.sigma_px, MIN_SIGMA_PX) * max(self.overdispersion, 1.0)
 
     @property
     def layout(self) -> Layout:
-        """Where lenses and mounts stand in theta."""
+        """Indices of lenses and mounts in theta."""
         return Layout.of_cameras(self.cameras)
 
     @property
     def of_models(self) -> IntArray:
-        """Where in theta the parameters of the lenses' models and the mounts stand."""
+        """Indices in theta of the parameters of the lens models and of the mounts."""
         layout = self.layout
         others = np.zeros(layout.count, dtype=bool)
         for camera, own in zip(self.cameras, layout.cameras, strict=True):
@@ -87,7 +87,7 @@ class Monitored:
         return np.flatnonzero(~others)
 
     def state(self, c: int, observations: Observations, rotation: FloatArray, translation_mm: Points) -> State:
-        """Return camera `c` before boards in these poses, with the shapes that are known of them."""
+        """Return camera `c` with boards in these poses, in their calibrated shapes where known."""
         known = [self._shape(board) for board in observations.boards]
         start = State.start(self.cameras[c], rotation, translation_mm, observations)
         return replace(start, shape=replace(start.shape, flat=np.concatenate(known)))
@@ -115,7 +115,7 @@ class Monitored:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FreshView:
-    """A board that camera number `camera` saw in a frame: what all cameras of a rig see at one moment."""
+    """A board seen by the camera of index `camera` in a frame: all views of a rig at one moment."""
 
     frame: str
     camera: int
@@ -124,10 +124,10 @@ class FreshView:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class FreshEvidence:
-    """What N frames say: information (N, T, T) and score (N, T) in px^2, the variance (px^2) that each counts with
-    where nothing changed, and what the residuals are like: their rms over the `corners` kept, what it should be
-    (`expected_px`), and how many were `left_out`. The variance contains that images, or parts of them, disagree more
-    than independent corners would, by `overdispersion` (a ratio of standard deviations), known with `freedom`."""
+    """The evidence of N frames: information (N, T, T) and score (N, T) in px^2, the variance (px^2) of the scores
+    where nothing changed, the rms of the residuals of the `corners` kept, its expectation `expected_px`, and the number
+    of corners `left_out`. The variance includes the `overdispersion` (a ratio of standard deviations, with `freedom`
+    degrees of freedom) of images, or parts of them, relative to independent corners."""
 
     information: FloatArray
     score: FloatArray
@@ -141,9 +141,9 @@ class FreshEvidence:
 
 
 def evidence_of(monitored: Monitored, views: Sequence[FreshView]) -> FreshEvidence:
-    """Return what fresh views say of theta.
+    """Return the evidence of fresh views about theta.
 
-    Raises InputError without views, DegenerateError where no view has a pose.
+    Raises InputError without views, DegenerateError where the pose of a board cannot be found.
     """
     if not views:
         raise InputError("check: no board was found in the pictures; take sharp ones in which the whole board is seen")
@@ -151,7 +151,7 @@ def evidence_of(monitored: Monitored, views: Sequence[FreshView]) -> FreshEviden
     for _ in range(POSE_ROUNDS):
         products = found.products(monitored)
         n = monitored.layout.count
-        # Of a board nearly all of whose corners stray, too few are left for a pose: what they leave open stays.
+        # Where nearly all corners of a board are outliers, the pose is not determined: the pseudoinverse keeps it.
         inverse = np.linalg.pinv(products[:, n : n + 6, n : n + 6], hermitian=True)
         step = (inverse @ products[:, n : n + 6, -1:])[..., 0]
         found = found.moved(np.asarray(step, dtype=np.float64))
@@ -174,10 +174,10 @@ def evidence_of(monitored: Monitored, views: Sequence[FreshView]) -> FreshEviden
 def board_information(
     monitored: Monitored, board: Board, rotation: FloatArray, translation_mm: Points, seen: Sequence[BoolArray]
 ) -> FloatArray:
-    """Return what each of C frames would say of theta, (C, T, T) in px^2: information as `FreshEvidence` has it.
+    """Return the information about theta of each of C frames, (C, T, T) in px^2, as in `FreshEvidence`.
 
-    A frame is `board` in the pose rig_from_board, `rotation` (C, 3, 3) and `translation_mm` (C, 3); `seen` (C, N) are,
-    for each camera, the corners that it sees.
+    A frame is `board` in the pose rig_from_board, `rotation` (C, 3, 3) and `translation_mm` (C, 3); `seen` has the
+    corners that each camera sees, (C, N).
     """
     frames = np.arange(len(rotation))
     observations = tuple(observations_of(own, (board,)) for own in seen)
@@ -189,8 +189,8 @@ def board_information(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _PosedBoards:
-    """Boards in frames (G of them, each with a pose rig_from_board and the number of its frame), and per camera its
-    observations, which board each is of, and its weights without what is no corner."""
+    """G boards in frames, each with its pose rig_from_board and the index of its frame; for each camera its
+    observations, the index of the board of each, and the weights, 0 for outliers."""
 
     rotation: FloatArray
     translation_mm: FloatArray
@@ -230,15 +230,15 @@ class _PosedBoards:
         return cls(rotation, translation, frame, tuple(observations), tuple(groups), tuple(weights))
 
     def state(self, monitored: Monitored, c: int, observations: Observations) -> State:
-        """Return camera `c` before its boards, as their poses in the rig have them."""
+        """Return camera `c` with its boards, posed by their poses in the rig."""
         pose, group = monitored.cam_from_rig[c], self.group[c]
         rotation = pose.rotation @ self.rotation[group]
         translation = self.translation_mm[group] @ pose.rotation.T + pose.translation_mm
         return monitored.state(c, observations, rotation, translation)
 
     def products(self, monitored: Monitored) -> FloatArray:
-        """Return for each board in a frame the sums of the products of its rows, (G, T + 7, T + 7): derivatives by
-        theta and by its pose in the rig, and the residual."""
+        """Return for each board in a frame the sums of products of its rows, (G, T + 7, T + 7): derivatives by theta
+        and by its pose in the rig, and the residual."""
         layout, each = monitored.layout, []
         for c, (seen, pose, lens) in enumerate(
             zip(self.observations, monitored.cam_from_rig, layout.cameras, strict=True)
@@ -256,7 +256,7 @@ class _PosedBoards:
         return replace(self, rotation=rotation, translation_mm=self.translation_mm + step[:, 3:])
 
     def residual_squares(self, monitored: Monitored) -> tuple[float, int, int]:
-        """Return the sum of the squared residuals of the corners kept, px^2, how many these are, and how many not."""
+        """Return the sum of squared residuals of the inliers, px^2, the number of inliers, and of outliers."""
         total, kept, left = 0.0, 0, 0
         for c, seen in enumerate(self.observations):
             if seen is not None:
@@ -267,8 +267,8 @@ class _PosedBoards:
 
 
 def _posed(monitored: Monitored, c: int, observations: Observations) -> tuple[State, FloatArray]:
-    """Return every board where its own view by camera `c` puts it, and the weights of its corners, zero for those that
-    stray."""
+    """Return every board in the pose that fits its view by camera `c` best, and the weights of its corners, zero for
+    outliers."""
     camera, poses = monitored.cameras[c], []
     for view in observations.views:
         try:

@@ -1,7 +1,7 @@
-"""Fresh pictures that a program turned or mirrored: the calibration holds for them once they are put back.
+"""Detection of fresh images that some program rotated or mirrored: the calibration holds once the flip is undone.
 
-Else they say that the principal point moved to the other side of the image's middle, which no glass does, or of a rig
-that nothing explains them.
+Otherwise such images would mean that the principal point moved to the other side of the image centre, which no lens
+does, or, for a rig, would have no explanation.
 """
 
 from __future__ import annotations
@@ -23,19 +23,18 @@ FLIP_SIGNS = {
     "mirrored left to right": (-1.0, 1.0),
     "mirrored top to bottom": (1.0, -1.0),
 }
-"""What may be done to a picture, and the signs of its axes then."""
+"""The flips of an image, and the signs of its axes after each."""
 MIN_SHARE_FLIPPED = 0.01
-"""Of the longer side: a flip moves the principal point by more, or a knock may as well have moved the glass. REAL
-lenses lie off the middle by 0.1 to 3.5 % (camodocal-fisheye, bouguet-stereo), and a flip doubles that."""
+"""Smallest displacement of the principal point by a flip, of the longer side: a knock could cause a smaller one. REAL
+lenses are 0.1 to 3.5 % off centre (camodocal-fisheye, bouguet-stereo), and a flip doubles that."""
 
 
 def flipped_pictures(monitored: Monitored, views: Sequence[FreshView]) -> str:
-    """Return how pictures must have been flipped, of a rig those of which camera or of all, where they fit once they
-    are put back: several ways in words where they look the same. "" where none does, and where the flip is too small to
-    tell."""
+    """Return in words how the images must have been flipped, for a rig also of which camera, if they fit after undoing
+    it; joined by "or" where several flips fit alike. "" where none fits, or the flip is too small to detect."""
     count = len(monitored.cameras)
     if count > 1:
-        # To a board one camera in a mirror is the other one in a mirror, where the rig looks the same in it.
+        # For a symmetric rig, mirroring the images of one camera is equivalent to mirroring those of the other.
         one = [
             f"those of '{name}' {flip}"
             for c, name in enumerate(monitored.names)
@@ -47,16 +46,16 @@ def flipped_pictures(monitored: Monitored, views: Sequence[FreshView]) -> str:
 
 
 def _fitting_flips(monitored: Monitored, views: Sequence[FreshView], which: tuple[int, ...]) -> list[str]:
-    """Return in how many ways the pictures of some cameras fit once they are put back, in words."""
+    """Return the flips after undoing which the images of some cameras fit, in words."""
     cameras = [monitored.cameras[c] for c in which]
-    # A board that another camera sees, too, stands elsewhere in a flipped picture: that is no knock.
+    # With another camera that sees the same board, a flip cannot be confused with a knock: the board's poses differ.
     whose = {frame: {v.camera for v in views if v.frame == frame} for frame in {v.frame for v in views}}
     together = any(len(seen) > 1 and not seen.isdisjoint(which) for seen in whose.values())
     fit = []
     for words, signs in FLIP_SIGNS.items():
         if not together and max(_moved(camera, signs) for camera in cameras) < MIN_SHARE_FLIPPED:
             continue
-        # In a mirror a board's columns or its rows are counted backwards, as the colours of its ends have it.
+        # The colours of a mirrored board's ends make its columns or its rows count backwards.
         flips = (0, 1) if np.prod(signs) < 0.0 else (None,)
         if any(_fits(monitored, _all_put_back(monitored, views, which, signs, flip)) for flip in flips):
             fit.append(words)
@@ -64,7 +63,7 @@ def _fitting_flips(monitored: Monitored, views: Sequence[FreshView], which: tupl
 
 
 def _moved(camera: Camera, signs: tuple[float, float]) -> float:
-    """Return how far a flip moves the principal point, as a share of the longer side."""
+    """Return the displacement of the principal point by a flip, as a part of the longer side."""
     off = np.array(camera.size_px) - 1.0 - 2.0 * camera.axis_px
     return float(np.linalg.norm(np.where(np.array(signs) < 0.0, off, 0.0))) / max(camera.size_px)
 
@@ -76,7 +75,7 @@ def _all_put_back(
     signs: tuple[float, float],
     backwards: int | None,
 ) -> list[FreshView]:
-    """Return all views, those of some cameras put back; these count boards that look alike turned as the others do."""
+    """Return all views with the flip of some cameras undone; their boards are numbered as other cameras number them."""
     out = [view for view in views if view.camera not in which]
     for view in views:
         if view.camera in which:
@@ -86,7 +85,7 @@ def _all_put_back(
 
 
 def counted_alike(monitored: Monitored, fresh: FreshView, before: Sequence[FreshView]) -> FreshView:
-    """Return a view of a board that looks the same turned, numbered from the end from which another camera did."""
+    """Return a view of a rotationally symmetric board, numbered from the same end as by another camera."""
     view, c = fresh.view, fresh.camera
     name = view.board.board_id
     same = [v for v in before if v.frame == fresh.frame and v.view.board.board_id == name and v.camera != c]
@@ -115,7 +114,7 @@ def _fits(monitored: Monitored, views: Sequence[FreshView]) -> bool:
 
 
 def _put_back(one: FreshView, signs: tuple[float, float], size_px: tuple[int, int], backwards: int | None) -> FreshView:
-    """Return a view as it was before its picture was flipped, with its columns (0) or rows (1) counted backwards."""
+    """Return a view with its flip undone, its columns (0) or rows (1) counted backwards."""
     view = one.view
     pixels = np.where(np.array(signs) < 0.0, np.array(size_px) - 1.0 - view.pixels, view.pixels)
     grid = view.grid.copy()

@@ -1,4 +1,4 @@
-"""Frames that could be taken of a camera or of all cameras of a rig at once, and what they would say."""
+"""Candidate frames of a camera, or of all cameras of a rig at once, and their expected information."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from rigkit.validation.sentinel.evidence import Monitored, board_information
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Frames:
-    """C frames that could be taken.
+    """C candidate frames.
 
     Attributes
     ----------
     rotation, translation_mm : (C, 3, 3) and (C, 3), of rig_from_board.
-    board : (C,) its number.
-    seen : (C, cameras) which see all of it.
-    owner : (C,) the camera for which the frame was thought of.
-    information : (C, T, T) px^2, what it says of theta.
+    board : (C,) index of the board.
+    seen : (C, cameras) whether the camera sees the whole board.
+    owner : (C,) index of the camera for which the frame was generated.
+    information : (C, T, T) px^2, about theta.
     """
 
     rotation: FloatArray
@@ -56,7 +56,7 @@ class Frames:
 
     @classmethod
     def _before(cls, monitored: Monitored, c: int, board: Board, number: int, reach: Reach) -> Frames:
-        """Return frames in which camera `c` sees the board; they are spread evenly, and so are the first of them."""
+        """Return frames in which camera `c` sees the board, spread evenly, as is every leading part of them."""
         held = held_boards(monitored.cameras[c], board, reach)
         held = held.chosen(np.arange(min(len(held), -(-CANDIDATES_KEPT // len(monitored.cameras)))))
         in_rig = held.transformed(monitored.cam_from_rig[c].inverse())
@@ -74,8 +74,7 @@ class Frames:
         return cls(in_rig.rotation, in_rig.translation_mm, number * count, seen, c * count, gained)
 
     def plan(self, monitored: Monitored, boards: Sequence[Board], goal: Goal, count: int) -> Plan:
-        """Return the `count` frames that would lower the goal's error most. Images are taken to disagree as those of
-        the calibration do."""
+        """Return the `count` frames that lower the goal's error most, with the overdispersion of the calibration."""
         inverse, sigma = covariance_of(monitored.covariance), monitored.fresh_sigma_px
         taken, errors = choose_views(inverse, self.information / sigma**2, goal, count)
         known = Knowledge(monitored.cameras[0], inverse, CornerError(sigma))
@@ -85,7 +84,7 @@ class Frames:
     def proposals(
         self, monitored: Monitored, boards: Sequence[Board], taken: Sequence[int], errors: Sequence[float]
     ) -> tuple[Proposal, ...]:
-        """Return some, and the errors after them, as views of the cameras for which they were thought of."""
+        """Return the frames of indices `taken`, with the `errors` after them, as views of their owners."""
         return tuple(
             self._proposal(k, monitored, boards[self.board[k]], error) for k, error in zip(taken, errors, strict=True)
         )

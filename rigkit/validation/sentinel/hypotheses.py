@@ -1,4 +1,4 @@
-"""What may have happened to a camera or a rig, each as directions in which everything calibrated would change."""
+"""Hypotheses on what happened to a camera or a rig, each as directions of change in the parameters theta."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ FIT_RANK = 1e-9
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Hypothesis:
-    """Something that may have happened.
+    """A possible change of a camera or a rig.
 
     Attributes
     ----------
     kind : "focus", "principal point", "distortion", "rotation", "shift", "moved" (both), "lens" or "scale".
-    camera : name of the camera that it happened to; None for all of the rig.
+    camera : name of the changed camera; None for the whole rig.
     directions : (T, m) of theta.
     units : of the m amounts.
     """
@@ -39,7 +39,7 @@ class Hypothesis:
 
     @property
     def words(self) -> str:
-        """What happened, in words."""
+        """The change as a clause."""
         texts = {
             "focus": "the focus of {} changed",
             "principal point": "the principal point of {} moved",
@@ -54,7 +54,7 @@ class Hypothesis:
 
 
 def hypotheses_of(monitored: Monitored) -> list[Hypothesis]:
-    """Return what may have happened, the simplest first."""
+    """Return all hypotheses, those with the fewest amounts first."""
     several = len(monitored.cameras) > 1
     layout, lenses, mounts = monitored.layout, [], []
     for c, (name, camera) in enumerate(zip(monitored.names, monitored.cameras, strict=True)):
@@ -83,8 +83,8 @@ def hypotheses_of(monitored: Monitored) -> list[Hypothesis]:
 
 
 def lens_goals(monitored: Monitored) -> list[Goal]:
-    """Return for each camera the rms change of its projection of what is far away, after the best rotation, over its
-    image."""
+    """Return for each camera the rms change of its projection of distant points over its image, after the best
+    rotation."""
     out, layout = [], monitored.layout
     for camera, run in zip(monitored.cameras, layout.cameras, strict=True):
         far = far_camera(camera)
@@ -96,8 +96,8 @@ def lens_goals(monitored: Monitored) -> list[Goal]:
 
 
 def turn_weight(camera: Camera) -> FloatArray:
-    """Return W (3, 3): w^T W w is the mean square over the image, px^2, of how far a camera's turn w (rad) moves what
-    is far away."""
+    """Return W (3, 3) such that w^T W w is the mean square displacement over the image, px^2, of distant points by a
+    rotation w (rad) of the camera."""
     camera = far_camera(camera)
     rays, valid = camera.unproject(grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2))
     by_turn = projection_design(camera, rays[valid])[:, camera.parameters.size :]
@@ -105,9 +105,9 @@ def turn_weight(camera: Camera) -> FloatArray:
 
 
 def _lens_directions(camera: Camera) -> FloatArray:
-    """Return the changes of the parameters (P, 6) that scale the image by a hundredth, move it by a pixel right and
-    down, and bend it by a pixel at its rim with the third, fifth and seventh power of the radius. They do so as nearly
-    as the model can, whatever the lens may do beyond it."""
+    """Return the changes of the parameters (P, 6) that best approximate: scaling the image by 1 %, moving it by a
+    pixel right and down, and distorting it by a pixel at its rim with the third, fifth and seventh power of the radius.
+    Parameters of the model's inadequacy are not used."""
     out = np.zeros((camera.parameters.size, 6))
     camera = lens_of(far_camera(camera))
     pixels = grid_pixels(camera.size_px, FIELD_GRID).reshape(-1, 2)
@@ -136,19 +136,19 @@ def _lens_directions(camera: Camera) -> FloatArray:
 
 
 def _mount_directions(monitored: Monitored, c: int) -> FloatArray:
-    """Return the change of theta (T, 6) where camera `c` turns by a degree about its own axes or is shifted by a
-    millimetre along them: x in it becomes exp(w) x + v."""
+    """Return the change of theta (T, 6) when camera `c` turns by a degree about its own axes or shifts by a millimetre
+    along them: a point x in it becomes exp(w) x + v."""
     layout, degree = monitored.layout, np.radians(1.0)
     out = np.zeros((layout.count, 6))
     if c > 0:
-        # exp(w) (R x + t) + v: the turn swings t, too.
+        # exp(w) (R x + t) + v: the rotation affects t, too.
         pose = monitored.cam_from_rig[c]
         run = layout.mount(c)
         out[run.start : run.start + 3, :3] = degree * np.eye(3)
         out[run.start + 3 : run.stop, :3] = -degree * skew(pose.translation_mm)
         out[run.start + 3 : run.stop, 3:] = np.eye(3)
         return out
-    # The first is the frame: when it moves, all others move the other way.
+    # The first camera is the frame: its motion moves all others inversely.
     for k, pose in enumerate(monitored.cam_from_rig[1:], start=1):
         run = layout.mount(k)
         out[run.start : run.start + 3, :3] = -degree * pose.rotation

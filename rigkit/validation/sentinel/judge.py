@@ -1,10 +1,10 @@
-"""Whether a calibration still holds, and else what changed: fresh frames against its covariance.
+"""Whether a calibration still holds, and otherwise what changed: a test of fresh frames against its covariance.
 
-Scores of frames have, where nothing changed, the covariance A + A C A in units of the frames' own scatter, with A their
-information and C the covariance of theta: the frames scatter, and the calibration was a little off from the start. With
-A = L L^T, w = L^+ score has the covariance I + L^T C L, and a change theta += D a moves it by L^T D a. Every hypothesis
-D is fitted alone; the simplest that explains enough is named (Schwarz's criterion), and the chance that unchanged
-cameras show as much of any hypothesis is that of the smallest chance of F-tests, drawn or by Bonferroni's bound.
+Where nothing changed, the scores of frames have the covariance A + A C A, A their information over their variance and
+C the covariance of theta: the noise of the frames, and the error of the calibration. With A = L L^T, w = L^+ score has
+the covariance I + L^T C L, and a change theta += D a moves it by L^T D a. Every hypothesis D is fitted on its own. The
+simplest that explains enough is reported (Schwarz's criterion, BIC). The p-value is the probability that, for unchanged
+cameras, the smallest p-value of all hypotheses' F-tests is as small: by simulation or by Bonferroni's bound.
 """
 
 from __future__ import annotations
@@ -26,42 +26,42 @@ from rigkit.validation.sentinel.power import Power, powers_of
 from rigkit.validation.sentinel.whitened import NULL_RANK, Whitened
 
 Look: TypeAlias = Callable[[Monitored], FreshEvidence]
-"""What fresh frames say, given cameras and mounts."""
+"""The evidence of fresh frames as a function of cameras and mounts."""
 
 ALARM_CHANCE = 0.01
-"""Fresh pictures that unchanged cameras would show more rarely raise an alarm."""
+"""p-values below raise an alarm."""
 ALARM_PX = 0.07
-"""What moves the projection by less is of no importance, however surely it is there."""
+"""Changes that move the projection by less raise no alarm, however significant."""
 FIX_ROUNDS = 3
-"""Times that a change is linearised anew where it was found."""
+"""Further Gauss-Newton iterations of a change."""
 MAX_OF_EXPECTED = 3.0
-"""Corners that scatter so many times as much as expected after every explanation are explained by none."""
+"""Where residuals after every explanation exceed the expected ones by this factor, nothing explains them."""
 MAX_SIGMA = 100.0
-"""Percent, pixels, degrees, millimetres: what is known no better is not seen at all."""
+"""Percent, pixels, degrees, millimetres: amounts with larger standard deviations are not observable."""
 RARE = {"lens": 6.0, "moved": 6.0}
-"""Twice the log odds against several things at once: one time in twenty."""
+"""Twice the log of the prior odds against several changes at once: one in twenty."""
 RARE_IN_RIGS = {"principal point": 6.0}
-"""Mounts turn, by what looks nearly the same, much more often than the glass moves in its barrel."""
+"""Rotations of mounts look nearly the same, and are much more frequent than shifts of the principal point."""
 AS_MUCH = 0.9
-"""Of what the likeliest hypothesis explains, by derivatives where nothing changed: of a large change these are off by a
-few per cent (a board with squares of 20 mm for 25: 0.7), and a simpler hypothesis that explains as much is held against
-it at the end of its own change."""
+"""As a part of the gain of the best hypothesis, linearised where nothing changed. For large changes such gains are
+wrong by a few per cent (a board with squares of 20 mm for 25: 0.7), so a simpler hypothesis with at least this part is
+compared by its residuals after its own change."""
 DRAWS, FEW_DRAWS = 4000, 8
-"""Of what unchanged cameras show; fewer than so many tell no chance."""
+"""Simulated tests of unchanged cameras; fewer exceedances than FEW_DRAWS give no reliable p-value."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Change:
-    """A hypothesis with the amounts that explain the frames best.
+    """A hypothesis with the amounts that fit the frames best.
 
     Attributes
     ----------
     hypothesis : what changed.
     amounts, covariance : (K,) and (K, K), in `hypothesis.units`.
-    chance : probability that unchanged cameras show as much of it.
-    size_px : how far it moves the projection, rms after the best rotation; of a mount, how far what it shows moves.
-    max_px : the same with how unsure it is: what may be large is not small because it is told badly.
-    gain : by how much it lowers the sum of squares.
+    chance : p-value, from the F-test of this hypothesis.
+    size_px : rms displacement of the projection after the best rotation; for a mount, of the points it shows.
+    max_px : the same including the uncertainty of the amounts, so that a poorly known change is not taken as small.
+    gain : reduction of the sum of squares.
     """
 
     hypothesis: Hypothesis
@@ -79,7 +79,7 @@ class Change:
 
     def __str__(self) -> str:
         if self.hypothesis.kind == "lens":
-            # Its amounts make up for each other: each by itself would say far more than happened.
+            # Its amounts are correlated and compensate each other: single ones would overstate the change.
             return f"{self.hypothesis.words}: by {self.size_px:.2g} px rms in all"
         values = ", ".join(
             f"{a:+.3g} +- {s:.2g} {unit}"
@@ -90,13 +90,13 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
-    """What frames of the time when a calibration was trusted say of it.
+    """The test of a calibration with frames from the time when it was trusted.
 
     Attributes
     ----------
-    frames : how many there were.
-    rms_px, rms_corrected_px : how far their points lie from where it has them, as it is and once it is corrected.
-    chance : probability that a calibration as sure as it says is off by so much.
+    frames : number of frames.
+    rms_px, rms_corrected_px : of the residuals before and after the correction.
+    chance : p-value of errors of this size, given the covariance of the calibration.
     """
 
     frames: int
@@ -107,23 +107,23 @@ class Baseline:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class SentinelCheck:
-    """The verdict on fresh pictures.
+    """The verdict on fresh images.
 
     Attributes
     ----------
-    chance : probability that an unchanged camera or rig shows at least as much.
-    change : what explains the pictures best, alarming or not; None where no hypothesis can be told.
+    chance : p-value, the probability that an unchanged camera or rig shows at least as much.
+    change : the best explanation of the images, significant or not; None where no hypothesis is observable.
     monitored, fixed : as calibrated, and after `change`.
-    step, covariance : change of theta (T,), and its covariance (T, T).
+    step, covariance : change of theta (T,), and covariance of the changed theta (T, T).
     rms_px, rms_fixed_px : of the fresh corners before and after.
-    expected_px : rms that corners of unchanged cameras show, with what the calibration leaves open.
-    frames, corners : how many there were.
-    tried : every hypothesis by itself, the simplest first.
-    powers : how well changes of lenses and turns of mounts would have been seen; what is missing was not seen at all.
-    cost : error that the change makes in the user's measurement (rms over the image), in `cost_unit`.
-    flipped : how the pictures must have been flipped if nothing changed (`flipped_pictures`); "" where that is no
-        explanation, or was not asked.
-    baseline : what was wrong before; `monitored` is without it. None where fresh frames are held against the file.
+    expected_px : expected rms for unchanged cameras, uncertainty of the calibration included.
+    frames, corners : numbers of both.
+    tried : every hypothesis on its own, the simplest first.
+    powers : power of the test for changes of lenses and rotations of mounts; those missing are not observable.
+    cost : error that the change causes in the user's measurement (rms over the image), in `cost_unit`.
+    flipped : how the images must have been flipped if nothing changed (`flipped_pictures`); "" where that is no
+        explanation, or was not tested.
+    baseline : the correction from earlier frames, included in `monitored`; None without such frames.
     """
 
     chance: float
@@ -146,25 +146,25 @@ class SentinelCheck:
 
     @property
     def unexplained(self) -> bool:
-        """Nothing that may happen to these cameras explains the pictures: another camera, or another board."""
+        """Whether no hypothesis explains the images: another camera, or another board."""
         return exceeds_expected(self.rms_fixed_px, self.expected_px)
 
     @property
     def holds(self) -> bool:
-        """Nothing says that the calibration does not hold."""
+        """Whether there is no evidence against the calibration."""
         if self.unexplained:
             return False
         return self.change is None or self.chance >= ALARM_CHANCE or self.change.max_px < ALARM_PX
 
 
 def exceeds_expected(rms_px: float, expected_px: float) -> bool:
-    """Say whether residuals are beyond all that is expected; those that are no numbers are."""
+    """Say whether residuals are larger than expected; NaN counts as larger."""
     return not rms_px <= max(MAX_OF_EXPECTED * expected_px, ALARM_PX)
 
 
 def check_views(monitored: Monitored, views: Sequence[FreshView], cost: Sequence[Goal] = ()) -> SentinelCheck:
-    """Return whether fresh views of boards agree with what is `monitored`; `cost` weighs a change of theta by what it
-    does to a measurement (the worst of several), by default to the projection.
+    """Return whether fresh views of boards agree with the `monitored` calibration. `cost` are quadratic forms of a
+    change of theta: its effect on measurements (the largest is stated), by default on the projection.
 
     Raises as `evidence_of`.
     """
@@ -172,14 +172,14 @@ def check_views(monitored: Monitored, views: Sequence[FreshView], cost: Sequence
 
 
 def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
-    """Return the verdict on what `look` finds in fresh frames."""
+    """Return the verdict on the evidence of fresh frames, `look`."""
     evidence = look(monitored)
     expected_px, known, chance = unchanged_px(monitored, evidence), list[Change](), 1.0
     try:
         whitened = Whitened.of(monitored, evidence)
         known = [c for c in (_fitted(whitened, hypothesis) for hypothesis in hypotheses_of(monitored)) if c is not None]
     except DegenerateError:
-        # Pictures of something else are far from all that can be linearised: that is the verdict.
+        # Images of something else are beyond any linearisation: the calibration does not hold for them.
         if not exceeds_expected(evidence.rms_px, expected_px):
             raise
         chance = 0.0
@@ -226,18 +226,18 @@ def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = (
 
 
 def unchanged_px(monitored: Monitored, evidence: FreshEvidence) -> float:
-    """Return the rms that corners of unchanged cameras show: their scatter, and what the calibration leaves open."""
+    """Return the rms residual expected for unchanged cameras: noise, and uncertainty of the calibration."""
     shown = evidence.information.sum(axis=0) / evidence.corners
-    # Pictures of something else may be too far off for any derivative: they say nothing of that.
+    # Images of something else may be too far off for any derivative: only the noise is then counted.
     with np.errstate(over="ignore", invalid="ignore"):
         left_open = float((shown * monitored.covariance).sum())
     return float(np.sqrt(evidence.expected_px**2 + (max(left_open, 0.0) if np.isfinite(left_open) else 0.0)))
 
 
 def _chance_of_any(whitened: Whitened, known: Sequence[Change]) -> float:
-    """Return the probability that unchanged cameras show as much of any hypothesis as they show of the likeliest.
-    Hypotheses overlap, so that it is less than the sum of their chances: drawn, as long as draws tell; else
-    Bonferroni's bound."""
+    """Return the probability that unchanged cameras give a p-value as small as the smallest of these, for any
+    hypothesis. Hypotheses overlap, so it is below the sum of their p-values: simulated where enough draws exceed it,
+    else Bonferroni's bound."""
     best = min(c.chance for c in known)
     bound = min(1.0, len(known) * best)
     if bound < FEW_DRAWS / DRAWS:
@@ -257,7 +257,7 @@ def _chance_of_any(whitened: Whitened, known: Sequence[Change]) -> float:
 
 
 def _evident(change: Change, penalty: float) -> float:
-    """Return twice the log odds of a hypothesis: what it explains, less what its numbers and its rarity cost."""
+    """Return twice the log odds of a hypothesis: its gain, less the costs of its parameters and of its prior odds."""
     return change.gain - _cost(change, penalty)
 
 
@@ -268,8 +268,8 @@ def _cost(change: Change, penalty: float) -> float:
 
 
 def _refined(monitored: Monitored, look: Look, change: Change) -> tuple[FloatArray, Monitored, FreshEvidence]:
-    """Return the amounts of a change, what is watched after it, and what the frames say then: linearised anew there, as
-    long as that is possible."""
+    """Return the amounts of a change, the calibration after it, and the evidence of the frames there, after further
+    Gauss-Newton iterations while these lower the residuals."""
     amounts = change.amounts
     fixed = monitored.changed(change.hypothesis.directions @ amounts)
     after = look(fixed)
@@ -283,7 +283,7 @@ def _refined(monitored: Monitored, look: Look, change: Change) -> tuple[FloatArr
         closer = monitored.changed(change.hypothesis.directions @ (amounts + again.amounts))
         try:
             then = look(closer)
-        except DegenerateError:  # A step so wide that the lens sees nothing any more.
+        except DegenerateError:  # The step is so large that no point is in the field of view.
             break
         if then.rms_px > after.rms_px:
             break
@@ -292,7 +292,7 @@ def _refined(monitored: Monitored, look: Look, change: Change) -> tuple[FloatArr
 
 
 def _fitted(whitened: Whitened, hypothesis: Hypothesis) -> Change | None:
-    """Return what a hypothesis would have to be; None where the frames do not show it."""
+    """Return the best fit of a hypothesis; None where it is not observable."""
     by_amount = whitened.by_theta @ hypothesis.directions
     weighed = np.linalg.solve(whitened.covariance, np.column_stack([by_amount, whitened.score]))
     normal, right = by_amount.T @ weighed[:, :-1], by_amount.T @ weighed[:, -1]
@@ -314,10 +314,10 @@ def _fitted(whitened: Whitened, hypothesis: Hypothesis) -> Change | None:
 def _sizes_px(
     monitored: Monitored, evidence: FreshEvidence, step: FloatArray, unsure: FloatArray
 ) -> tuple[float, float]:
-    """Return how large a change of theta (T,) is, whose estimate has the covariance `unsure`. It is the largest of:
-    over the image of the camera that suffers most, after the best rotation; how far a camera that turned on its mount
-    sees what is far away move; what the corners show of it. The square of an estimate is too large by its variance,
-    which is taken off; and the same where it is not."""
+    """Return the size of a change of theta (T,) whose estimate has the covariance `unsure`, and an upper bound. The
+    size is the largest rms displacement of: the projection of any one camera, after the best rotation; distant points
+    seen by any one camera that turned on its mount; the corners. The square of an estimate is biased by its variance,
+    which is subtracted for the size, but not for the bound."""
     shown = evidence.information.sum(axis=0) / evidence.corners
     turns = [_turn_weight(monitored, c) for c in range(1, len(monitored.cameras))]
     weights = [shown, *(goal.weight for goal in lens_goals(monitored)), *turns]
@@ -326,7 +326,7 @@ def _sizes_px(
 
 
 def _turn_weight(monitored: Monitored, c: int) -> FloatArray:
-    """Return what a turn of camera `c` in a change of theta moves, (T, T): see `turn_weight`."""
+    """Return the quadratic form (T, T) of `turn_weight` for camera `c` in a change of theta."""
     layout = monitored.layout
     turn = layout.mount(c).start
     out = np.zeros((layout.count, layout.count))

@@ -1,9 +1,9 @@
-"""What fresh frames would have found: the chance that a change raises the alarm, and how many frames it takes.
+"""The power of a check: the probability that a change raises the alarm, and the number of frames that it needs.
 
-A change a of a hypothesis adds a^T N a, N its normal matrix in whitened scores, to the mean of the statistic: F becomes
-the noncentral F distribution. The limit is that of one of all hypotheses tried (Bonferroni), and a change is looked for
-by its own hypothesis only: the chances stated are rather too small. The covariance of the calibration does not shrink
-with the fresh frames: where no number of them is enough, the calibration is what is not sure.
+Amounts a of a hypothesis with the normal matrix N in whitened scores give the F statistic the noncentrality a^T N a.
+The critical value is that for one of all hypotheses tested (Bonferroni), and only the hypothesis of the change itself
+is counted: the stated power is a lower estimate. More fresh frames do not reduce the covariance of the calibration:
+where no number of them is enough, the calibration is too uncertain.
 
 Reference: G. A. F. Seber, A. J. Lee, "Linear Regression Analysis" (2003), section 4.3.
 """
@@ -23,31 +23,31 @@ from rigkit.validation.sentinel.whitened import NULL_RANK, Whitened
 
 LENS_KINDS = ("focus", "principal point", "distortion")
 CHANGED_PX, TURNED_DEG = 0.15, 0.02
-"""Changes of which the chance is told: of a lens, rms over the image after the best rotation; of a mount."""
+"""Changes of which the power is stated: of a lens, rms over the image after the best rotation; of a mount."""
 FOUND = 0.9
-"""A change that is found so often is said to be found."""
+"""Power from which a change counts as detectable."""
 TIMES = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
-"""Frames like these that are thought of: so many times as many."""
+"""Multiples of the number of frames that are tried."""
 SIZE_PARTS = np.geomspace(1e-2, 1e2, 33)
-"""Sizes that are looked at, as parts of the one told of."""
+"""Sizes at which the power is computed, as multiples of the stated size."""
 MAX_NONCENTRALITY = 1e5
-"""With it everything is found."""
+"""Beyond it the power is 1."""
 QUANTILES = (np.arange(16) + 0.5) / 16
-"""Of what the variance may be, given how well it is known."""
+"""Of the distribution of the true variance, given its degrees of freedom."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Power:
-    """How well a change would have been seen.
+    """How well a check detects a change.
 
     Attributes
     ----------
     kind, camera : of the hypothesis.
-    size, unit : a change of this size (px rms over the image, or degrees of a mount)
-    chance : is found with this probability, in a direction as any other.
-    found_from : the size that is found nine times in ten; infinite where these frames do not show it.
-    frames : like these that find `size` nine times in ten; None where no number does: the calibration is not sure.
-    both : so many times as many frames, in the calibration as in the check, find it; None where that is not enough.
+    size, unit : size of the change (px rms over the image, or degrees of a mount).
+    chance : probability that it is detected, averaged over directions.
+    found_from : the size detected with probability 0.9; infinite where these frames do not show it.
+    frames : number of such frames that detect `size` with probability 0.9; None where the calibration is too uncertain.
+    both : multiple of the frames, in the calibration as in the check, that detects it; None where not enough.
     """
 
     kind: str
@@ -63,8 +63,8 @@ class Power:
 def powers_of(
     monitored: Monitored, evidence: FreshEvidence, hypotheses: Iterable[Hypothesis], alarm_chance: float
 ) -> tuple[Power, ...]:
-    """Return how well changes of each lens, and turns of mounts, would have been seen by frames like these, where a
-    chance below `alarm_chance` of any of the hypotheses is an alarm."""
+    """Return the power of a check with frames like these for changes of each lens and rotations of mounts, where the
+    alarm level `alarm_chance` is that of all hypotheses together."""
     hypotheses = list(hypotheses)
     several = [Whitened.of(monitored, _repeated(evidence, times)) for times in TIMES]
     more_precise = [
@@ -115,8 +115,8 @@ def _repeated(evidence: FreshEvidence, times: int) -> FreshEvidence:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Shown:
-    """Noncentrality of a change of unit size along each axis on which it moves anything, how many `amounts` it has, and
-    the limits (K,) of chi-squared for what the variance may be."""
+    """Noncentrality of a change of unit size along each observable axis, the number of `amounts`, and the critical
+    values (K,) of chi-squared for the quantiles of the variance."""
 
     by_axis: FloatArray
     amounts: int
@@ -132,21 +132,21 @@ class _Shown:
         by_axis = np.maximum(np.linalg.eigvalsh(root.T @ normal @ root), 0.0)
         m = len(metric)
         limit = m * fdtri(m, whitened.freedom, 1.0 - alarm_chance)
-        # Of chi-squared with these degrees of freedom; scipy.stats has it too, but takes a second to import.
+        # Quantiles of chi-squared with these degrees of freedom; importing scipy.stats would take a second.
         chi2 = 2.0 * gammaincinv(0.5 * whitened.freedom, QUANTILES)
         return cls(by_axis, m, limit * chi2 / whitened.freedom)
 
     def chance(self, size: FloatArray) -> FloatArray:
-        """Return how often changes of `size` (K,) are found, the mean over their axes, (K,)."""
+        """Return the probability that changes of `size` (K,) are detected, averaged over their axes, (K,)."""
         noncentrality = np.minimum(self.by_axis * np.square(size)[:, None], MAX_NONCENTRALITY)
         return np.asarray(1.0 - chndtr(self.limits, self.amounts, noncentrality[..., None]).mean(axis=(1, 2)))
 
     def finds(self, size: float) -> bool:
-        """Say whether a change of `size` is found often enough."""
+        """Say whether a change of `size` is detectable."""
         return bool(self.chance(np.array([size]))[0] >= FOUND)
 
     def found_from(self, size: float) -> float:
-        """Return the size that is found often enough, to be looked for around `size`; infinite where none is."""
+        """Return the smallest detectable size, searched around `size`; infinite where there is none."""
         found = self.chance(size * SIZE_PARTS)
         if found[-1] < FOUND:
             return float("inf")

@@ -1,4 +1,4 @@
-"""Calibrations as what is watched."""
+"""Calibrations of cameras and rigs as `Monitored`."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from rigkit.validation.sentinel.evidence import Monitored
 
 
 def monitored_camera(calibration: Calibration, name: str, *, beyond_model: bool = True) -> Monitored:
-    """Return a camera as it was calibrated, by default with what its lens may do beyond its model; its pupil, where
-    that moves, is as unsure as it was solved for."""
+    """Return a calibrated camera, by default with the inadequacy of its model among its parameters; a moving pupil has
+    its covariance from the solution."""
     known = (
         uncertain_camera(calibration, quoted=False, near=True)
         if beyond_model
@@ -39,7 +39,7 @@ def monitored_camera(calibration: Calibration, name: str, *, beyond_model: bool 
 
 
 def monitored_rig(rig: RigCalibration) -> Monitored:
-    """Return a rig as it was calibrated, with what its lenses may do beyond their models."""
+    """Return a calibrated rig, with the inadequacies of its models among the parameters."""
     cameras, covariance = rig.with_departures
     central = Monitored(
         names=tuple(c.name for c in rig.cameras),
@@ -55,10 +55,10 @@ def monitored_rig(rig: RigCalibration) -> Monitored:
 
 
 def with_pupils(central: Monitored, pupils: Mapping[str, SolvedPupil]) -> Monitored:
-    """Return cameras with the pupils, by name, that move, and the covariance of all their parameters.
+    """Return cameras with their moving pupils, by name, and the covariance of all parameters.
 
-    A pupil e follows lenses and mounts x as their covariance has it, e = W x + rest; the rests of two pupils are taken
-    to be independent.
+    A pupil e depends on the lenses and mounts x by their joint covariance, e = W x + rest; the rests of two pupils are
+    assumed independent.
     """
     if not pupils:
         return central
@@ -82,8 +82,8 @@ def with_pupils(central: Monitored, pupils: Mapping[str, SolvedPupil]) -> Monito
 
 
 def _blocks(parts: list[FloatArray]) -> FloatArray:
-    """Return a matrix with the parts along its diagonal."""
-    # Imported here: scipy.linalg is slow to import, and few lenses ask.
+    """Return the block-diagonal matrix of the parts."""
+    # Imported here: scipy.linalg is slow to import, and few lenses need it.
     from scipy.linalg import block_diag
 
     return np.asarray(block_diag(*parts))

@@ -1,8 +1,8 @@
-"""Scores of fresh frames in units of their own scatter, and what unchanged cameras would show.
+"""Whitened scores of fresh frames, and their covariance for unchanged cameras.
 
-A = L L^T is the frames' information over their variance, and C the covariance of theta. Where nothing changed, w = L^+
-score has the covariance I + L^T C L: the frames scatter, and the calibration was a little off from the start. A change
-d of theta moves it by L^T d.
+A = L L^T is the frames' information over their variance, and C the covariance of theta. Where nothing changed,
+w = L^+ score has the covariance I + L^T C L: the noise of the frames, and the error of the calibration. A change d of
+theta moves it by L^T d.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from rigkit.core.errors import DegenerateError
 from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
 
 COMMON_FREEDOM = 10.0
-"""By how much more images disagree than independent corners would is one number, the mean over all directions: lens and
-board bend in some ways more than in others. Where measured, the variances of directions scatter around their mean by
-about half of it, as a mean square of so many values does."""
+"""Degrees of freedom of one overdispersion for all directions: lens and board deform more in some directions than in
+others. In the measured cases the variances of directions scatter around their mean by about half of it, as a mean
+square of so many values does."""
 NULL_RANK = 1e-9
 MIN_FREE_VARIANCE = 1e-3
-"""Of the variance of a match, what the fit leaves at least."""
+"""Smallest part of the variance of a match that a fit leaves."""
 MAX_CONDITION_NUMBER = 1e15
-"""Of a covariance that rounding leaves something of."""
+"""Of a covariance that is not lost to rounding errors."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Whitened:
-    """Scores w (R,), their covariance (R, R) where nothing changed, and how a change of theta moves them (R, T)."""
+    """Scores w (R,), their covariance (R, R) where nothing changed, and their derivatives by theta (R, T)."""
 
     score: FloatArray
     covariance: FloatArray
@@ -40,7 +40,7 @@ class Whitened:
     def of(cls, monitored: Monitored, evidence: FreshEvidence) -> Whitened:
         information = evidence.information.sum(axis=0) / evidence.variance_px2
         score = evidence.score.sum(axis=0) / evidence.variance_px2
-        # Scaled to a unit diagonal: parameters differ by many powers of ten.
+        # Scaled to a unit diagonal: parameters differ by many orders of magnitude.
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
         with np.errstate(over="ignore", invalid="ignore"):
             scaled = information * scale[:, None] * scale
@@ -67,8 +67,8 @@ class Whitened:
 
 
 def disagreement(information: FloatArray, score: FloatArray) -> tuple[float, float]:
-    """Return by how much more the parts (K, T, T), (K, T) of an image scatter than independent matches would, as a
-    ratio of variances, at least 1, and its degrees of freedom; what all have in common is left out."""
+    """Return the variance of the parts (K, T, T), (K, T) of an image over that of independent matches, at least 1, and
+    its degrees of freedom. The estimate common to all parts is subtracted first."""
     whole = information.sum(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(whole * scale[:, None] * scale)
@@ -76,8 +76,8 @@ def disagreement(information: FloatArray, score: FloatArray) -> tuple[float, flo
     root = vectors[:, seen] * scale[:, None] / np.sqrt(values[seen])
     common = root @ (root.T @ score.sum(axis=0))
     left = (score - information @ common) @ root
-    # What all have in common follows each part by its share: what is left of part k and l has the covariance
-    # (k == l) B_k - B_k B_l with B the shares. The sum of its squares counts as so many values (Satterthwaite).
+    # The common estimate uses each part by its share B: the residuals of parts k and l have the covariance
+    # (k == l) B_k - B_k B_l. The degrees of freedom of their sum of squares are by Satterthwaite.
     shares = root.T @ information @ root
     squares = shares @ shares
     common = squares.sum(axis=0)
