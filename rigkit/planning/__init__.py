@@ -1,1 +1,1 @@
-"""Which picture to take next: what a view would tell of the lens, before it is taken."""
+"""Planning of views: which image to take next, by the information it will give about the lens."""

@@ -1,4 +1,4 @@
-"""Poses in which a person can hold a board: wholly in view, tilted, at distances at which its squares are plain."""
+"""Poses in which a person can hold a board: completely in view, tilted, and close enough that its squares are found."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.planning.information import HeldBoards
 
 CANDIDATES_DRAWN, CANDIDATES_KEPT = 2400, 900
-"""Poses tried, and so many at the most of those that can be held: both fill place, tilt and size evenly."""
+"""Candidate poses generated, and the most kept: both cover position, tilt and size evenly."""
 TILT_DEG = (15.0, 60.0)
-"""Flat views do not tell the focal length; beyond, corners are seen too slantingly to be placed well."""
+"""Flat views do not determine the focal length; with more tilt, corners are foreshortened too much for precision."""
 SIZE_SHARE = (0.35, 1.6)
 """Diagonal of a board in the image, as a part of the image's height."""
 UPRIGHT_SHARE = 0.3
-"""So many of the poses turn the board by 90 degrees."""
+"""Part of the poses with the board turned by 90 degrees."""
 MIN_SQUARE_PX = 8.0
-"""Smaller squares are not found reliably."""
+"""Smaller squares are not detected reliably."""
 BORDER_SHARE = 0.01
-"""The paper stays this part of the image's width away from its border: hands are not that sure."""
+"""Margin between paper and image border, as a part of the image's width: hands are not that steady."""
 MOVES = 5
-"""Times that a board which sticks out of the image is pushed back into it."""
+"""Iterations that push a board that extends beyond the image back into it."""
 INWARD = 0.12
-"""A board that the lens does not see whole goes this part of the way to the middle of the image each time."""
+"""Part of the distance to the image centre by which a board that leaves the field of view is moved in each."""
 MAX_SLANT_DEG = 76.0
-"""Of a line of sight to the board's normal, at any of its corners."""
+"""Largest angle between a line of sight and the board's normal, at any of its corners."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """Where boards can be held: between `nearest_mm` and `farthest_mm` from the camera, where it is sharp, and within
-    `field_deg` of the lens where its image does not fill the sensor (None: all that the model sees)."""
+    """Where boards can be held: between `nearest_mm` and `farthest_mm` from the camera, the depth of field, and within
+    `field_deg` of a lens whose image does not fill the sensor (None: the field of view of the model)."""
 
     nearest_mm: float = 0.0
     farthest_mm: float = np.inf
@@ -46,7 +46,7 @@ class Reach:
     __repr__ = brief
 
     def __post_init__(self) -> None:
-        """Raise InputError for distances, or a field, that there are not."""
+        """Raise InputError for impossible distances or fields of view."""
         if not 0.0 <= self.nearest_mm < self.farthest_mm:
             raise InputError(f"boards held from {self.nearest_mm:g} to {self.farthest_mm:g} mm: give the nearer first")
         if self.field_deg is not None and not 0.0 < self.field_deg <= 360.0:
@@ -54,8 +54,8 @@ class Reach:
 
 
 def outline_mm(board: Board) -> Points:
-    """Return the outline of a board's squares, one square beyond its outer corners: the corners of the outline and the
-    middles between them, (8, 3), clockwise as seen."""
+    """Return the outline of a board's squares, one square beyond its outer corners: its four corners, each followed by
+    the midpoint to the next, (8, 3), clockwise as seen."""
     points = board.points()[:, :2]
     square = np.array([board.square_x_mm, board.square_y_mm])
     (left, top), (right, bottom) = points.min(axis=0) - square, points.max(axis=0) + square
@@ -65,9 +65,9 @@ def outline_mm(board: Board) -> Points:
 
 
 def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
-    """Return poses of `board` that a person can hold before `camera`, spread evenly; always the same ones.
+    """Return poses of `board` that a person can hold in front of `camera`, evenly spread and deterministic.
 
-    Raises DegenerateError where the board fits nowhere into the image.
+    Raises DegenerateError where the board never fits into the image.
     """
     u, v, size, tilt, azimuth, upright = _even(CANDIDATES_DRAWN, 6).T
     width, height = camera.size_px
@@ -100,12 +100,12 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
 
 
 def sees_held(camera: Camera, board: Board, held: HeldBoards, reach: Reach) -> BoolArray:
-    """Say in which of C poses a camera sees all of a board, and plainly."""
+    """Say for each of C poses whether the camera sees the whole board, large enough and not too slanted."""
     return _inside(camera, held.in_cam(outline_mm(board)), reach.field_deg) & _plain(camera, board, held)
 
 
 def _even(count: int, dimensions: int) -> FloatArray:
-    """Return `count` places that fill the unit cube evenly: multiples of the powers of the generalised golden ratio.
+    """Return `count` points that fill the unit cube evenly: multiples of the powers of the generalised golden ratio.
 
     Reference: M. Roberts, "The unreasonable effectiveness of quasirandom sequences" (2018).
     """
@@ -119,7 +119,7 @@ def _even(count: int, dimensions: int) -> FloatArray:
 def _tilted(tilt_rad: FloatArray, azimuth_rad: FloatArray) -> FloatArray:
     """Return rotations (C, 3, 3) that tilt a facing board so that its side at `azimuth_rad` comes towards the
     camera."""
-    # A turn about a moves d by a x d: with a = (-d_y, d_x, 0) that is along -z, towards the camera.
+    # A rotation a moves d by a x d: with a = (-d_y, d_x, 0) that is along -z, towards the camera.
     axis = np.stack([-np.sin(azimuth_rad), np.cos(azimuth_rad), np.zeros_like(azimuth_rad)], axis=-1)
     return np.asarray(exp_so3(tilt_rad[:, None] * axis))
 
@@ -127,14 +127,14 @@ def _tilted(tilt_rad: FloatArray, azimuth_rad: FloatArray) -> FloatArray:
 def _placed(
     camera: Camera, board: Board, spot: Pixels, facing: FloatArray, square_px: FloatArray, middle: FloatArray
 ) -> tuple[HeldBoards, BoolArray]:
-    """Return the poses in which the middle of the board is seen at `spot` (C, 2) and a facing square is `square_px`
-    wide, and where the lens sees there."""
+    """Return the poses with the board's centre at `spot` (C, 2) in the image and a square `square_px` wide if seen
+    frontally, and whether `spot` is in the field of view."""
     rays, seen = camera.unproject(spot)
     rays = np.where(seen[:, None], rays, [0.0, 0.0, 1.0])
-    # Radians per pixel, the larger of the two directions: a square is nowhere wider than asked for.
+    # Radians per pixel, the larger of the two directions: no square is wider than `square_px`.
     scale = np.linalg.norm(np.where(seen[:, None, None], camera.ray_jacobian(spot), 0.0), axis=1).max(axis=-1)
     distance = min(board.square_x_mm, board.square_y_mm) / np.where(seen, scale * square_px, 1.0)
-    # Upright as the image has it, also where a fisheye sees sideways.
+    # Upright in the image, also at large angles of a fisheye.
     down = np.where(np.abs(rays[:, 1:2]) < 0.95, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
     x = unit(np.cross(down, rays))
     towards = np.stack([x, np.cross(rays, x), rays], axis=-1)
@@ -145,8 +145,8 @@ def _placed(
 
 
 def _back_inside(camera: Camera, pixels: Pixels, valid: BoolArray) -> FloatArray:
-    """Return how far boards with their outlines at `pixels` (C, 8, 2) must be pushed to be in the image, (C, 2); those
-    that the lens does not see whole go towards the middle."""
+    """Return the shifts (C, 2) px that move boards with outlines at `pixels` (C, 8, 2) into the image; boards partly
+    outside the field of view move towards the image centre."""
     width, height = camera.size_px
     border = BORDER_SHARE * width
     whole, any_seen = np.all(valid, axis=1), np.any(valid, axis=1)
@@ -159,20 +159,20 @@ def _back_inside(camera: Camera, pixels: Pixels, valid: BoolArray) -> FloatArray
 
 
 def _inside(camera: Camera, paper: Points, field_deg: float | None) -> BoolArray:
-    """Say of which boards the outline (C, 8, 3), in the camera frame, is wholly seen."""
+    """Say for each outline (C, 8, 3), in the camera frame, whether all of it is in the image."""
     pixels, valid = camera.project(paper)
     inside = valid & camera.on_image(pixels) & _in_field(paper, field_deg)
     return np.asarray(np.all(inside, axis=1))
 
 
 def _in_field(points: Points, field_deg: float | None) -> BoolArray:
-    """Say which points (..., 3) lie within a field of view."""
+    """Say which points (..., 3) are within a field of view."""
     limit = -2.0 if field_deg is None else np.cos(np.radians(0.5 * field_deg))
     return np.asarray(points[..., 2] >= limit * np.linalg.norm(points, axis=-1))
 
 
 def _plain(camera: Camera, board: Board, held: HeldBoards) -> BoolArray:
-    """Say of which boards all squares are large enough, and no line of sight too slanting."""
+    """Say for each board whether all squares are large enough, and no line of sight too slanted."""
     columns, rows = board.size
     lattice = board.points().reshape(rows, columns, 3)[[0, 0, -1, -1], [0, -1, 0, -1]]
     step = np.array([board.square_x_mm, board.square_y_mm, 0.0]) * np.eye(3)[:2]

@@ -1,5 +1,5 @@
-"""What a calibration is for, as a weight on the errors of the camera's parameters: the mean square of what matters is
-trace(W C), with C their covariance."""
+"""The purpose of a calibration as a weight W on the errors of the camera's parameters: the mean square error of the
+quantity of interest is trace(W C), with C their covariance."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray, IntArray, Pixels, Rays
 
 GOAL_GRID = (24, 18)
-"""Columns and rows of the pixels that the goal averages over."""
+"""Columns and rows of the pixels over which the goal is averaged."""
 METRE_MM = 1000.0
 
 
 class Aim(Protocol):
-    """What views are chosen for: a number in `unit`, which `what` says in words, that is to become small."""
+    """The criterion by which views are chosen: an error in `unit`, described by `what`, to be minimised."""
 
     @property
     def unit(self) -> str: ...
@@ -28,25 +28,25 @@ class Aim(Protocol):
     def what(self) -> str: ...
 
     def error(self, covariance: FloatArray) -> FloatArray:
-        """Return what covariances (..., T, T) of all that is known leave, (...,)."""
+        """Return the error (...,) for covariances (..., T, T) of all parameters."""
         ...
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Goal:
-    """What is to become small: the root of trace(`weight` C), in `unit`; `what` says it in words."""
+    """The root of trace(`weight` C) as the error to minimise, in `unit`, described by `what`."""
 
     weight: FloatArray
     unit: str
     what: str
 
     def error(self, covariance: FloatArray) -> FloatArray:
-        """Return what covariances (..., T, T) leave, (...,); the camera's parameters are the first of T."""
+        """Return the error (...,) for covariances (..., T, T); the camera's parameters are the first of T."""
         p = len(self.weight)
         return np.asarray(np.sqrt(np.maximum((self.weight * covariance[..., :p, :p]).sum(axis=(-1, -2)), 0.0)))
 
     def among(self, index: IntArray, count: int) -> Goal:
-        """Return it where there are `count` unknowns, of which its own are those at `index` (P,)."""
+        """Return the goal for `count` unknowns, among which its own parameters have the indices `index` (P,)."""
         weight = np.zeros((count, count))
         weight[np.ix_(index, index)] = self.weight
         return replace(self, weight=weight)
@@ -54,27 +54,27 @@ class Goal:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Requirement:
-    """How small a goal's error is to become, in its unit, and whose it is: "" where there is but one."""
+    """The `wanted` error of a goal, in its unit, and the camera it belongs to: "" where there is but one."""
 
     goal: Goal
     wanted: float
     whose: str = ""
 
     def remaining(self, covariance: FloatArray) -> RemainingError:
-        """Return how far it is from that."""
+        """Return the error for a covariance, compared with the wanted one."""
         return RemainingError(self, float(self.goal.error(covariance)))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RemainingError:
-    """What there is left of a goal's error."""
+    """The error of a goal compared with its requirement."""
 
     requirement: Requirement
     error: float
 
     @property
     def share(self) -> float:
-        """As a part of what is wanted: reached at 1."""
+        """As a part of the wanted error: reached at 1."""
         return self.error / self.requirement.wanted
 
     @property
@@ -86,8 +86,8 @@ class RemainingError:
 
 
 def projection_goal(camera: Camera, field_deg: float | None = None, pixels: Pixels | None = None) -> Goal:
-    """Return the mean square error of the projection, at infinity and after the rotation that boards leave open: over
-    the image, or the part of it within a field of view of `field_deg`; or at `pixels` (N, 2)."""
+    """Return the mean square error of the projection of points at infinity, after the best rotation: over the image, or
+    its part within a field of view of `field_deg`; or at `pixels` (N, 2)."""
     if pixels is None:
         pixels = grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2)
     rays = rays_within(camera, pixels, field_deg)
@@ -96,8 +96,7 @@ def projection_goal(camera: Camera, field_deg: float | None = None, pixels: Pixe
 
 
 def px_words(camera: Camera, error_px: float) -> str:
-    """Return an error in the image in words, as it is and as what it comes to: how far aside, rms over the image, it
-    puts what is a metre away."""
+    """Return an error in the image in words: in px, and as the rms displacement over the image of points at 1 m."""
     pixels = grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2)
     _, seen = camera.unproject(pixels)
     if not seen.any():
@@ -108,7 +107,7 @@ def px_words(camera: Camera, error_px: float) -> str:
 
 
 def turned_design(camera: Camera, rays: Rays) -> FloatArray:
-    """Return d pixel / d parameters along rays (N, 3) at infinity, (N, 2, P), after the rotation that hides them
+    """Return d pixel / d parameters along rays (N, 3) at infinity, (N, 2, P), after the rotation that compensates them
     best."""
     p = camera.parameters.size
     design = projection_design(camera, rays).transpose(2, 0, 1).reshape(-1, p + 3)
@@ -118,7 +117,7 @@ def turned_design(camera: Camera, rays: Rays) -> FloatArray:
 
 
 def rays_within(camera: Camera, pixels: Pixels, field_deg: float | None) -> Rays:
-    """Return the rays of those of `pixels` (N, 2) that the lens sees."""
+    """Return the rays of those of `pixels` (N, 2) within the field of view."""
     rays, valid = camera.unproject(pixels)
     if field_deg is not None:
         with np.errstate(invalid="ignore"):

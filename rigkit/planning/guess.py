@@ -1,4 +1,4 @@
-"""A lens of which somebody only knows how much it sees."""
+"""A camera from nothing but the approximate field of view of its lens."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from rigkit.cameras.registry import camera_model
 from rigkit.core.errors import InputError
 
 PERSPECTIVE_DEG = 100.0
-"""Lenses that see less across the image's width mostly draw straight lines straight; wider ones are fisheyes."""
+"""Lenses with a smaller horizontal field of view are mostly rectilinear; wider ones are fisheyes."""
 SAMPLES = 64
 CURVE_END = 1.05
-"""The curve ends this far beyond the corner of the image."""
+"""End of the radial curve, relative to the corner of the image."""
 MAX_THETA_RAD = 3.0
 
 
 def check_field(hfov_deg: float) -> None:
-    """Raise InputError for an angle that no lens sees across the width of its image."""
+    """Raise InputError for an impossible horizontal field of view."""
     if not 0.5 <= hfov_deg <= 300.0:
         raise InputError(f"a lens of {hfov_deg:g} degrees: give the field of view across the image's width, 0.5 to 300")
 
 
 def guessed_camera(hfov_deg: float, size_px: tuple[int, int], model: str | None = None) -> Camera:
-    """Return a camera that sees `hfov_deg` across the width of its image: perspective where that is less than 100
-    degrees, else equidistant; of `model`, by default Brown's or Kannala and Brandt's.
+    """Return a camera with a horizontal field of view of `hfov_deg`: perspective below 100 degrees, else equidistant;
+    of `model`, by default Brown's or Kannala and Brandt's.
 
-    Raises InputError for an angle that no lens has, or a model that cannot see so much.
+    Raises InputError for an impossible angle, or a model that cannot represent it.
     """
     check_field(hfov_deg)
     half_px, half_rad = 0.5 * size_px[0], np.radians(0.5 * hfov_deg)

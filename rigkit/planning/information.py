@@ -1,8 +1,8 @@
-"""What a view of a board tells of the camera, once its own pose is eliminated.
+"""The information of a view of a board about the camera, with the pose of the board eliminated.
 
 With J_k and J_p the derivatives of a view's corners by camera and pose, it is I = J_k^T J_k - J_k^T J_p (J_p^T J_p)^-1
-J_p^T J_k over the variance of a corner. The corners of one view share causes of error, so n of them count like
-n / (1 + (n - 1) rho) that do not: the design effect of samples that come in clusters.
+J_p^T J_k over the variance of a corner. The corners of one view have correlated errors, so n of them count like
+n / (1 + (n - 1) rho) independent ones: the design effect of cluster sampling.
 
 Reference: L. Kish, "Survey Sampling" (1965), section 5.4.
 """
@@ -29,23 +29,23 @@ from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
 
 LENS_UNKNOWN = 0.1
-"""A lens that is only guessed shows things this part of half the image's diagonal from where it is thought to."""
+"""Standard deviation of the projection of a guessed lens, as a part of half the image's diagonal."""
 PRIOR_GRID = (12, 9)
 MIN_SIGMA_PX = 0.02
-"""No corner is better than this, as real ones go: exact corners would make every view count for ever."""
+"""Least standard deviation of a real corner: with exact corners every view would have unlimited information."""
 
 
 @dataclass(frozen=True, slots=True)
 class CornerError:
-    """How wrong a corner is: its standard deviation per coordinate, px, and the part `rho` of its variance that it has
-    in common with the other corners of its view."""
+    """The error of a corner: its standard deviation per coordinate, px, and the correlation `rho` with the other
+    corners of its view."""
 
     sigma_px: float
     rho: float = 0.0
 
     @classmethod
     def of(cls, calibration: Calibration) -> CornerError:
-        """Return what the views of a calibration show: they disagree more than independent corners would."""
+        """Return the error from the residuals of a calibration, with rho from their overdispersion."""
         corners = np.array([int(view.kept.sum()) for view in calibration.views])
         typical = float(corners[corners > 0].mean())
         excess = calibration.overdispersion**2 - 1.0
@@ -53,14 +53,14 @@ class CornerError:
         return cls(max(calibration.sigma_px, MIN_SIGMA_PX), rho)
 
     def variance(self, corners: FloatArray) -> FloatArray:
-        """Return the variance that each of so many corners of a view counts with, px^2."""
+        """Return the effective variance of each corner in views with so many corners, px^2."""
         return np.asarray(self.sigma_px**2 * (1.0 + np.maximum(corners - 1.0, 0.0) * self.rho))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HeldBoards:
-    """One board in C poses: cam_from_board as `rotation` (C, 3, 3) and `translation_mm` (C, 3), and which of its N
-    corners are `seen` (C, N)."""
+    """One board in C poses: cam_from_board as `rotation` (C, 3, 3) and `translation_mm` (C, 3), and the mask `seen`
+    (C, N) of its N corners."""
 
     points_mm: Points
     rotation: FloatArray
@@ -71,32 +71,32 @@ class HeldBoards:
         return len(self.rotation)
 
     def pose(self, index: int) -> Rigid3:
-        """Return cam_from_board of one of them."""
+        """Return cam_from_board of the pose at `index`."""
         return Rigid3(self.rotation[index], self.translation_mm[index])
 
     def chosen(self, index: IntArray | BoolArray) -> HeldBoards:
-        """Return some of them."""
+        """Return the poses at `index`."""
         return HeldBoards(self.points_mm, self.rotation[index], self.translation_mm[index], self.seen[index])
 
     def transformed(self, other_from_cam: Rigid3) -> HeldBoards:
-        """Return them in another frame; which corners are seen stays."""
+        """Return the poses in another frame; `seen` is unchanged."""
         rotation, translation = other_from_cam.rotation @ self.rotation, other_from_cam.apply(self.translation_mm)
         return HeldBoards(self.points_mm, rotation, translation, self.seen)
 
     def in_cam(self, points_mm: Points) -> Points:
-        """Return where points (K, 3) of the board are, (C, K, 3)."""
+        """Return points (K, 3) of the board in the camera frame, (C, K, 3)."""
         return np.asarray(points_mm @ np.swapaxes(self.rotation, -1, -2) + self.translation_mm[:, None, :])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Knowledge:
-    """What is known of a camera.
+    """Estimate of a camera, and its information.
 
     Attributes
     ----------
-    camera : its estimate.
-    information : (T, T) on its parameters, and then on the warps of the boards that are not known to be flat.
-    error : how wrong corners are.
+    camera : the estimate.
+    information : (T, T) on its parameters, then on the warps of the boards that are not known to be flat.
+    error : of a corner.
     warped : names of these boards.
     """
 
@@ -107,12 +107,12 @@ class Knowledge:
 
     @classmethod
     def guessed(cls, camera: Camera, error: CornerError) -> Knowledge:
-        """Return what is known of a lens of which somebody only said roughly what it is."""
+        """Return the knowledge of a lens that is only roughly guessed."""
         return cls(camera, lens_prior(camera), error)
 
     @classmethod
     def unseen(cls, calibration: Calibration) -> Knowledge:
-        """Return what is known of a calibrated lens without its views."""
+        """Return the knowledge of a calibrated lens without the information of its views."""
         camera = calibration.camera
         warped = [shape for shape in calibration.boards if shape.kind != "flat"]
         p = camera.parameters.size
@@ -124,7 +124,7 @@ class Knowledge:
 
     @classmethod
     def of(cls, calibration: Calibration) -> Knowledge:
-        """Return what a calibration's views say."""
+        """Return the knowledge from the views of a calibration."""
         known = cls.unseen(calibration)
         for shape in calibration.boards:
             views = [v for v in calibration.views if v.board_id == shape.board_id and v.kept.any()]
@@ -143,11 +143,11 @@ class Knowledge:
 
     @classmethod
     def beyond_model(cls, calibration: Calibration) -> Knowledge:
-        """Return the same with what the lens may do beyond its model, as its rivals do."""
+        """Return the same with the inadequacy of the model, estimated from alternative models."""
         return cls.of(calibration).departing(lens_modes(calibration))
 
     def of_views(self, held: HeldBoards, board_id: str = "") -> FloatArray:
-        """Return what each view of the board `board_id` in C poses adds, (C, T, T)."""
+        """Return the information of each view of the board `board_id` in C poses, (C, T, T)."""
         camera, p = self.camera, self.camera.parameters.size
         out = np.zeros((len(held), *self.information.shape))
         if board_id not in self.warped:
@@ -161,11 +161,11 @@ class Knowledge:
         return out
 
     def departing(self, modes: LensModes) -> Knowledge:
-        """Return the same with the amounts of what the lens may do beyond its model as further parameters: of these new
-        views tell, too."""
+        """Return the same with the amounts of the model's inadequacy as further parameters, which new views also
+        estimate."""
         p, count = self.camera.parameters.size, modes.modes.shape[1]
         (camera,), _ = with_modes((self.camera,), np.zeros((p, p)), (modes,))
-        # What is known is of parameters x less what goes with the amounts a: n = x - moves a, and a of variance one.
+        # The information is that of n = x - moves a, with x the parameters and a amounts of variance one.
         back = np.zeros((len(self.information), len(self.information) + count))
         own, amounts = np.r_[0:p, p + count : back.shape[1]], np.arange(p, p + count)
         back[:, own] = np.eye(len(self.information))
@@ -175,19 +175,19 @@ class Knowledge:
         return replace(self, camera=camera, information=information)
 
     def with_views(self, held: HeldBoards, board_id: str = "") -> Knowledge:
-        """Return what is known once these views are taken."""
+        """Return the knowledge after these views are taken."""
         return replace(self, information=self.information + self.of_views(held, board_id).sum(axis=0))
 
 
 def view_information(camera: Camera, held: HeldBoards, error: CornerError) -> FloatArray:
-    """Return what each view of a board in C poses tells of the camera's parameters, (C, P, P)."""
+    """Return the information of each view of a board in C poses about the camera's parameters, (C, P, P)."""
     products = _products(camera, held, error)
     return reduced_by_cluster(products, camera.parameters.size, np.arange(len(products)))[0]
 
 
 def pose_information(camera: Camera, held: HeldBoards, error: CornerError) -> FloatArray:
-    """Return what each view of a board in C poses tells of that pose where the camera is known, (C, 6, 6): of a turn
-    about the board's origin (rad), and of a shift (mm), in the camera frame."""
+    """Return the information of each view of a board in C poses about that pose, for a known camera, (C, 6, 6): about
+    a rotation around the board's origin (rad) and a translation (mm), in the camera frame."""
     p = camera.parameters.size
     return _products(camera, held, error)[:, p : p + 6, p : p + 6]
 
@@ -203,7 +203,7 @@ def _products(camera: Camera, held: HeldBoards, error: CornerError, shape: Shape
 
 
 def observations_of(seen: BoolArray, boards: tuple[Board, ...] = ()) -> Observations:
-    """Return the observations of views that could be taken, of one board whose corners `seen` (C, N) each sees."""
+    """Return observations of hypothetical views of one board; `seen` (C, N) is the mask of its corners in each."""
     views, corners = seen.shape
     return Observations(
         views=(),
@@ -219,13 +219,13 @@ def observations_of(seen: BoolArray, boards: tuple[Board, ...] = ()) -> Observat
 
 
 def lens_prior(camera: Camera) -> FloatArray:
-    """Return the information (P, P) of what is known of every lens: square pixels, an axis roughly in the middle, and
-    a projection that is a tenth of the image off at the most. The views of a session do not feel it."""
+    """Return the prior information (P, P) on any lens: square pixels, a roughly central axis, and a projection known to
+    a tenth of half the image's diagonal. It is negligible beside the views of a session."""
     rays, valid = camera.unproject(grid_pixels(camera.size_px, PRIOR_GRID).reshape(-1, 2))
     p = camera.parameters.size
     design = projection_design(camera, rays[valid])[:, :p]
     sigma = LENS_UNKNOWN * 0.5 * float(np.hypot(*camera.size_px))
-    # All pixels together say no more than one for each parameter.
+    # All pixels together give the information of one observation per parameter.
     whole = np.einsum("ipm,iqm->pq", design, design) * p / (design[0, 0].size * sigma**2)
     rows, _ = camera_prior(camera)
     return np.asarray(whole + rows.T @ rows)

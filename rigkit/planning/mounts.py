@@ -1,7 +1,7 @@
-"""How sure frames of a rig make where one camera stands to another, once the lenses are known.
+"""The information of frames of a rig about the relative pose of two cameras, for known lenses.
 
-A board that two cameras a and b see at once has a pose in each, b_from_board and a_from_board, and b_from_a is the one
-times the inverse of the other: its error is that of both poses. Frames are independent, so their information adds up.
+A board that cameras a and b see at once has the poses a_from_board and b_from_board, and b_from_a = b_from_board
+board_from_a has the errors of both. Frames are independent, so their information adds up.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rigkit.planning.information import CornerError, HeldBoards, pose_informatio
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SharedViews:
-    """C boards that cameras `a` and `b` see at once, as either holds them, and how wrong corners are."""
+    """C boards that cameras `a` and `b` see at once, posed in each camera, and the error of a corner."""
 
     a: Camera
     b: Camera
@@ -28,14 +28,14 @@ class SharedViews:
     error: CornerError
 
     def carried(self) -> tuple[FloatArray, FloatArray]:
-        """Return the rotations (C, 3, 3) of b_from_a, and the origins of the boards in a turned by them, (C, 3) mm."""
+        """Return the rotations (C, 3, 3) of b_from_a, and the boards' origins in a rotated by them, (C, 3) mm."""
         turn = self.in_b.rotation @ np.swapaxes(self.in_a.rotation, -1, -2)
         return turn, np.einsum("cij,cj->ci", turn, self.in_a.translation_mm)
 
 
 def mount_information(shared: SharedViews) -> FloatArray:
-    """Return what each of C shared boards tells of b_from_a, (C, 6, 6): of a turn about the origin of b (rad), and of
-    a shift (mm)."""
+    """Return the information of each of C shared boards about b_from_a, (C, 6, 6): about a rotation around the origin
+    of b (rad) and a translation (mm)."""
     turn, rotated = shared.carried()
     by_a, by_b = np.zeros((len(turn), 6, 6)), np.zeros((len(turn), 6, 6))
     # With b_from_a = B A^-1, errors (w, v) of either pose, x -> exp(w) R x + t + v, make w = w_b - R_ba w_a and
@@ -50,10 +50,10 @@ def mount_information(shared: SharedViews) -> FloatArray:
 
 
 def mount_error_px(shared: SharedViews, information: FloatArray) -> FloatArray:
-    """Return how wrong (...), rms px, the boards' corners appear in b if they are taken over from a: by what each of
-    `information` (..., 6, 6) leaves open of the mount."""
+    """Return the rms error (...), px, of the boards' corners predicted in b from their poses in a, with the mount known
+    from each of `information` (..., 6, 6)."""
     turn, lever = shared.carried()
-    # A turn about the origin of b moves the board's origin, too.
+    # A rotation around the origin of b moves the board's origin, too.
     as_pose = np.tile(np.eye(6), (len(turn), 1, 1))
     as_pose[:, 3:, :3] = -skew(lever)
     unit = pose_information(shared.b, shared.in_b, CornerError(1.0))
@@ -63,7 +63,7 @@ def mount_error_px(shared: SharedViews, information: FloatArray) -> FloatArray:
 
 
 def mean_motion(motions: list[Rigid3]) -> Rigid3:
-    """Return the middle of motions that are nearly alike: medians of turns about the first, and of shifts."""
+    """Return the middle of similar motions: medians of their rotations relative to the first, and of translations."""
     first = motions[0]
     turns = np.array([log_so3(m.rotation @ first.rotation.T) for m in motions])
     shifts = np.array([m.translation_mm for m in motions])
@@ -71,7 +71,7 @@ def mean_motion(motions: list[Rigid3]) -> Rigid3:
 
 
 def _inverse(matrices: FloatArray) -> FloatArray:
-    """Return the inverses of matrices (..., 6, 6), scaled first: radians and millimetres differ much."""
+    """Return the inverses of matrices (..., 6, 6), scaled first: radians and millimetres differ in magnitude."""
     scale = 1.0 / np.sqrt(np.maximum(np.einsum("...ii->...i", matrices), np.finfo(float).tiny))
     unit = matrices * scale[..., :, None] * scale[..., None, :]
     return np.asarray(np.linalg.pinv(unit, hermitian=True) * scale[..., :, None] * scale[..., None, :])

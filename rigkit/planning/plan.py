@@ -1,4 +1,4 @@
-"""Choosing views greedily: the one that lowers the error of the goal most, then the next."""
+"""Greedy choice of views: the one that lowers the error of the goal most, then the next."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from rigkit.planning.goal import Aim
 from rigkit.planning.information import Knowledge
 
 NEARLY = 0.03
-"""Of views whose gain and whose error are within this part of the best one's, the one nearest to the last pose is
-taken."""
+"""Views whose gain and error are within this part of the best view's count as equally good: of these the one nearest
+to the last pose is taken."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Proposal:
-    """A view to take: where to hold the board before `camera`, and the error of the goal once it is taken. Of a rig,
-    `seen_by` are the cameras that see it, the one that it is told of first."""
+    """A view to take: the pose of the board in front of `camera`, and the error of the goal after it. For a rig,
+    `seen_by` are the names of the cameras that see it, `camera` first."""
 
     board: Board
     cam_from_board: Rigid3
@@ -35,7 +35,7 @@ class Proposal:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Plan:
-    """Views to take, in this order, what the goal's error is before them, and what is known of the camera."""
+    """Views to take, in this order, with the error of the goal before them and the knowledge of the camera."""
 
     knowledge: Knowledge
     goal: Aim
@@ -44,19 +44,19 @@ class Plan:
 
     @property
     def gain(self) -> float:
-        """The part of the error that all views together take away."""
+        """The relative reduction of the error by all views together."""
         return 1.0 - self.views[-1].error / self.error if self.views else 0.0
 
     def stated(self, error: float) -> Plan:
-        """Return the plan with this error before the views, and those after them changed in proportion: a calibration
-        states what its images agree on, which may be more or less than what their corners would tell."""
+        """Return the plan with this error before the views, and those after them in proportion: a calibration states
+        an error from the disagreement of its images, which differs from that predicted from its corners."""
         factor = error / self.error
         return replace(self, error=error, views=tuple(replace(v, error=factor * v.error) for v in self.views))
 
 
 def covariance_of(information: FloatArray) -> FloatArray:
     """Return the inverses of information matrices (..., P, P), each scaled to a unit diagonal first: parameters differ
-    by many powers of ten. What nothing is known of, a parameter without effect, is as unsure as rounding tells."""
+    by many orders of magnitude. Singular directions get the variance that rounding errors allow."""
     scale = 1.0 / np.sqrt(np.einsum("...pp->...p", information))
     unit = information * scale[..., :, None] * scale[..., None, :]
     try:
@@ -76,16 +76,16 @@ def choose_views(
     *,
     effort: Callable[[int], FloatArray] | None = None,
 ) -> tuple[list[int], list[float]]:
-    """Return which `count` of C views to take, in order, and the error of the goal after each.
+    """Return the indices of `count` of C views, in the order in which to take them, and the goal's error after each.
 
     Parameters
     ----------
-    information : (P, P) what is known before.
-    views : (C, P, P) what each view adds; each is taken once.
-    effort : returns how far all views (C,) are from view j, or (-1) from the last one taken before: of views nearly as
-        good (NEARLY) the nearest is taken. None: the best is.
+    information : (P, P) before the views.
+    views : (C, P, P) information of each view; each is taken once.
+    effort : returns the distances (C,) of all views from view j, or for -1 from the last view taken before: of views
+        nearly as good as the best (NEARLY) the nearest is taken. None: the best is taken.
 
-    Raises DegenerateError where numbers are no real ones.
+    Raises DegenerateError for errors that are not finite.
     """
     left, taken, errors = np.arange(len(views)), [], []
     last = -1
@@ -101,7 +101,7 @@ def choose_views(
         if effort is None:
             pick = int(np.argmin(after))
         else:
-            # Rounding may make the error grow a little: then the best view alone is as good as the best.
+            # Rounding errors may make the error grow: then only the best view is good enough.
             gain = max(before - best, 0.0)
             good = np.flatnonzero(after <= best + NEARLY * min(gain, best))
             pick = int(good[np.argmin(effort(last)[left[good]])])
@@ -122,11 +122,11 @@ def plan_views(
     reach: Reach | None = None,
     last: Rigid3 | None = None,
 ) -> Plan:
-    """Return the next `count` views to take of `boards`, one board a view, the first near the pose `last` where several
-    are nearly as good.
+    """Return the next `count` views to take of `boards`, one board a view, close to the pose `last` where several are
+    nearly as good.
 
-    Raises InputError: no board, or no view asked for; DegenerateError: no board fits into the image at the distances
-    allowed.
+    Raises InputError without boards or for a `count` below 1, DegenerateError where no board fits into the image at the
+    allowed distances.
     """
     if not boards or count < 1:
         raise InputError("plan: at least one board and one view are needed")
@@ -151,8 +151,8 @@ def plan_views(
 
 
 def _effort(rotation: FloatArray, middle: FloatArray, last_rotation: FloatArray, last_middle: FloatArray) -> FloatArray:
-    """Return how far poses (C, ...) are from the last: the angles of the turn and between the lines of sight, and the
-    logarithm of the ratio of the distances."""
+    """Return the distances of poses (C, ...) from the last: the sum of the angles of rotation and between the lines of
+    sight, and of the logarithm of the ratio of the distances."""
     distance, last_distance = np.linalg.norm(middle, axis=-1), float(np.linalg.norm(last_middle))
     turned = np.einsum("cij,ij->c", rotation, last_rotation)
     seen = middle @ last_middle / (distance * last_distance)

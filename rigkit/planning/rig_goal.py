@@ -1,4 +1,4 @@
-"""What a rig is for, as a weight on the errors of its lenses and mounts together."""
+"""The purpose of a rig as a weight on the errors of its lenses and mounts together."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from rigkit.planning.goal import GOAL_GRID, Goal, rays_within
 def rig_goal(
     cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], distance_mm: float, field_deg: float | None = None
 ) -> Goal:
-    """Return the mean square error of the projections of all cameras, for what lies at a distance before each of them:
-    where one point appears in two cameras, lenses and mounts err together. The motion of the world, which boards leave
-    open, follows as well as it can. Lenses see no farther than a field of view of `field_deg`.
+    """Return the mean square error of the projections of all cameras, for points at a distance in front of each: errors
+    of lenses and mounts together move the projections of one point in two cameras. The motion of the world, which
+    boards leave undetermined, is chosen for the smallest error. Points are within a field of view of `field_deg`.
 
     Its weight is on the parameters of all cameras, then the mounts of all but the first (`Layout.of_cameras`): left
     rotation perturbation, rad, and translation, mm.
@@ -28,7 +28,7 @@ def rig_goal(
     placed, layout = list(zip(cameras, cam_from_rig, strict=True)), Layout.of_cameras(cameras)
     points = np.concatenate([_before(c, pose, distance_mm, field_deg) for c, pose in placed])
     rows = np.concatenate([_design(c, pose, points, layout, k, field_deg) for k, (c, pose) in enumerate(placed)])
-    # Turns by radians and shifts by millimetres: of one size at the distance.
+    # Rotations in radians and translations in millimetres, scaled to equal effects at the distance.
     motion = rows[:, layout.count :] / np.array([1.0, 1.0, 1.0, *[1.0 / distance_mm] * 3])
     along, _ = np.linalg.qr(motion)
     left = rows[:, : layout.count] - along @ (along.T @ rows[:, : layout.count])
@@ -37,7 +37,7 @@ def rig_goal(
 
 
 def _before(camera: Camera, cam_from_rig: Rigid3, distance_mm: float, field_deg: float | None) -> Points:
-    """Return what a camera sees at a distance, all over its image, in the rig's frame."""
+    """Return points at a distance all over a camera's image, in the rig's frame."""
     rays = rays_within(camera, grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2), field_deg)
     return cam_from_rig.inverse().apply(distance_mm * rays)
 
@@ -45,8 +45,8 @@ def _before(camera: Camera, cam_from_rig: Rigid3, distance_mm: float, field_deg:
 def _design(
     camera: Camera, cam_from_rig: Rigid3, points: Points, layout: Layout, k: int, field_deg: float | None
 ) -> FloatArray:
-    """Return how the pixels of the points that camera `k` sees move, (2 N, G + 6): by all of the layout, and by a
-    motion of the world."""
+    """Return the derivatives (2 N, G + 6) of the pixels of the points that camera `k` sees: by the parameters of the
+    layout, and by a motion of the world."""
     turned = points @ cam_from_rig.rotation.T
     in_cam = turned + cam_from_rig.translation_mm
     d_pixels_d_point = np.zeros((2, 3, len(points)))

@@ -1,5 +1,4 @@
-"""Where to hold a board, in the words of one person to another: "top right corner, 40 cm away, left side 35 degrees
-nearer"."""
+"""The pose of a board as an instruction for a person: "top right corner, 40 cm away, left side 35 degrees nearer"."""
 
 from __future__ import annotations
 
@@ -18,21 +17,21 @@ MIDDLE_THIRD = (0.38, 0.62)
 FACING_DEG = 8.0
 NEARER_SIDES = ("right side", "lower right corner", "lower side", "lower left corner", "left side", "upper left corner",
          "upper side", "upper right corner")  # fmt: skip
-"""Every 45 degrees as the image has them, clockwise from the right."""
+"""Every 45 degrees in the image, clockwise from the right."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class BoardInView:
-    """Where a board is or should be, as a person sees it.
+    """The pose of a board as a person sees it.
 
     Attributes
     ----------
-    place : where in the image, such as "top right corner".
-    distance_mm : of the board's middle from the camera.
-    tilt_deg : between the board's normal and the line of sight to its middle.
+    place : in the image, such as "top right corner".
+    distance_mm : of the board's centre from the camera.
+    tilt_deg : between the board's normal and the line of sight to its centre.
     nearer : the side of the board that is nearer to the camera; "" where it faces the camera.
-    upright : whether its longer side stands upright in the image.
-    outline_px : (K, 2) the outline of its squares in the image; NaN where the lens does not see it.
+    upright : whether its longer side is vertical in the image.
+    outline_px : (K, 2) outline of its squares in the image; NaN outside the field of view.
     """
 
     place: str
@@ -50,14 +49,14 @@ class BoardInView:
 
 
 def _length(mm: float) -> str:
-    """Return a length as a person says it, to a few per cent; boards under a microscope are near."""
+    """Return a length rounded to a few per cent; boards under a microscope are close."""
     if mm < 50.0:
         return f"{mm:.2g} mm"
     return f"{mm / 10.0:.0f} cm" if mm < 1500.0 else f"{mm / 1000.0:.1f} m"
 
 
 def placement(camera: Camera, board: Board, cam_from_board: Rigid3) -> BoardInView:
-    """Return where a board in this pose is."""
+    """Return a board in this pose as seen by the camera."""
     paper = outline_mm(board)
     middle = paper.mean(axis=0)
     at = cam_from_board.apply(middle)
@@ -66,7 +65,7 @@ def placement(camera: Camera, board: Board, cam_from_board: Rigid3) -> BoardInVi
     tilt = float(np.degrees(np.arccos(np.clip(normal @ sight, -1.0, 1.0))))
     outline, valid = camera.project(cam_from_board.apply(_border(paper)))
     here, seen = camera.project(at)
-    # The way along the board on which it comes nearest: its image says which side that is.
+    # The direction on the board towards the camera: its image is that of the nearer side.
     along = normal * (normal @ sight) - sight
     size = float(np.linalg.norm(np.ptp(paper, axis=0)))
     there, _ = camera.project(at + 0.05 * size * along)
@@ -85,7 +84,7 @@ def placement(camera: Camera, board: Board, cam_from_board: Rigid3) -> BoardInVi
 
 
 def _border(paper: Pixels) -> Pixels:
-    """Return more points on the outline, so that it bends as a fisheye bends it."""
+    """Return the outline with more points, so that a fisheye's distortion of it is visible."""
     ahead = np.roll(paper, -1, axis=0)
     return np.concatenate(
         [a + (b - a) * np.linspace(0.0, 1.0, 6)[:-1, None] for a, b in zip(paper, ahead, strict=True)]
@@ -93,7 +92,7 @@ def _border(paper: Pixels) -> Pixels:
 
 
 def _place(share: Pixels) -> str:
-    """Return where in the image a place is, given as parts of its width and height."""
+    """Return the name of a position in the image, given as parts of its width and height."""
     low, high = MIDDLE_THIRD
     column = "left" if share[0] < low else "right" if share[0] > high else ""
     row = "top" if share[1] < low else "bottom" if share[1] > high else ""
