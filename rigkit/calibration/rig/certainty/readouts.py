@@ -1,8 +1,8 @@
-"""What is not sure of a rig because nobody is sure how long its cameras take to read an image.
+"""The uncertainty of a rig from that of its cameras' readout times.
 
-The rig is solved again with the readout of one camera a standard deviation longer. What residuals then say of it, they
-say beside the poses of views alone; the rest of the rig has followed by the part that they say less, and explains as
-much of the information on the readout.
+For each camera the rig is solved again with its readout one standard deviation longer. `readout_steps` holds all but
+the poses of views; the rest of the rig follows and explains a part of the residuals, which lowers the information on
+the readout by the same part.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from rigkit.calibration.solving.solver import FROM_OPTIMUM
 from rigkit.core.arrays import FloatArray
 
 MIN_LEFT = 0.05
-"""Part of the information on a readout that is its own, at least: less is rounding."""
+"""Least part of the information on a readout that remains: less is rounding error."""
 
 
 def readout_error(joint: JointRig) -> tuple[FloatArray, FloatArray]:
-    """Return what the errors of the readouts add to the covariance (G, G) of all globals, and their standard deviations
-    (n,); zeros where none was solved for."""
+    """Return the covariance (G, G) of all globals due to the errors of the readouts, to be added, and the standard
+    deviations (n,) of the readouts; zeros where none was solved for."""
     observations, state = joint.observations, joint.solution.state
     layout, cameras = state.layout(observations), len(state.cameras)
     out, sigmas = np.zeros((layout.count, layout.count)), np.zeros(cameras)

@@ -1,12 +1,12 @@
-"""Cameras without a common trigger: each lags by a time of its own behind the first, and boards go on meanwhile.
+"""Cameras without a common trigger: each has a time lag behind the first, in which boards move on.
 
-Lags are solved for with all else, with the boards' ways made anew from the poses that come out (`moments`), where the
-images speak for them. They stay where frames agree on them far beyond their scatter: boards that stand, or are
-elsewhere in every frame, say nothing of lags, and ways through such frames are no motion that a camera has seen.
+Lags are solved for together with all other unknowns, with the boards' trajectories (`moments`) recomputed from the
+resulting poses. They are kept only where frames agree on them far beyond their scatter: boards at rest, or placed anew
+for every frame, contain no information on lags, and trajectories through such frames are not real motion.
 
-A camera that runs freely lags by more in one frame than in the next. How much, between all frames, comes from how far
-views that share a pose disagree along their ways (expectation and maximisation); each picture's own time is then taken
-out of what it says.
+The lag of a free-running camera differs between frames. The standard deviation of that is estimated over all frames
+from the disagreement of views that share a pose, along their trajectories (expectation maximisation). The time of each
+image is then eliminated from its view.
 
 Reference: A. P. Dempster, N. M. Laird, D. B. Rubin, "Maximum likelihood from incomplete data via the EM algorithm",
 J. R. Statist. Soc. B 39 (1977), section 4.5, on variances of random effects.
@@ -33,21 +33,21 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.identifiers import last_number, natural_key
 
 CHANCE = 0.01
-"""Of cameras that are triggered together so few are taken for lagging, with lags that may be none in their sigmas."""
+"""Significance level: the part of triggered rigs that get lags by mistake, which are then consistent with zero."""
 MAX_ROUNDS, SETTLED = 8, 0.01
-"""Ways and times of pictures are found anew until the cost changes by less than this part, so many times at most."""
+"""Trajectories and times of images are recomputed until the cost changes by less than this part."""
 FIRST_SPREAD, MIN_SPREAD, SPREAD_ROUNDS = 0.1, 1e-4, 50
-"""By how much pictures of a camera lag differently, in the time between frames: where the search begins, the least that
-is told from nothing, and how many steps it makes."""
+"""Standard deviation of the lags of a camera's images, in the time between frames: the initial value, the least one
+that is distinguishable from zero, and the number of iterations."""
 ORDERS_DRAWN = 199
-"""Orders of the ways that are drawn for what chance does."""
+"""Random permutations of the trajectories in the test of scatter."""
 RIDGE, HELD = 1e-9, 1e12
-"""As parts of the largest information: keeps a pose that hardly a corner shows, and a time that is the frame's."""
+"""As parts of the largest information: regularises poses with few corners, and fixes the time that defines a frame."""
 
 
 def times_of(keys: Sequence[Key], frames: Mapping[Key, str]) -> FloatArray:
-    """Return the time of every key, (F,), in units of the usual time between two frames; NaN for views that share no
-    pose. The last numbers in the names of `frames` tell it, their order where these do not rise."""
+    """Return the time of every key, (F,), in units of the median time between two frames; NaN for views that share no
+    pose. It is the last number in the names of `frames`, or their order where these numbers do not increase."""
     names = sorted({frame for key, frame in frames.items() if key[0] == frame}, key=natural_key)
     in_names = [last_number(name) for name in names]
     numbers = np.array([float(n) if n.isdecimal() else 0.0 for n in in_names])
@@ -61,8 +61,8 @@ def times_of(keys: Sequence[Key], frames: Mapping[Key, str]) -> FloatArray:
 def with_lags(
     observations: RigObservations, solution: Solution[RigState], sigma_px: float, times: FloatArray, frames: IntArray
 ) -> tuple[RigObservations, Solution[RigState]]:
-    """Return the solution with lags and times of pictures, and the observations as rolling shutters leave them; or the
-    same where the frames do not surely tell of lags.
+    """Return the observations corrected for rolling shutters, and the solution with lags and times of images; or both
+    unchanged where the lags are not significant.
 
     `times` (F,) of the keys, `sigma_px` as for `solve_rig`, `frames` as for `frame_covariance`.
     """
@@ -89,7 +89,7 @@ def with_lags(
 def _solved_again(
     observations: RigObservations, lagging: Solution[RigState], sigma_px: float, times: FloatArray, *, own_times: bool
 ) -> Solution[RigState]:
-    """Return the solution with ways through the poses that have come out, and times of pictures by them."""
+    """Return the solution with trajectories through its own poses, and with the images' times estimated from them."""
     state = lagging.state
     assert state.moments is not None
     moments = _through(state.moments, state, observations, times)
@@ -102,9 +102,9 @@ def _solved_again(
 def _with_readouts(
     observations: RigObservations, lagging: Solution[RigState], sigma_px: float, times: FloatArray
 ) -> tuple[RigObservations, Solution[RigState]]:
-    """Return observations and solution with the readouts of rolling shutters, or the same where no camera surely has
-    one."""
-    # Imported here: scipy is slow to import, and few rigs ask.
+    """Return observations and solution with the readouts of rolling shutters, or both unchanged where no readout is
+    significant."""
+    # Imported here: scipy is slow to import, and few rigs need it.
     from scipy.special import stdtr
 
     step, sigma, freedom = readout_steps(observations, lagging.state)
@@ -126,26 +126,26 @@ def _with_readouts(
 
 def lags_of(names: Sequence[str], state: RigState, covariance: FloatArray, lags: slice) -> dict[str, Lag]:
     """Return the lags of all cameras but the first by their `names`, where they were solved for; `covariance` (G, G) is
-    that of the globals, of which they are the `lags`."""
+    that of the globals, among which the slice `lags` is theirs."""
     if state.moments is None:
         return {}
     sigmas, out = np.sqrt(np.diag(covariance)[lags]), {}
     for c, sigma in enumerate(sigmas.tolist(), 1):
         known = state.moments.information[c]
-        # Of pictures that show a frame alone, or first, nothing is known but the frame's.
+        # The only image, or the first, of a frame defines the frame's time: it has no scatter.
         scatter = float(np.std(state.moments.own[c][np.isfinite(known)])) if np.isfinite(known).any() else 0.0
         out[names[c]] = Lag(float(state.moments.lags[c]), sigma, scatter)
     return out
 
 
 def _through(moments: Moments, state: RigState, observations: RigObservations, times: FloatArray) -> Moments:
-    """Return the moments with ways through the poses of a state."""
+    """Return the moments with trajectories through the poses of a state."""
     targets = [target for _, target in observations.keys]
     return replace(moments, ways=ways_through(state.frame_rotation, state.frame_mm, targets, times))
 
 
 def _asked(observations: RigObservations, state: RigState, start: Moments, sigma_px: float) -> bool:
-    """Say whether a step with lags takes more off the cost than it does by chance."""
+    """Say whether a step with lags lowers the cost by more than chance would."""
     state = replace(state, moments=start)
     normal, more = rig_normal(observations, state, sigma_px), len(state.cameras) - 1
     step, before = normal.step(STEP_DAMPING), normal.cost / max(2 * observations.corner_count, 1)
@@ -154,8 +154,8 @@ def _asked(observations: RigObservations, state: RigState, start: Moments, sigma
 
 
 def _chance(observations: RigObservations, solution: Solution[RigState], sigma_px: float, frames: IntArray) -> float:
-    """Return the probability of such lags where there are none: Wald's test, with the scatter between frames."""
-    # Imported here: scipy is slow to import, and few rigs ask.
+    """Return the p-value of the lags: Wald's test, with the scatter between frames."""
+    # Imported here: scipy is slow to import, and few rigs need it.
     from scipy.special import fdtrc
 
     assert solution.state.moments is not None
@@ -166,8 +166,8 @@ def _chance(observations: RigObservations, solution: Solution[RigState], sigma_p
 
 
 def _with_own_times(state: RigState, moments: Moments, observations: RigObservations, sigma_px: float) -> Moments:
-    """Return the moments with how far the times of pictures scatter, by camera, and where each one probably lies, all
-    but poses as it is; `sigma_px` is the standard deviation of a corner."""
+    """Return the moments with the estimated time of every image and the standard deviation of a camera's times, with
+    all but the poses held; `sigma_px` is the standard deviation of a corner."""
     by_target = _by_target(state, observations)
     free = _free(by_target)
     products = _with_times(by_target, moments.speeds_at_all())
@@ -190,8 +190,8 @@ def _with_own_times(state: RigState, moments: Moments, observations: RigObservat
 
 
 def _by_target(state: RigState, observations: RigObservations) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what the views of n cameras say of the targets where they have seen them: information (n, F, 6, 6) and
-    score (n, F, 6); and how these places follow the poses, (n, F, 6, 6)."""
+    """Return the information (n, F, 6, 6) and score (n, F, 6) of the views of n cameras about the targets at the time
+    of the view, and the derivatives (n, F, 6, 6) of these target poses by the poses of the keys."""
     shape = len(state.cameras), len(observations.keys)
     information, score, follow = np.zeros((*shape, 6, 6)), np.zeros((*shape, 6)), np.zeros((*shape, 6, 6))
     follow[:] = np.eye(6)
@@ -208,8 +208,8 @@ def _by_target(state: RigState, observations: RigObservations) -> tuple[FloatArr
 
 
 def _with_times(by_target: tuple[FloatArray, FloatArray, FloatArray], speeds: FloatArray) -> FloatArray:
-    """Return the products (F, 6 + n, 7 + n) of every pose, of the derivatives by it and by the own times of n cameras,
-    and of the residual; targets have `speeds` (n, F, 6)."""
+    """Return the products (F, 6 + n, 7 + n) for every pose: of the derivatives by it and by the image times of n
+    cameras with each other and with the residual. Targets have `speeds` (n, F, 6)."""
     information, score, by_pose = by_target
     cameras, keys = score.shape[:2]
     follow = np.zeros((cameras, keys, 6, 6 + cameras))
@@ -222,15 +222,15 @@ def _with_times(by_target: tuple[FloatArray, FloatArray, FloatArray], speeds: Fl
 
 
 def _free(by_target: tuple[FloatArray, FloatArray, FloatArray]) -> BoolArray:
-    """Return whose own times are free, (F, n): of a frame's moments one is what its pose is of, that of the first
-    camera that sees it."""
+    """Return the mask (F, n) of the free image times: the pose of a frame is at the time of the first camera that sees
+    it, which is fixed."""
     shown = np.einsum("nfii->nf", by_target[0]) > 0.0
     return np.asarray((shown & (np.cumsum(shown, axis=0) > 1)).T)
 
 
 def _chance_of_scatter(state: RigState, observations: RigObservations, start: Moments, sigma_px: float) -> float:
-    """Return the probability that views agree so much better with times of their own where ways have nothing to do
-    with them: those of other frames serve as well then."""
+    """Return the p-value of the agreement gained by image times of their own: permuted trajectories, which have nothing
+    to do with the views, gain as much by chance."""
     by_target, rng = _by_target(state, observations), np.random.default_rng(0)
     free, known = _free(by_target), (sigma_px / FIRST_SPREAD) ** 2
     ways = start.ways[:, 0]

@@ -1,11 +1,11 @@
-"""When each camera took its pictures, and where targets were then: cameras without a common trigger.
+"""Times at which cameras without a common trigger took their images, and the targets' poses at these times.
 
-A camera lags behind the first by a time of its own, and each of its pictures by a little more or less. Meanwhile a
-target has gone on, along a polynomial of time through its poses in the frames before and after: the pose of key f has
-made the step  s(t) = sum_k ways[f, k] t^(k + 1)  after the time t. Times are in units of the time between two frames.
+Each camera has a constant lag behind the first, and each of its images a small deviation from it. Meanwhile a target
+moves along a polynomial in time through its poses in the frames before and after: at time t after key f its pose has
+changed by the step  s(t) = sum_k ways[f, k] t^(k + 1).  The unit of time is that between two frames.
 
-What a picture's own time does to it, the derivative u by that time, is taken out of its view before the rest is solved
-for: of the products M of the columns of a view,  M - (M u) (M u)^T / (u^T M u + information)  are left.
+The deviation of each image is eliminated from its view before the solution, with u the derivative of the pose by it:
+the products M of the columns of a view become  M - (M u) (M u)^T / (u^T M u + information).
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.geometry.board_pose import stepped
 
 POINTS, MIN_POINTS = 5, 3
-"""Poses that a way goes through, the frame's own counted in. Swings of 1.5 s, six frames a second: a fifth order's
-speeds are 1 % off in the middle and 5 % at the ends, a third order's 8 and 16 %."""
+"""Poses that a trajectory passes through, the frame's own included. For swings of 1.5 s at six frames a second, a
+fifth order's speeds are 1 % off in the middle and 5 % at the ends, a third order's 8 and 16 %."""
 WAY_REACH = 4.0
-"""So many times between two frames may lie between a frame and those that its way goes through."""
+"""Largest time between a frame and those through which its trajectory passes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """By how much a camera takes its pictures after the first of its rig, and the standard deviation of that; by how
-    much its pictures lag differently (standard deviation). In units of the usual time between two frames."""
+    """The time by which a camera lags behind the first of its rig, its standard deviation, and the standard deviation
+    of the lags of single images. In units of the median time between two frames."""
 
     frames: float
     sigma: float
@@ -40,15 +40,15 @@ class Lag:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Moments:
-    """The moments of pictures.
+    """The times of images.
 
     Attributes
     ----------
     lags : (n,) of the cameras, the first zero.
-    ways : (F, K, 6) of the targets, in the rig.
-    own : (n, F) by how much more a camera lags in the frame of a key.
-    information : (n, F) px^2 a squared unit, of `own` about zero; infinite where that is zero.
-    readouts : (n,) how long the cameras take to read an image (`shutters`).
+    ways : (F, K, 6) coefficients of the targets' trajectories, in the rig.
+    own : (n, F) deviation from the camera's lag in the frame of a key.
+    information : (n, F) px^2 per squared unit, prior of `own` around zero; infinite where `own` is fixed at zero.
+    readouts : (n,) readout times of the cameras (`shutters`).
     """
 
     lags: FloatArray
@@ -62,23 +62,23 @@ class Moments:
         return replace(self, lags=self.lags + np.append(0.0, step))
 
     def turned(self, turn: Mat3) -> Moments:
-        """Return the same in a rig that has been turned, (3, 3)."""
+        """Return the same in a rig rotated by `turn` (3, 3)."""
         return replace(self, ways=(self.ways.reshape(-1, 3) @ turn.T).reshape(self.ways.shape))
 
     def targets(self, c: int, key: IntArray, poses: tuple[Mat3, Points]) -> tuple[Mat3, Points]:
-        """Return rig_from_target of views (V,) of camera `c` at their own moments, from the `poses` of their keys."""
+        """Return rig_from_target of views (V,) of camera `c` at their own times, from the `poses` of their keys."""
         powers = self._times(c, key) ** np.arange(1.0, self.ways.shape[1] + 1.0)
         rotation, place = stepped(poses, np.einsum("vks,vk->vs", self.ways[key], powers))
         return rotation, place
 
     def speeds(self, c: int, key: IntArray) -> FloatArray:
-        """Return how the targets of views of camera `c` go on at their moments, (V, 6) a unit of time."""
+        """Return the speeds of the targets of views of camera `c` at their times, (V, 6) per unit of time."""
         order = np.arange(float(self.ways.shape[1]))
         speeds: FloatArray = np.einsum("vks,vk->vs", self.ways[key], (order + 1.0) * self._times(c, key) ** order)
         return speeds
 
     def speeds_at_all(self) -> FloatArray:
-        """Return the speeds of all targets at the moments of all cameras, (n, F, 6)."""
+        """Return the speeds of all targets at the times of all cameras, (n, F, 6)."""
         keys = np.arange(len(self.ways))
         return np.array([self.speeds(c, keys) for c in range(len(self.lags))])
 
@@ -87,8 +87,8 @@ class Moments:
         return times[:, None]
 
     def at_reference(self, part: PoseJacobians, c: int, meanwhile: Mat3, lag: int) -> PoseJacobians:
-        """Return how views of camera `c` follow the targets as they are at the first camera's moment, and the `lag`
-        among the globals, from how they follow them at their own: the targets have turned by `meanwhile` (V, 3, 3)."""
+        """Return the derivatives of views of camera `c` by the targets at the first camera's time, and by the `lag`
+        among the globals, from those by the targets at their own times, rotated by `meanwhile` (V, 3, 3) since."""
         speed, since = self.speeds(c, part.poses)[:, :, None], np.zeros((len(part.views), 6, 6))
         since[:, :3, :3], since[:, 3:, 3:] = meanwhile, np.eye(3)
         index, follow = part.index, part.globals
@@ -100,8 +100,8 @@ class Moments:
 def without_own_times(
     normal: NormalEquations, gone: FloatArray, own: FloatArray, information: FloatArray
 ) -> NormalEquations:
-    """Return the normal equations of a camera's views without the pictures' own times `own` (V,), by which their poses
-    have `gone` (V, 6) a unit of time: whatever these are, they cost `information` (V,) times their squares."""
+    """Return the normal equations of a camera's views with the images' own times `own` (V,) eliminated. These have the
+    prior `information` (V,) and change the poses of the views by `gone` (V, 6) per unit of time."""
     (products,), free = normal.products, np.isfinite(information)
     own, information, gone = (np.where(free, own, 0.0), np.where(free, information, 1.0), gone * free[:, None])
     pose = slice(-7, -1)
@@ -125,8 +125,8 @@ def without_own_times(
 
 
 def ways_through(rotation: Mat3, place: Points, targets: Sequence[str], times: FloatArray) -> FloatArray:
-    """Return the ways (F, POINTS - 1, 6) through the poses (F, 3, 3) and (F, 3) of `targets`, at `times` (F,): nothing
-    where they are not known, or where fewer than MIN_POINTS poses are near enough in time."""
+    """Return the trajectories (F, POINTS - 1, 6) through the poses (F, 3, 3) and (F, 3) of `targets`, at `times` (F,):
+    zeros where times are unknown, or where fewer than MIN_POINTS poses are within WAY_REACH."""
     ways = np.zeros((len(times), POINTS - 1, 6))
     for target in dict.fromkeys(targets):
         own = np.array([f for f, t in enumerate(targets) if t == target and np.isfinite(times[f])], dtype=np.int64)

@@ -1,8 +1,8 @@
-"""Rolling shutters: a camera reads its image row by row, and boards go on meanwhile.
+"""Rolling shutters: a camera reads its image row by row, while boards move.
 
-A corner that lies some part of the image's height below its middle is seen by this part of the camera's `readout` after
-the picture's time, and its board has gone on by as much (`moments`). A readout shows in residuals that no pose of a
-view explains. Corners are then taken where they were at the picture's time.
+A corner at some part of the image's height below its middle is exposed this part of the camera's `readout` time after
+the image's time, when its board has moved on (`moments`). A readout is observable in residuals that no pose of the view
+explains. Corners are then corrected to their positions at the image's time.
 
 References: C. Geyer, M. Meingast, S. Sastry, "Geometric models of rolling-shutter cameras", OMNIVIS 2005. L. Oth,
 P. Furgale, L. Kneip, R. Siegwart, "Rolling shutter camera calibration", CVPR 2013.
@@ -21,21 +21,21 @@ from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rotation import skew
 
 POSE_RIDGE = 1e-9
-"""As a part of the largest information: keeps the pose of a view that shows hardly a corner."""
+"""As a part of the largest information: regularises the pose of a view with few corners."""
 
 
 @dataclass(frozen=True, slots=True)
 class Readout:
-    """How long a camera takes from the first row of an image to the last, and the standard deviation of that, in units
-    of the usual time between two frames."""
+    """The time between the first and the last row of an image, and its standard deviation, in units of the median time
+    between two frames."""
 
     frames: float
     sigma: float
 
 
 def read_on(observations: RigObservations, state: RigState, steps: FloatArray) -> RigObservations:
-    """Return the observations with the corners taken where they are if the readouts of the n cameras are longer by
-    `steps` (n,)."""
+    """Return the observations with the corners corrected for readouts of the n cameras that are longer by `steps`
+    (n,)."""
     moved = [
         replace(own, pixels=own.pixels - step * _while_read(observations, state, c)[0])
         for c, (own, step) in enumerate(zip(observations.cameras, steps.tolist(), strict=True))
@@ -44,9 +44,9 @@ def read_on(observations: RigObservations, state: RigState, steps: FloatArray) -
 
 
 def readout_steps(observations: RigObservations, state: RigState) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return by how much longer the readouts of the n cameras are than the corners are taken for, their standard
-    deviations with views as what repeats, all but the views' poses as it is, and the degrees of freedom of these, (n,)
-    each; zeros where hardly more than one view tells."""
+    """Return the corrections of the readouts of the n cameras, their standard deviations, clustered by view, with all
+    but the views' poses held, and the degrees of freedom of these, (n,) each; zeros where hardly more than one view has
+    information."""
     found = [_step(*_told(observations, state, c)) for c in range(len(state.cameras))]
     step, sigma, freedom = np.array(found).T
     return step, sigma, freedom
@@ -63,7 +63,7 @@ def readouts_of(names: Sequence[str], state: RigState, sigmas: FloatArray) -> di
 def _step(score: FloatArray, information: FloatArray) -> tuple[float, float, float]:
     total = float(information.sum())
     share = information / total if total > 0.0 else np.ones(1)
-    # Views of much leverage count for several, and have pulled the readout to themselves (as in `clustered`).
+    # Views with high leverage count for several, and have pulled the readout towards themselves (as in `clustered`).
     freedom = 1.0 / float((share**2).sum()) - 1.0
     if freedom < 1.0:
         return 0.0, 0.0, freedom
@@ -87,8 +87,8 @@ def _told(observations: RigObservations, state: RigState, c: int) -> tuple[Float
 
 
 def _while_read(observations: RigObservations, state: RigState, c: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return how far the corners of camera `c` have gone when they are read, px a unit of readout (V, C, 2), their
-    derivatives by the pose of their view (V, C, 2, 6), and residuals (V, C, 2); zero where a corner is not used."""
+    """Return the displacement of the corners of camera `c` until they are read, px per unit of readout (V, C, 2), their
+    derivatives by the pose of the view (V, C, 2, 6), and residuals (V, C, 2); zero for corners that are not used."""
     own, alone = observations.cameras[c], state.of_camera(c, observations)
     points, lever = alone.points_in_cam(own)
     pixels, valid, by_point, _ = alone.camera.project_with_jacobians(points)
