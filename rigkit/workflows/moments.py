@@ -1,4 +1,4 @@
-"""Which images of several cameras were taken together: by the names of files and folders, else in the order given."""
+"""Grouping the images of several cameras by moment: by the names of files and folders, else in the order given."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.folder_session import cameras_in
 
 Moments = list[list[Path]]
-"""The images of every moment, one a camera."""
+"""The images of every moment, one per camera."""
 
 
 def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[Moments, list[Path]]:
-    """Return the moments that cameras called `names` saw, and images without a partner.
+    """Return the moments of the cameras `names`, and the images without a partner.
 
-    Sources are a folder a camera, called as the cameras or in their order; one folder, as `cameras_in` takes it; or the
-    images themselves: where their names, or those of their folders, are one but for the camera's, so; else moment by
-    moment, each in the order of the cameras. Raises InputError where they are not as many of each camera.
+    Sources are one folder per camera, named like the cameras or in their order; one folder, as for `cameras_in`; or the
+    images themselves. These are grouped by the names of files or folders if these are equal but for the camera's name,
+    else moment by moment, in the order of the cameras. Raises InputError for unequal numbers of images.
     """
     if len(names) == 1:
         return [[image] for image in images_in(sources)], []
@@ -44,10 +44,10 @@ def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[Moments, 
 
 
 def together(columns: Sequence[Sequence[Path]]) -> tuple[Moments, list[Path]]:
-    """Return the moments of which every camera has an image of one name, or number, and the images without a partner;
-    where names tell nothing, in their order.
+    """Return the moments of which every camera has an image of the same name or number, and the images without a
+    partner; images are paired in order where names give no pairs.
 
-    Raises InputError where the names tell nothing, and there are not as many images of each camera.
+    Raises InputError where they give none, and the cameras have unequal numbers of images.
     """
     try:
         known = frames_of_images({f"{k}": [path.name for path in own] for k, own in enumerate(columns)})
@@ -64,8 +64,8 @@ def together(columns: Sequence[Sequence[Path]]) -> tuple[Moments, list[Path]]:
 
 
 def _by_names(names: Sequence[str], images: Sequence[Path]) -> Moments:
-    """Return the moments of images whose names, or else their folders' names, are one but for the camera's; none where
-    that is not so of all."""
+    """Return the moments of images whose names, or whose folders' names, are equal but for the camera's name; [] where
+    some are not."""
     found: dict[tuple[str, str], dict[str, Path]] = {}
     for image in images:
         own = _sides(names, image.stem, f"{image.parent}") or _sides(names, image.parent.name, image.stem)
@@ -81,7 +81,7 @@ def _by_names(names: Sequence[str], images: Sequence[Path]) -> Moments:
 
 
 def _sides(names: Sequence[str], text: str, beside: str) -> dict[str, tuple[str, str]]:
-    """Return the cameras whose names stand in a text, and the text without it, with what is beside it."""
+    """Return for each camera whose name is in `text` the text without the name, and `beside`."""
     out = {}
     for name in names:
         more = r"\d" if name[-1].isdigit() else "[a-z]"

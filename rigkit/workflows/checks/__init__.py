@@ -1,1 +1,1 @@
-"""Does a calibration still hold? Against fresh images, another one, its register; and what it can measure."""
+"""Checks of a calibration: against fresh images, another calibration or its register; and its certificate."""

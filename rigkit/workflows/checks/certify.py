@@ -1,4 +1,4 @@
-"""From a calibration's file to a certificate of what can be measured with it."""
+"""From a calibration file to a certificate of the lengths that can be measured with it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from rigkit.workflows.outputs.provenance import digest_line, software_facts
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CertifyOptions(NamesFiles):
-    """The limit that a certificate is compared with, and where to write it."""
+    """The limit to compare with, and the files to write."""
 
     limit: float | None = None
     """Largest error allowed, in the unit of the task."""
@@ -35,16 +35,16 @@ class CertifyOptions(NamesFiles):
     cameras: tuple[str, str] | None = None
     """Two cameras of a rig; None: its first two."""
     report: Path | None = None
-    """File for a page to look at; None: no page."""
+    """File for the page; None: no page."""
     pdf: Path | None = None
-    """File for a sheet of A4 to sign; None: no sheet."""
+    """File for a sheet of A4 to sign; None: none."""
     force: bool = False
     """Replace files that exist; the calibration is never replaced."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class CertifiedFile:
-    """What was certified: the bound over the image, what its page says, and the files that were written."""
+    """The certificate: the bound over the image, the contents of its page, and the files that were written."""
 
     certificate: Certificate
     words: PageFacts
@@ -54,10 +54,10 @@ class CertifiedFile:
 
 
 def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = None) -> CertifiedFile:
-    """Certify how well a calibration or a rig measures `task`, and write what `options` ask for.
+    """Certify the errors of measuring `task` with a calibration or a rig, and write the files in `options`.
 
-    Raises InputError: no calibration, one without a covariance, a camera that the rig does not have, or a file that
-    cannot be written; DegenerateError: nowhere do all cameras see what is measured.
+    Raises InputError for a file that is no calibration or has no covariance, for an unknown camera, or a file that
+    cannot be written; DegenerateError where no point of `task` is in the fields of view of all cameras.
     """
     options = options or CertifyOptions()
     ensure_writable((options.report, options.pdf), force=options.force, inputs=[path])
@@ -85,9 +85,9 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
 def load_instrument(
     path: str | Path, cameras: tuple[str, str] | None = None, sigma_px: float | None = None
 ) -> Instrument:
-    """Return the camera of points in mm of a calibration's file, or two of a rig's, with what is known of their errors.
+    """Return the camera of a calibration file, for points in mm, or two cameras of a rig's, with their covariance.
 
-    Raises InputError for another file, or one that does not say how sure it is.
+    Raises InputError for another file, or one without a covariance.
     """
     rig = is_rig_file(path)
     if cameras is not None and not rig:

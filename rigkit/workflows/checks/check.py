@@ -1,4 +1,4 @@
-"""Does a calibration, or a rig, still hold? Fresh pictures of boards, or of any scene, against it."""
+"""Does a calibration, or a rig, still hold? A check with fresh images of boards, or of any textured scene."""
 
 from __future__ import annotations
 
@@ -61,34 +61,34 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckOptions(NamesFiles):
-    """What is in the pictures, what matters, and where the results go."""
+    """What the images show, which errors matter, and the files to write."""
 
     boards: tuple[Board, ...] = ()
-    """Boards that may be in the pictures; (): those of the calibration."""
+    """Boards that may be in the images; (): those of the calibration."""
     before: tuple[Path, ...] = ()
-    """Images of the time when the calibration was trusted, given as the fresh ones are: what they show of it already
-    is no change. (): fresh images are held against the file."""
+    """Images from the time when the calibration was trusted, given as the fresh ones are: errors that they show are not
+    reported as a change. (): fresh images are compared with the file."""
     scene: bool = False
-    """The pictures show any textured scene instead of boards (rigs)."""
+    """The images show any textured scene instead of boards (rigs)."""
     length: Task | None = None
-    """A length at a distance: what a change costs is told in mm."""
+    """A length at a distance: the effect of a change is stated for it, in mm."""
     fix: Path | None = None
-    """File for the calibration with the smallest change that explains the pictures, written where it does not hold
-    and one explains them; None: none is written."""
+    """File for the calibration with the smallest change that explains the images, written where the calibration does
+    not hold and a change explains them; None: none is written."""
     report: Path | None = None
-    """File for a page to look at; None: no page."""
+    """File for the page; None: no page."""
     history: Path | None = None
     """Register to which the check is added; None: none."""
     temperature_c: float | None = None
-    """When the pictures were taken, for the register."""
+    """Temperature when the images were taken, for the register."""
     force: bool = False
-    """Replace files that exist; what was read is never replaced, and the register only grows."""
+    """Replace existing files; input files are never replaced, and the register is only appended to."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class CheckedPictures:
-    """The verdict, what its page says, images without a board by the reason, those that cannot be used at all (cut
-    off, of another size), and the files that were written."""
+    """The verdict, the contents of its page, images without a board with the reason, unusable images (truncated, of
+    another size), and the files that were written."""
 
     check: SentinelCheck
     facts: PageFacts
@@ -102,13 +102,12 @@ class CheckedPictures:
 def check_pictures(
     path: str | Path, images: Sequence[str | Path], options: CheckOptions | None = None, *, progress: Progress = silent
 ) -> CheckedPictures:
-    """Check a calibration, or a rig, with fresh images (or folders of them).
+    """Check a calibration or a rig with fresh images, or folders of them; for a rig as for `moments_of`.
 
-    Of a rig give them as `moments_of` takes them. An image that cannot be read does not end the rest; its error is
-    raised where there is no other.
+    An unreadable image is skipped; its error is raised only where no other image is left.
 
     Raises InputError: no covariance, no images, none with a board, boards of another size, images of two cameras
-    exchanged, or a file that cannot be written; DegenerateError: pictures that say nothing of the camera.
+    exchanged, or a file that cannot be written; DegenerateError: images without information about the camera.
     """
     options, source = options or CheckOptions(), Path(path)
     monitored, known = load_monitored(source)
@@ -152,9 +151,9 @@ def check_pictures(
 
 
 def _files(source: Path, check: SentinelCheck, options: CheckOptions) -> dict[Path, str | bytes]:
-    """Return what is written, each with its place: the calibration corrected, and the page."""
+    """Return the contents of the files to write, by path: the corrected calibration, and the page."""
     files: dict[Path, str | bytes] = {}
-    # What holds needs no correction, and what nothing explains has none; flipped pictures are wrong themselves.
+    # No correction where it holds or where nothing explains the images; flipped images are themselves the error.
     right = check.holds or check.unexplained or bool(check.flipped)
     if options.fix is not None and check.change is not None and not right:
         files[options.fix] = fixed_text(source, check)
@@ -167,7 +166,7 @@ def _files(source: Path, check: SentinelCheck, options: CheckOptions) -> dict[Pa
 def _register(
     register: Path, source: Path, check: SentinelCheck, before: Sequence[Sequence[Path]], temperature_c: float | None
 ) -> None:
-    # Of words that say how it is computed, the digest.
+    # Only the digest, without the words on how it was computed.
     told = (digest_of_images([image for frame in before for image in frame]) or "").rpartition(": ")[2]
     place = as_seen_from(register, source)
     entry = HistoryEntry.of_check(check, place, digest=digest_of(source), baseline=told, temperature_c=temperature_c)
@@ -175,9 +174,9 @@ def _register(
 
 
 def load_monitored(source: Path) -> tuple[Monitored, tuple[Board, ...]]:
-    """Return what a file of a calibration or a rig says, and the whole boards it knows.
+    """Return the calibration or rig in a file, to check, and the complete boards that it describes.
 
-    Raises InputError for another file, or one that does not say how sure it is.
+    Raises InputError for another file, or one without a covariance.
     """
     require_sure(source)
     if not is_rig_file(source):
@@ -190,7 +189,7 @@ def load_monitored(source: Path) -> tuple[Monitored, tuple[Board, ...]]:
 
 
 def _monitored_rig(known: SavedRig, source: Path) -> Monitored:
-    """Return what a rig's file says; raises InputError for one that does not say how sure it is."""
+    """Return the rig in a file; raises InputError for one without a covariance."""
     lenses, covariance, sigma_px = known.stated(source)
     central = Monitored(
         names=tuple(known.cameras),
@@ -206,7 +205,7 @@ def _monitored_rig(known: SavedRig, source: Path) -> Monitored:
 
 
 def _as_known(boards: Sequence[Board], known: Sequence[Board]) -> tuple[Board, ...]:
-    """Return boards, one that the calibration knows as it knows it, by whatever name and way up it is given."""
+    """Return the boards, replaced by the calibration's own where it has them, under any name and orientation."""
     out: list[Board] = []
     for board in boards:
         alike = [own for own in known if difference(own, board) is None and _as_large(own, board) and own not in out]
@@ -228,8 +227,8 @@ def _as_large(one: Board, other: Board) -> bool:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _Pictures:
-    """Pictures of the cameras watched, by the boards that may be in them and those `known` to the file `source`, with
-    what was left out of them, and what could not be used, so far."""
+    """Images of the monitored cameras, the boards that may be in them, those `known` from the file `source`, and so far
+    the images left out and the unusable ones."""
 
     source: Path
     monitored: Monitored
@@ -240,7 +239,7 @@ class _Pictures:
     unreadable: list[str] = field(default_factory=list)
 
     def seen(self, frames: Sequence[Sequence[Path]], *, scene: bool) -> tuple[Look, list[FreshView]]:
-        """Return what frames say, given cameras, and the boards in them; none of a scene."""
+        """Return the evidence of frames as a function of the cameras, and the boards in them; no boards for a scene."""
         if scene:
             if len(self.monitored.cameras) < 2:
                 raise InputError(
@@ -261,12 +260,12 @@ class _Pictures:
         return (lambda now: evidence_of(now, views)), views
 
     def _read(self, frame: Sequence[Path]) -> list[Any]:
-        """Return the images of a moment, none where one cannot be used: why goes to `unreadable`."""
+        """Return the images of a moment, [] where one is unusable: the reason goes to `unreadable`."""
         images = [self._image(camera, path) for camera, path in zip(self.monitored.cameras, frame, strict=True)]
         return [] if any(image is None for image in images) else images
 
     def _image(self, camera: Camera, path: Path) -> Any:
-        """Return an image of the camera; None where it cannot be used, which goes to `unreadable`."""
+        """Return an image of the camera; None where it is unusable: the reason goes to `unreadable`."""
         try:
             return read_image_of(path, camera.size_px, self.source)
         except InputError as error:
@@ -274,7 +273,7 @@ class _Pictures:
             return None
 
     def _boards_seen(self, frames: Sequence[Sequence[Path]]) -> list[dict[str, Sequence[BoardDetection]]]:
-        """Return of every camera what each of its images shows; why one cannot be used goes to `unreadable`."""
+        """Return for every camera the detections in its images; the reasons of unusable ones go to `unreadable`."""
         total, cameras = sum(len(frame) for frame in frames), self.monitored.cameras
         found: list[dict[str, Sequence[BoardDetection]]] = [{} for _ in cameras]
         for k, frame in enumerate(frames):
@@ -294,7 +293,7 @@ def _views(
     boards: Sequence[Board],
     left_out: list[tuple[str, str]],
 ) -> list[FreshView]:
-    """Return the boards in all images; one without any goes to `left_out`, with the reason."""
+    """Return the boards in all images; an image without any goes to `left_out`, with the reason."""
     out: list[FreshView] = []
     own = [without_lookalikes(found, boards) for found in seen]
     whose = monitored.names if len(monitored.names) > 1 else (None,)
@@ -311,7 +310,7 @@ def _views(
 
 
 def _nothing_to_check(left_out: Sequence[tuple[str, str]], unreadable: Sequence[str], boards: Sequence[Board]) -> str:
-    """Return in words why no image shows a board."""
+    """Return a message on why no image shows a board."""
     if not left_out:
         return unreadable[0]
     total = len(left_out) + len(unreadable)
@@ -322,8 +321,8 @@ def _nothing_to_check(left_out: Sequence[tuple[str, str]], unreadable: Sequence[
 
 
 def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> None:
-    """Raise InputError where the images of two cameras of a rig exchanged say that it holds, or are explained by what
-    may happen to it while these are not: cameras of one lens might as well have changed their places."""
+    """Raise InputError where a rig's calibration holds for the images of two cameras exchanged, or a change explains
+    them exchanged but not as given: with equal lenses, the cameras may have changed places instead."""
     names = check.monitored.names
     for i, j in combinations(range(len(names)), 2):
         other = {i: j, j: i}
@@ -333,7 +332,7 @@ def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> No
         except (DegenerateError, InputError):
             continue
         if exchanged.holds or (check.unexplained and not exchanged.unexplained):
-            # Two cameras of one lens that were both turned look as if they had been exchanged.
+            # Two cameras with equal lenses, both turned upside down, look as if exchanged.
             how = f"exchanged, or {check.flipped}" if check.flipped else "exchanged"
             raise InputError(
                 f"check: the images of '{names[i]}' and '{names[j]}' are {how}: put right, they fit; give them in the "
@@ -342,17 +341,17 @@ def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> No
 
 
 def fixed_text(source: Path, check: SentinelCheck) -> str:
-    """Return the file `source` with the change that explains the pictures, and a finding that says so."""
+    """Return the text of the file `source` with the change that explains the images, and a finding that reports it."""
     data: dict[str, Any] = json.loads(source.read_text(encoding="utf-8"))
     monitored = load_monitored(source)[0]
-    # Of a change since pictures of before, that alone.
+    # Relative to images from before, only the change since then.
     fixed, own = monitored.changed(check.step), monitored.of_models
     since = "" if check.baseline is None else f" beside {check.baseline.frames} of before"
     message = Finding.look(
         f"corrected from {check.frames} fresh frames{since}: {check.change}; views and residuals are older",
         "calibrate anew when there is time",
     )
-    # What the lenses may do beyond their models the file says by itself; nothing that happens changes a pupil.
+    # The file states the inadequacy of the models separately; no hypothesis changes a pupil.
     covariance = np.array(data["covariance"]) + (check.covariance - check.monitored.covariance)[np.ix_(own, own)]
     if "cameras" in data:
         for entry, camera, pose in zip(data["cameras"], fixed.cameras, fixed.cam_from_rig, strict=True):

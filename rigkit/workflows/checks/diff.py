@@ -1,4 +1,4 @@
-"""Two calibrations, rigs, or sets of boards on one mount, against what their uncertainties predict."""
+"""Comparison of two calibrations, rigs, or sets of boards on one mount, given their covariances."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiffOptions(NamesFiles):
-    """Where the map of the difference of two cameras goes."""
+    """Where to write the map of the difference of two cameras."""
 
     output: Path | None = None
     """File for the map; None: no map."""
     report: Path | None = None
-    """A page that `write_diff_page` will write; its place is looked at before the work."""
+    """The page that `write_diff_page` will write; its path is checked before the work."""
     force: bool = False
-    """Replace a map that exists."""
+    """Replace an existing map."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -41,8 +41,8 @@ class CameraPair:
     Attributes
     ----------
     difference : over the image of the first.
-    judged : the difference compared with what both covariances predict; None where a file has no covariance, as those
-        of other tools.
+    judged : the difference compared with both covariances; None where a file has no covariance, such as those of other
+        tools.
     """
 
     difference: CameraDifference
@@ -52,7 +52,7 @@ class CameraPair:
 
     @property
     def same(self) -> bool | None:
-        """Whether it is the same camera; None: nobody can tell."""
+        """Whether both are the same camera; None where that cannot be decided."""
         return None if self.judged is None else self.judged.same
 
 
@@ -62,8 +62,8 @@ class RigPair:
 
     Attributes
     ----------
-    mounts : the difference of where the cameras are.
-    cameras : by name, the difference of each lens; it is judged where the calibrations lie beside both rigs.
+    mounts : the difference of the cameras' poses.
+    cameras : by name, the difference of each lens, tested where the calibrations are stored with both rigs.
     """
 
     mounts: RigDifference
@@ -73,7 +73,7 @@ class RigPair:
 
     @property
     def same(self) -> bool | None:
-        """Whether it is the same rig; None: nobody can tell."""
+        """Whether both are the same rig; None where that cannot be decided."""
         known = [s for s in (self.mounts.same, *(c.same for c in self.cameras.values())) if s is not None]
         return all(known) if known else None
 
@@ -86,14 +86,14 @@ class BoardsPair:
 
     @property
     def same(self) -> bool:
-        """Whether every board sits where it sat."""
+        """Whether every board has kept its pose."""
         return all(target.same is not False for target in self.targets.values())
 
 
 def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | RigPair | BoardsPair:
-    """Compare two calibration files, two files of rigs, or two of boards on one mount.
+    """Compare two files of calibrations, of rigs, or of boards on one mount.
 
-    Raises InputError for files of two kinds, rigs of other cameras or boards, or a map that cannot be written.
+    Raises InputError for files of different kinds, rigs of other cameras or boards, or a map that cannot be written.
     """
     options = options or DiffOptions()
     ensure_writable(options.report, force=options.force, inputs=(a, b))
@@ -178,14 +178,14 @@ def _rigs(a: Path, b: Path) -> RigPair:
 
 
 def _mounted(rig: SavedRig) -> Mounted:
-    """Return the cameras of a rig; mounts move with what their lenses may do beyond their models."""
+    """Return the cameras of a rig; the mounts are correlated with the inadequacies of the models."""
     lenses, covariance = rig.with_departures
     cameras = {name: (lens, pose) for lens, (name, (_, pose)) in zip(lenses, rig.cameras.items(), strict=True)}
     return Mounted(cameras, covariance, rig.freedom)
 
 
 def _named_like(rig: SavedRig, other: SavedRig, path: Path) -> SavedRig:
-    """Return another tool's rig, whose cameras have numbers for names, with the names of the other, in their order."""
+    """Return another tool's rig, whose cameras are numbered, with the names of the other rig in their order."""
     if is_rig_file(path) or len(rig.cameras) != len(other.cameras):
         return rig
     return replace(rig, cameras=dict(zip(other.cameras, rig.cameras.values(), strict=True)))

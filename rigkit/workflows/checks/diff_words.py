@@ -1,4 +1,4 @@
-"""A difference of two cameras, rigs or mounts as figures, in words, and as a page."""
+"""The difference of two cameras, rigs or mounts as figures, as text, and as a page."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ Pair = CameraPair | RigPair | BoardsPair
 
 
 def figures_of(pair: Pair) -> dict[str, Any]:
-    """Return the figures for programs."""
+    """Return the figures for machine-readable output."""
     if isinstance(pair, BoardsPair):
         return _boards_figures(pair)
     return _rig_figures(pair) if isinstance(pair, RigPair) else _camera_figures(pair)
 
 
 def words_of(pair: Pair) -> list[str]:
-    """Return what a person should know, in lines, the verdict last."""
+    """Return the difference as lines of text, the verdict last."""
     if isinstance(pair, BoardsPair):
         return _boards_in_words(pair)
     if isinstance(pair, RigPair):
@@ -39,7 +39,7 @@ def words_of(pair: Pair) -> list[str]:
 
 
 def facts_of(pair: Pair) -> PageFacts:
-    """Return what the page of a difference says."""
+    """Return the contents of the page of a difference."""
     *sentences, verdict = words_of(pair)
     cameras = _cameras_of(pair)
     tables = [_camera_table(cameras)] if cameras else []
@@ -49,7 +49,7 @@ def facts_of(pair: Pair) -> PageFacts:
         tables += [_mount_table(f"Boards with {name}", target) for name, target in pair.targets.items()]
     sentences = [line[0].upper() + line[1:] + "." for line in sentences]
     if isinstance(pair, CameraPair):
-        # The verdict's own figures first: how much, and how much is usual.
+        # First the verdict with its own figures: the difference, and the expected difference.
         verdict, sentences = f"{sentences[0][:-1]}; {verdict}", []
     return PageFacts(
         headline=verdict[0].upper() + verdict[1:] + ".",
@@ -61,7 +61,7 @@ def facts_of(pair: Pair) -> PageFacts:
 
 
 def write_diff_page(path: Path, pair: Pair, files: tuple[Path, Path], *, force: bool) -> None:
-    """Write the difference of two `files` as a page; its place was looked at by `diff`."""
+    """Write the difference of two `files` as a page; its path was checked by `diff`."""
     pictures = [
         (f"{name} difference over the image".strip(), partial(difference_png, own.difference))
         for name, own in _cameras_of(pair).items()
@@ -106,7 +106,7 @@ def _chance(value: float | None) -> str:
 
 
 def _camera_figures(pair: CameraPair) -> dict[str, Any]:
-    """Return the figures for programs; `same` is None where a file has no covariance."""
+    """Return the figures for machine-readable output; `same` is None where a file has no covariance."""
     judged, difference = pair.judged, pair.difference
     return {
         "rms_px": difference.rms_px,
@@ -134,7 +134,7 @@ def _camera_in_words(figures: dict[str, Any]) -> str:
         return line + NO_VERDICT
     low, high = figures["usual_px"]
     at = f" at {figures['rms_px']:.2g} px" if figures["verdict"] == CameraVerdict.UNIMPORTANT else ""
-    # No more than usual, and no chance all the same: it differs where, or in what, both are surer.
+    # Of normal size but significant: the difference is in a place or a direction that both know more precisely.
     how = "" if figures["same"] or figures["rms_px"] > high else ", but in a way of which both are surer than that"
     return line + (
         f"expected of one camera {figures['predicted_px']:.4f} px ({low:.3f} to {high:.3f} in nine of ten cases), "
@@ -185,7 +185,7 @@ def _rigs_in_words(pair: RigPair, figures: dict[str, Any]) -> list[str]:
     verdict = "the same rig" if figures["same"] else "NOT the same rig: a camera or a lens moved"
     scale, lenses = pair.mounts.scale, all(own.same is not False for own in pair.cameras.values())
     if scale is not None and lenses:
-        # Of two cameras only the distance between them tells.
+        # With two cameras, a scale and a shift along the baseline are indistinguishable.
         how = ", or one camera moved along the line between both" if len(figures["cameras"]) == 2 else ""
         verdict = (
             f"NOT the same rig: lengths of the second are {scale:.5g} times those of the first, and nothing else "

@@ -1,4 +1,4 @@
-"""A register of checks over months, and its page."""
+"""The register of checks over months, and its page."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from rigkit.workflows.outputs.provenance import digest_line, digest_of, software
 
 RECALIBRATION_GRID = (40, 30)
 MAX_CLOCK_DIFFERENCE = timedelta(days=1)
-"""Machines of one lab may differ by less: their zones, or how well their clocks are set."""
+"""Clocks of one lab's machines may differ by less, by time zone or by bad setting."""
 _log = logging.getLogger(__name__)
 
 
 def show_history(
     register: Path, *, report: Path | None = None, force: bool = False
 ) -> tuple[tuple[HistoryEntry, ...], tuple[Path, ...]]:
-    """Return the entries of a register by date and the files written: a page, where one is asked for.
+    """Return the entries of a register by date and the files written: the page `report`, unless None.
 
     Raises InputError for another file, or a page that cannot be written.
     """
@@ -76,7 +76,7 @@ def show_history(
 
 
 def _since(register: Path, entries: Sequence[HistoryEntry]) -> Iterator[str]:
-    """Yield which calibrations were overwritten since their last entry."""
+    """Yield messages on calibrations that were overwritten since their last entry."""
     last = {entry.watched: entry for entry in entries if entry.digest}
     for watched, entry in last.items():
         file = register.parent / watched
@@ -88,9 +88,9 @@ def _since(register: Path, entries: Sequence[HistoryEntry]) -> Iterator[str]:
 
 
 def add_to_history(register: Path, new: Path, reference: Path, *, temperature_c: float | None = None) -> None:
-    """Add a calibration made anew to a register, as a change of the `reference`.
+    """Add a new calibration of the same camera to a register, as a change of the `reference`.
 
-    Raises InputError for cameras of two models or sizes, and files that are no calibrations.
+    Raises InputError for cameras of different models or sizes, and files that are not calibrations.
     """
     ensure_register(register, [new, reference], temperature_c)
     now, before = load_calibration(new), load_calibration(reference)
@@ -102,7 +102,7 @@ def add_to_history(register: Path, new: Path, reference: Path, *, temperature_c:
             "the same model and degree to compare them number by number, or see `rigkit diff`"
         )
     with about(new, reference):
-        # Both follow what the lens does beyond its model.
+        # The model's inadequacy affects both calibrations alike, so it is left out.
         central = replace(before, pupil=None)
         watched = monitored_camera(central, reference.stem, beyond_model=False)
         check = evaluate_evidence(watched, lambda watched: _as_evidence(watched, now))
@@ -114,11 +114,11 @@ def add_to_history(register: Path, new: Path, reference: Path, *, temperature_c:
 
 
 def _as_evidence(watched: Monitored, calibration: Calibration) -> FreshEvidence:
-    """Return what another calibration says of the camera watched: its covariance is the inverse of its information. Its
-    free rotation is taken out first."""
+    """Return another calibration as evidence about the monitored camera: its information is the inverse of its
+    covariance. Its undetermined rotation is removed first."""
     camera, new = watched.cameras[0], calibration.camera
     difference = compare_cameras(camera, new, grid=RECALIBRATION_GRID)
-    # The same lens, told with the axis of the one watched.
+    # The same lens, with its axis rotated to that of the monitored one.
     pixels = grid_pixels(camera.size_px, RECALIBRATION_GRID).reshape(-1, 2)
     rays, valid = new.unproject(pixels)
     same = refit_camera(camera, rays[valid] @ difference.b_from_a, pixels[valid])
