@@ -1,1 +1,1 @@
-"""The coach: a local page that says what picture to take next, takes it, and says when there are enough."""
+"""The coach: a local page that says which image to take next, takes it, and says when there are enough."""

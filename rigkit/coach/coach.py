@@ -1,4 +1,4 @@
-"""The coach at work: looks at frames, takes those that help, keeps them, and goes on where it was left."""
+"""A capture session: looks at frames, takes those that add information, stores them, and resumes earlier sessions."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from rigkit.core.errors import InputError
 from rigkit.io.media.images import announced_sizes, quiet_opencv
 
 MAX_PICTURE_PX = 12000
-"""Of a picture that a page sends."""
+"""Largest side of an uploaded image."""
 LOOK_S = 0.06
-"""A look that takes longer is had at a smaller picture next time: ten of them fit into a second then."""
+"""Where a look takes longer, the next image is reduced: with it ten looks a second are possible."""
 MAX_SHRINK = 4
 MIN_WORTH = 0.05
-"""A frame of a recording that brings less than this part of what the outline would is left where it is."""
+"""Least gain, relative to that of a board in the outline, for which a frame of a recording is taken."""
 
 Image = NDArray[Any]
 
 
 def decoded(data: bytes) -> Image:
-    """Return the picture (H, W, 3) RGB in an upload, as the sensor has it, whatever way up it was held; raises
-    InputError where it is none, or too large."""
-    # Before a decoder makes room for them.
+    """Return the uploaded image (H, W, 3) RGB as on the sensor, without any EXIF rotation; raises InputError for data
+    that are no image, or too large a one."""
+    # Checked before a decoder allocates memory for them.
     sizes = announced_sizes(data)
     if not sizes or max(max(size_px) for size_px in sizes) > MAX_PICTURE_PX:
         raise InputError(f"coach: that is no picture of at most {MAX_PICTURE_PX} px a side; send a PNG or JPEG")
@@ -51,11 +51,11 @@ def decoded(data: bytes) -> Image:
 
 
 def ignored(_: object) -> None:
-    """Show, or tell, nobody."""
+    """Do nothing."""
 
 
 class Take(Enum):
-    """Whether a frame is kept: not at all, where it is worth it, or wherever a board is in it."""
+    """Whether a frame is kept: never, where its gain is large enough, or wherever it shows a board."""
 
     NO = "look"
     WORTH = "offer"
@@ -63,8 +63,8 @@ class Take(Enum):
 
 
 class Coach:
-    """A session of one camera, or of several whose frames are taken together. Frames may come from several threads;
-    each is dealt with by itself."""
+    """A session of one camera, or of several whose frames are taken together. Frames may come from several threads, and
+    are processed one at a time."""
 
     def __init__(
         self,
@@ -74,9 +74,9 @@ class Coach:
         tell: Callable[[str], None] = ignored,
         executor: Executor | None = None,
     ) -> None:
-        """Go on with what the keeper has. `finish` calibrates the session and says what came of it; `tell` is given a
-        line for every frame that is kept, for every photo that is not, and for what came of it; `executor` calibrates
-        meanwhile what there is, by default while all wait."""
+        """Resume with the frames of the keeper. `finish` calibrates the session and returns a summary; `tell` gets a
+        line for every frame kept, every photo not taken, and the summary; `executor` runs intermediate calibrations, by
+        default in the foreground."""
         self.guide, self.keeper = RigGuide(keeper.names, options, executor), keeper
         self._executor = executor
         self.finished: str | None = None
@@ -106,11 +106,11 @@ class Coach:
         source: str = "",
         show: Callable[[Sequence[Image]], None] = ignored,
     ) -> dict[str, Any]:
-        """Look at a frame, an image a camera, and say what to do, and whether it was kept. A `photo` was taken by
-        itself, of a board that was held as still as it shows; `source` is the file that it is from. `show` is given the
-        frame together with what is said of it.
+        """Look at a frame, one image per camera, and return the state for the page: what to do, and the frame's name if
+        it was kept. A `photo` is a single image of a board held still; `source` is its file. `show` gets the frame
+        together with the state.
 
-        Raises InputError for other cameras' images.
+        Raises InputError for another number of images or another image size.
         """
         names = self.keeper.names
         if len(images) != len(names):
@@ -119,7 +119,7 @@ class Coach:
             whole = photo or take is Take.YES
             frame_observations = self._observe(images, whole=whole, photo=photo)
             advice = self.guide.advise(frame_observations, photo=photo)
-            # A folder is looked through from its beginning again when the coach is started again.
+            # When the coach is restarted, a folder is read from its beginning again.
             again = self._marks.get(_mark(images)) if photo else None
             kept = take is Take.YES or (take is Take.WORTH and advice.take and again is None)
             taken = None
@@ -139,7 +139,7 @@ class Coach:
             return self._shown
 
     def _keep(self, images: Sequence[Image], frame_observations: Sequence[FrameObservation], source: str) -> str:
-        """Write a frame and go on with it; return its name."""
+        """Write a frame and add it to the guide; return its name."""
         name = self.keeper.keep(images)
         self._add(name, frame_observations, images)
         self._tell(f"{source}: taken as {name}" if source else f"{name} taken")
@@ -157,10 +157,9 @@ class Coach:
         self._shown = self.guide.state(frame_observations, advice) | {"looks": looks, "finished": self.finished, **more}
 
     def _observe(self, images: Sequence[Image], *, whole: bool, photo: bool) -> list[FrameObservation]:
-        """Return what all cameras show; what is not `whole` is looked at quickly, and where that is slow, in a
-        smaller picture."""
+        """Return what all cameras show; unless `whole`, by quick detection, in a reduced image where that is slow."""
         out, boards = [], self.guide.options.boards
-        # Until it is taken: then the part of a board that it shows is not that of the next.
+        # A temporary name, so that parts of boards in different frames get different names.
         frame = f"frame {len(self._names)}"
         for c, (image, name, lens) in enumerate(zip(images, self.keeper.names, self.guide.lenses, strict=True)):
             shrink = 1 if whole else self._shrink[c]
@@ -169,7 +168,7 @@ class Coach:
                 image, boards, frame, self._last[c], shrink=shrink, quick=not whole, camera=self._called[c]
             )
             if not whole:
-                # The work grows with the picture's area.
+                # Detection time is proportional to the image's area.
                 spent = (time.thread_time() - began) * shrink**2
                 self._shrink[c] = int(np.clip(np.ceil(np.sqrt(spent / LOOK_S)), 1, MAX_SHRINK))
             if lens.size_px not in (None, frame_observation.size_px):
@@ -178,11 +177,11 @@ class Coach:
         return out
 
     def say(self, words: str) -> None:
-        """Tell pages something between two frames."""
+        """Show a message on pages between two frames."""
         self._shown = self._shown | {"words": words}
 
     def state(self) -> dict[str, Any]:
-        """Return what was said last: for pages whose frames come from this machine, or are photos."""
+        """Return the latest state: for pages whose frames come from this machine, or are photos."""
         if self._shown.get("waits"):
             with self._lock:
                 none = [
@@ -195,7 +194,7 @@ class Coach:
         return self._shown | {"finished": self.finished}
 
     def take_shown(self) -> dict[str, Any]:
-        """Keep the frame that came from this machine last, whatever it is worth; raises InputError where there is no
+        """Keep the latest frame of this machine's cameras, whatever its gain; raises InputError where there is no
         new one."""
         if self._offered is None:
             raise InputError("coach: no new picture to take")
@@ -203,8 +202,8 @@ class Coach:
         return self.look(images, take=Take.YES, photo=photo)
 
     def choose(self, frames: Sequence[Sequence[Image]], show: Callable[[Sequence[Image]], None]) -> None:
-        """Take the frames that help most out of a recording, the best first, each of which is shown, until there are
-        enough or none that is left helps."""
+        """Take the frames with the largest gain from a recording, the best first, and show each, until there are enough
+        or none of the rest has a gain."""
         frame_observations: list[list[FrameObservation]] = []
         left = list(range(len(frames)))
         for images in frames:
@@ -222,7 +221,7 @@ class Coach:
                 self._show(frame_observations[best], self.guide.advise(frame_observations[best]), words=chosen)
 
     def undo(self) -> dict[str, Any]:
-        """Set the last frame aside; raises InputError where there is none."""
+        """Remove the last frame from the session; raises InputError where there is none."""
         with self._lock:
             if not self._names:
                 raise InputError("coach: there is no frame to undo")
@@ -238,7 +237,7 @@ class Coach:
             return self._shown
 
     def finish(self, missing: str = "") -> str:
-        """Calibrate the session, and say what came of it, and what is `missing`."""
+        """Calibrate the session, and return its summary followed by the message `missing`."""
         with self._lock:
             self.finished = self._finish() + missing
             self._tell(self.finished)
@@ -246,12 +245,12 @@ class Coach:
 
 
 def _mark(images: Sequence[Image]) -> bytes:
-    """Return what tells a frame from others: all its pixels."""
+    """Return a hash of all pixels of a frame."""
     return sha256(b"".join(np.ascontiguousarray(image).tobytes() for image in images)).digest()
 
 
 def _reason(frame_observations: Sequence[FrameObservation], advice: RigAdvice) -> str:
-    """Return why a picture is not taken."""
+    """Return why an image is not taken."""
     seeing = [frame_observation for frame_observation in frame_observations if frame_observation.view is not None]
     wrong = next((frame_observation.complaint for frame_observation in seeing if frame_observation.complaint), "")
     if not seeing:

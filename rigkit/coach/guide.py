@@ -1,4 +1,4 @@
-"""What to take next of one camera, whether a frame is worth taking, and when there are enough."""
+"""Guidance for one camera: what to take next, whether to take a frame, and when there are enough."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from rigkit.planning.plan import Plan, Proposal, covariance_of, plan_views
 from rigkit.planning.words import placement
 
 FIRST_FRAMES = 4
-"""Before so many frames there is no calibration: the coach goes by a guess of the lens."""
+"""Frames needed for a first calibration; before it, plans use a guessed lens."""
 ENOUGH_FRAMES = 8
-"""With fewer nobody can tell whether the lens model fits."""
+"""With fewer frames it cannot be tested whether the lens model fits."""
 CHECKING = "Wait a moment: is it enough?"
 MIN_GAIN = 0.6
-"""A frame that brings this part of what the outline would bring is taken, wherever the board is."""
+"""Least gain for which a frame is taken, relative to that of a board in the outline."""
 MIN_GAIN_OF_PHOTO = 0.2
-"""A photo is there already, and another like the outline may never come: five of these bring as much. One that takes
-MIN_GAIN_TO_CONTINUE of the error away is taken, too, however much more the outline would."""
+"""The same for a photo: it exists already, and one with the board in the outline may never come; five of these have its
+gain. A photo that lowers the error by MIN_GAIN_TO_CONTINUE is taken too, however much more the outline would."""
 MIN_GAIN_TO_CONTINUE = 0.05
-"""Where two more frames would bring less than this, there are enough."""
+"""Where two more frames would lower the error by less than this part, there are enough."""
 MODELS_TRIED = (("brown", 5), ("kannala_brandt", None))
 LIVE_GRID = (24, 16)
 TYPICAL_ERROR = CornerError(0.15, 0.05)
@@ -50,16 +50,16 @@ TYPICAL_ERROR = CornerError(0.15, 0.05)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuideOptions:
-    """What the pictures are for.
+    """The purpose of the images.
 
     Attributes
     ----------
     boards : those that may be shown.
-    hfov_deg : rough field of view across the image, until pictures say better.
-    goal_px : rms error of the projection at which there are enough; of a rig also of what one camera tells another.
-    goal_mm : error of `measured` at which there are enough, as well; None: only the projection counts.
-    measured : says of cameras, and of where they stand in their rig, what is to be measured with them, in mm; raises
-        DegenerateError where that is nowhere in view.
+    hfov_deg : approximate horizontal field of view, used until the first calibration.
+    goal_px : rms error of the projection at which there are enough; for a rig also with the mounts included.
+    goal_mm : error of `measured` that must be reached as well; None: only the projection counts.
+    measured : returns the goals, in mm, of what will be measured with cameras at their poses in the rig; raises
+        DegenerateError where that is outside all fields of view.
     reach : where boards can be held.
     """
 
@@ -71,19 +71,19 @@ class GuideOptions:
     reach: Reach = field(default_factory=Reach)
 
     def requirements(self, camera: Camera) -> tuple[Requirement, ...]:
-        """Return what is to become small of a camera alone: the error of its projection, and what is measured."""
+        """Return the requirements on a single camera: on the error of its projection, and on what is measured."""
         projection = Requirement(projection_goal(camera, self.reach.field_deg), self.goal_px)
         return projection, *self.lengths((camera,), (Rigid3.identity(),))
 
     def lengths(self, cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3]) -> tuple[Requirement, ...]:
-        """Return what is measured with cameras, as small as it is wanted; raises DegenerateError where that is nowhere
-        in view."""
+        """Return the requirements on what is measured with cameras; raises DegenerateError where that is outside all
+        fields of view."""
         if self.goal_mm is None or self.measured is None:
             return ()
         return tuple(Requirement(goal, self.goal_mm) for goal in self.measured(cameras, cam_from_rig))
 
     def stated(self, calibration: Calibration) -> str:
-        """Return in words what a calibration says of the goals: errors, and whether they are small enough."""
+        """Return in words the errors of a calibration, and whether they meet the requirements."""
         known = uncertain_camera(calibration)
         return stated_words(
             [requirement.remaining(known.covariance) for requirement in self.requirements(known.camera)]
@@ -92,18 +92,18 @@ class GuideOptions:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Advice:
-    """What the coach says.
+    """The coach's advice on a frame.
 
     Attributes
     ----------
     words : what to do now.
     target_px : (K, 2) outline to hold the board into.
-    worth : what this very frame brings, as a part of what a board in the outline would.
-    take : this very frame is worth taking.
+    worth : gain of this frame, relative to that of a board in the outline.
+    take : whether to take this frame.
     enough : there are enough frames.
-    waits : nothing is asked for, until it is known whether there are.
-    left : what the frames so far leave of what is to become small, the projection first; empty where nobody knows yet.
-    more_percent : what two more frames would bring.
+    waits : no instruction, until a calibration shows whether there are enough.
+    left : errors after the frames so far with their requirements, the projection first; empty before a calibration.
+    more_percent : reduction of the error by two more frames.
     """
 
     words: str
@@ -117,13 +117,13 @@ class Advice:
 
     @property
     def share(self) -> float:
-        """What is left as a part of what is wanted, the worst of it; infinite where nobody knows yet."""
+        """The largest error relative to its requirement; infinite before a calibration."""
         return max((own.share for own in self.left), default=np.inf)
 
 
 class CaptureGuide:
-    """Frames taken so far and what follows from them. All of `calibrate` is done by an executor, which may take its
-    time: until then a quick calibration will do, but there are not enough."""
+    """The frames taken so far and the advice that follows from them. An executor runs the full `calibrate`: until it
+    has finished, a quick calibration is used, but there are never enough frames."""
 
     def __init__(self, options: GuideOptions, executor: Executor | None = None) -> None:
         self.options = options
@@ -137,17 +137,17 @@ class CaptureGuide:
         self._map: list[list[float | None]] | None = None
 
     def add(self, view: BoardView, size_px: tuple[int, int]) -> None:
-        """Take a frame."""
+        """Add a frame."""
         self.size_px = size_px
         self.views.append(view)
         self._stale, self._plan, self._map = True, None, None
 
     @property
     def calibration(self) -> Calibration | None:
-        """What the frames so far say, once they say anything."""
+        """The calibration from the frames so far; None before there is one."""
         if self._whole.latest is not None:
             return self._whole.latest.calibration
-        # Many frames may come at once, when a session goes on: only then is there something to be asked of it.
+        # A resumed session adds many frames at once: it is calibrated only on demand.
         if self._stale and self.size_px is not None and len(self.views) >= FIRST_FRAMES:
             self._quick = _calibrated(self.views, self.size_px) or self._quick
         self._stale = False
@@ -155,21 +155,21 @@ class CaptureGuide:
 
     @property
     def has_many(self) -> bool:
-        """Whether there are frames enough to tell whether the lens model fits."""
+        """Whether there are enough frames to test whether the lens model fits."""
         return _distinct(self.views) >= ENOUGH_FRAMES
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether all of `calibrate` has been asked of all frames, and answered."""
+        """Whether the full `calibrate` has finished for all frames."""
         return not self._whole.is_new(self.views)
 
     @property
     def begun(self) -> BegunCalibration | None:
-        """What the latest of these calibrations found, for a rig's."""
+        """The intermediate results of the latest full calibration, for that of a rig."""
         return None if self._whole.latest is None else self._whole.latest.begun
 
     def _go_on(self) -> None:
-        """Take what has been calibrated meanwhile, and have calibrated what has come."""
+        """Use finished calibrations, and start one of new frames."""
         if self.size_px is None or not self.has_many:
             return
         if self._whole.go_on(self.views, self.size_px):
@@ -207,24 +207,24 @@ class CaptureGuide:
         )
 
     def asked(self, size_px: tuple[int, int]) -> Proposal:
-        """Return where the outline is."""
+        """Return the view that is asked for."""
         return self._planned(size_px).views[0]
 
     def camera(self, size_px: tuple[int, int]) -> Camera:
-        """Return the camera as far as it is known."""
+        """Return the present estimate of the camera."""
         return self._planned(size_px).knowledge.camera
 
     def corner_error(self, size_px: tuple[int, int]) -> CornerError:
-        """Return how wrong its corners are."""
+        """Return the error of its corners."""
         return self._planned(size_px).knowledge.error
 
     def pose_of(self, view: BoardView, size_px: tuple[int, int]) -> Rigid3 | None:
-        """Return where a board is; None where the lens does not see enough of it."""
+        """Return the pose of a board; None where the field of view has too little of it."""
         return _pose(self.camera(size_px), view)
 
     def _left(self, knowledge: Knowledge) -> tuple[RemainingError, ...]:
-        """Return what the frames leave of what is to become small: as all of `calibrate` states it for those that it
-        has had."""
+        """Return the errors after the frames so far with their requirements, scaled to those that the latest full
+        calibration states for its frames."""
         left = [
             requirement.remaining(covariance_of(knowledge.information))
             for requirement in self.options.requirements(knowledge.camera)
@@ -237,8 +237,8 @@ class CaptureGuide:
         return tuple(replace(own, error=own.error * factor) for own, factor in zip(left, factors, strict=True))
 
     def sigma_map(self) -> list[list[float | None]] | None:
-        """Return the rms error of the projection over the image, rows of LIVE_GRID px, None where the lens does not
-        see; None before there is a calibration."""
+        """Return the rms error of the projection over the image, as rows of LIVE_GRID px, None outside the field of
+        view; None before there is a calibration."""
         if self.calibration is None or self.size_px is None:
             return None
         if self._map is None:
@@ -282,13 +282,13 @@ class CaptureGuide:
         return knowledge
 
     def repeats(self, view: BoardView) -> bool:
-        """Say whether the board was not moved since a frame that is taken: the two count as one."""
+        """Say whether the board has not moved since a frame already taken: the two count as one."""
         return _distinct([*self.views, view]) == _distinct(self.views)
 
     def _gain(self, view: BoardView | None, plan: Plan, *, photo: bool) -> float:
-        """Return what this frame brings, as a part of what the outline would: nothing where the board was not moved
-        since one that is taken, for the two count as one. A photo that is new is worth taking as one of the first, and
-        where it takes enough off the error."""
+        """Return the gain of this frame, relative to that of a board in the outline: 0 where the board has not moved
+        since a frame already taken. A new photo is always good enough among the first frames, and later where it lowers
+        the error enough."""
         if view is None or self.repeats(view):
             return 0.0
         pose = _pose(plan.knowledge.camera, view)
@@ -297,25 +297,25 @@ class CaptureGuide:
         known = plan.knowledge
         more = known.of_views(held_view(view, pose), view.board.board_id)[0]
         worth = relative_gain(plan, float(plan.goal.error(covariance_of(known.information + more))), photo=photo)
-        # So few frames do not tell what others would bring.
+        # With so few frames the gain of others cannot be predicted.
         return max(worth, MIN_GAIN_OF_PHOTO) if photo and not self.has_many else worth
 
 
 def relative_gain(plan: Plan, after: float, *, photo: bool) -> float:
-    """Return what a frame that leaves the error `after` brings, as a part of what the first of the plan would; of a
-    photo also what it takes off the error counts."""
+    """Return the gain of a frame that leaves the error `after`, relative to that of the first view of the plan; for a
+    photo, its reduction of the error counts as well."""
     brings = (plan.error - after) / max(plan.error - plan.views[0].error, 1e-12)
     return max(brings, MIN_GAIN_OF_PHOTO / MIN_GAIN_TO_CONTINUE * (1.0 - after / plan.error)) if photo else brings
 
 
 def stated_words(left: Sequence[RemainingError]) -> str:
-    """Return errors in words, and whether they are small enough."""
+    """Return errors in words, and whether they meet their requirements."""
     each = (f"{own} ({'as wanted' if own.reached else f'wanted {own.requirement.wanted:g}'})" for own in left)
     return f"error {', '.join(each)}"
 
 
 def enough_words(left: Sequence[RemainingError], gain: float, camera: Camera | None = None) -> str:
-    """Return that there are enough frames, in words; of one `camera` also what an error comes to."""
+    """Return in words that there are enough frames; for one `camera` also the effect of the error at 1 m."""
     message = ", ".join(map(str, left)) if camera is None or len(left) > 1 else px_words(camera, left[0].error)
     missed = [f"{own.requirement.wanted:g} {own.requirement.goal.unit}" for own in left if not own.reached]
     if not missed:
@@ -324,12 +324,12 @@ def enough_words(left: Sequence[RemainingError], gain: float, camera: Camera | N
 
 
 def min_gain_of(*, photo: bool) -> float:
-    """Return what a frame has to be worth to be taken."""
+    """Return the least relative gain for which a frame is taken."""
     return MIN_GAIN_OF_PHOTO if photo else MIN_GAIN
 
 
 def _distinct(views: Sequence[BoardView]) -> int:
-    """Return how many views there are without those that repeat another."""
+    """Return the number of views without repeats."""
     if not views:
         return 0
     names = [f"{k}" for k in range(len(views))]
@@ -344,15 +344,15 @@ def _pose(camera: Camera, view: BoardView) -> Rigid3 | None:
 
 
 def held_view(view: BoardView, pose: Rigid3) -> HeldBoards:
-    """Return the corners of a view as a board that is held."""
+    """Return a view as a board with its corners seen in one pose."""
     seen = np.zeros((1, view.board.corner_count), dtype=bool)
     seen[0, view.board.index(view.grid)] = True
     return HeldBoards(view.board.points(), pose.rotation[None], pose.translation_mm[None], seen)
 
 
 def _calibrated(views: Sequence[BoardView], size_px: tuple[int, int]) -> Calibration | None:
-    """Return the better of the usual narrow and wide models, quickly; None where the views do not determine it. Boards
-    bow a little: taken for flat, they make the lens seem to be what it is not, once there are views enough to tell."""
+    """Return the better of a narrow and a wide model, fitted quickly; None where the views do not determine it. With
+    enough views boards may be warped: assuming them flat would bias the lens."""
     named = [replace(view, image=f"{k:04d}") for k, view in enumerate(views)]
     for board in ("warp", "flat") if len(views) >= ENOUGH_FRAMES else ("flat",):
         best: Calibration | None = None

@@ -1,4 +1,4 @@
-"""Frames on disk: every one that is taken is there at once, whole and lossless, with the session that calibrates it."""
+"""Frames on disk: each is written losslessly and atomically as soon as it is taken, beside the session file."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ FRAME_FOLDER = "images"
 
 
 def folder_of(name: str, count: int) -> str:
-    """Return the folder of the frames of the camera `name`, of `count`, in that of the session."""
+    """Return the frame folder of the camera `name`, one of `count`, relative to the session's."""
     return FRAME_FOLDER if count == 1 else f"{FRAME_FOLDER}/{name}"
 
 
 class Keeper:
-    """A session's folder: `session.toml`, the boards' files, and `images/frame-0001.png` and on; of several cameras
+    """A session's folder: `session.toml`, the boards' files, and `images/frame-0001.png` and so on; for several cameras
     `images/NAME/frame-0001.png`."""
 
     def __init__(self, folder: Path, files: dict[Path, str], names: Sequence[str] = (ONE,)) -> None:
-        """Make the folder, or go on with it. `files` (path -> text) are the session and its boards, `names` those of
+        """Make the folder, or resume the session in it. `files` (path -> text) are the session and its boards, `names`
         the cameras.
 
         Raises InputError where the folder holds another session.
@@ -59,8 +59,8 @@ class Keeper:
         return sorted(found, key=_number)
 
     def images(self) -> Iterator[tuple[str, list[NDArray[Any]]]]:
-        """Yield the frames taken before that are there of every camera, by name; one of which an image cannot be read
-        is told of, and left out."""
+        """Yield the earlier frames that all cameras have, by name; frames with an unreadable image are skipped with a
+        warning."""
         for name in self.frames:
             if all((place / name).exists() for place in self._places):
                 try:
@@ -69,7 +69,7 @@ class Keeper:
                     _log.warning("left out: %s", error)
 
     def keep(self, images: Sequence[NDArray[Any]]) -> str:
-        """Write a frame, every image whole or not at all, and return its name."""
+        """Write a frame, each image atomically, and return its name."""
         taken = self.frames
         name = FRAME_NAME.format(1 + (_number(taken[-1]) if taken else 0))
         for place, image in zip(self._places, images, strict=True):
@@ -78,14 +78,14 @@ class Keeper:
         return name
 
     def drop(self, name: str) -> None:
-        """Set a frame aside: it stays on disk, under a name that no session reads."""
+        """Remove a frame from the session: its files are renamed so that no session reads them."""
         for path in (place / name for place in self._places):
             if path.exists():
                 path.rename(_dropped_path(path))
 
 
 def _dropped_path(path: Path) -> Path:
-    """Return a name for a frame set aside that no other has: after it is undone, the next one is called as it was."""
+    """Return a unique name for a removed frame: after an undo, the next frame gets the same name."""
     dropped = path.with_suffix(".png.dropped")
     again = 1
     while dropped.exists():

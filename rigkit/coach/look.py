@@ -1,4 +1,4 @@
-"""One look at a frame: the board in it, and whether the picture is sharp, still and well exposed."""
+"""Evaluation of one frame: the board in it, and whether the image is sharp, still and well exposed."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
 
 MAX_EDGE_PX = 4.0
-"""Edges wider than this are blurred: by focus, or by a hand that moves."""
+"""Wider edges are blurred: by defocus, or by motion."""
 STILL_SHARE = 0.0015
-"""A board that moved by less than this part of the image's width since the last look is held still."""
+"""Largest motion since the last look of a board that is held still, as a part of the image's width."""
 MIN_BOARD_CONTRAST = 30.0
-"""Grey levels of 255 between black and white squares, at the least."""
+"""Least difference between white and black squares, in grey levels of 255."""
 MAX_CLIPPED = 0.2
-"""Part of the board's pixels that may be white without any detail."""
+"""Largest part of the board's pixels that may be saturated."""
 MAX_SAMPLED_PIXELS = 60_000
-"""So many pixels of the board tell its light and its edges as well as all."""
+"""Most pixels of the board used to estimate exposure and sharpness."""
 DARK_AND_BRIGHT = (5.0, 95.0)
 STEEPEST = 99.0
-"""Percentiles of the grey levels, and of the gradients, that count as black, white, and as edges."""
+"""Percentiles of grey levels for black and white, and of gradients for the edges."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -41,8 +41,8 @@ class FrameObservation:
     size_px : (width, height) of the frame.
     view : the largest board in it; None where there is none.
     edge_px : width of its edges.
-    moved_px : median way of its corners since the last look; None where there was none.
-    contrast, clipped : grey levels between its black and white, and the part that is white without detail.
+    moved_px : median displacement of its corners since the last look; None where it was not seen then.
+    contrast, clipped : difference of grey levels between black and white, and the part that is saturated.
     """
 
     size_px: tuple[int, int]
@@ -65,11 +65,11 @@ class FrameObservation:
         return self.contrast >= MIN_BOARD_CONTRAST and self.clipped <= MAX_CLIPPED
 
     def as_photo(self) -> FrameObservation:
-        """Return the glance at a picture that was taken by itself, of a board that was held as still as it shows."""
+        """Return the observation of a single photo, of which the board counts as held still."""
         return self if self.view is None else replace(self, moved_px=0.0)
 
     def shown(self) -> dict[str, Any]:
-        """Return what the page shows of it."""
+        """Return the part of the page's state about it."""
         return {
             "size_px": self.size_px,
             "corners": [] if self.view is None else np.round(self.view.pixels, 1).tolist(),
@@ -84,7 +84,7 @@ class FrameObservation:
 
     @property
     def complaint(self) -> str:
-        """What is wrong with the picture, in words; "" where nothing is."""
+        """What is wrong with the image, in words; "" where nothing is."""
         if self.view is None:
             return "show the whole board"
         if self.contrast < MIN_BOARD_CONTRAST:
@@ -106,9 +106,9 @@ def observe_frame(
     quick: bool = False,
     camera: str | None = None,
 ) -> FrameObservation:
-    """Return what a frame shows, `last` having been seen before it; the board is looked for at a `shrink`-th of the
-    size, and quickly, which takes less time and places corners less well. Parts of boards are called after the frame's
-    `name`, and after its `camera` where there are several."""
+    """Return what a frame shows, `last` being the previous observation. Detection in an image reduced by `shrink`, or
+    `quick`, takes less time and is less accurate. Parts of boards are named by the frame's `name`, and by its `camera`
+    where there are several."""
     size_px = (int(image.shape[1]), int(image.shape[0]))
     smaller = (
         image
@@ -128,7 +128,7 @@ def observe_frame(
     part = np.asarray(grey_image(cut), dtype=np.float32) * np.float32(255.0 / top)
     every = 1 + int(np.sqrt(part.size / MAX_SAMPLED_PIXELS))
     dark, bright = np.percentile(part[::every, ::every], DARK_AND_BRIGHT)
-    # Differences of neighbours, of some pixels.
+    # Central differences at a part of the pixels.
     inner = part[1:-1:every, 1:-1:every]
     rows, columns = inner.shape
     across = part[1:-1:every, 2::every][:, :columns] - part[1:-1:every, :-2:every][:, :columns]
@@ -145,7 +145,7 @@ def observe_frame(
 
 
 def _median_displacement_px(view: BoardView, last: FrameObservation | None) -> float | None:
-    """Return the median way, px, of the corners that were seen last time, too."""
+    """Return the median displacement, px, of the corners also seen by the last look."""
     if last is None or last.view is None or last.view.board.board_id != view.board.board_id:
         return None
     before = {(int(c), int(r)): p for (c, r), p in zip(last.view.grid, last.view.pixels, strict=True)}

@@ -1,8 +1,8 @@
-"""Several cameras whose frames are taken together: every lens by its own guide, and the mounts by the boards that two
-cameras see at once. Of one camera it is that camera's guide.
+"""Guidance for several cameras whose frames are taken together: each lens by its own guide, the mounts by the boards
+that two cameras see at once. For one camera it is that camera's guide.
 
-The lens that is worst off says what to do, until all are well; then the camera whose mount is least sure does; and then
-what all of the rig's calibration says of all frames, which alone tells whether there are enough.
+First the lens with the largest error determines the advice, until all have enough frames; then the camera with the
+least certain mount; then the calibration of the whole rig from all frames, which alone decides whether it is enough.
 """
 
 from __future__ import annotations
@@ -39,29 +39,29 @@ from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mou
 from rigkit.planning.words import placement
 
 SHARED_FRAMES = 5
-"""Fewer boards that two cameras see at once do not tell how these disagree."""
+"""With fewer boards seen by two cameras at once, their disagreement cannot be estimated."""
 MAX_HELP = 3.0
-"""A rig may know a lens so many times better than that does alone (2.6 in ten REAL frames of a pair of 63 degrees).
-Where a lens is farther from what is wanted the rig is not asked, which takes seconds: then it ends later."""
+"""Largest improvement of a lens by the rig over its own calibration (2.6 in ten REAL frames of a pair of 63 degrees).
+If a lens needs more, the rig is not calibrated, which takes seconds: the session then ends later."""
 TAKING = "Good: taking it"
 MAX_MARKS = 1500
-"""Corners that are drawn, at the most."""
+"""Most corners drawn."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigAdvice:
-    """What the coach says of the frames just seen.
+    """The coach's advice on the latest frame of all cameras.
 
     Attributes
     ----------
-    lenses : what each camera's guide says.
-    mount_px : how wrong the mounts are; None where nobody knows.
-    worth : what the frames bring, as a part of what a board in the outline would.
-    enough, waits : whether there are enough frames; whether nothing is asked for until that is known.
-    advised_camera : the number of the camera that the words are about.
-    targets : by camera the outline (K, 2) to hold the board into, None for none.
-    left, gain : once the rig was calibrated, what that leaves of what is to become small, and the part of the worst of
-        it that two more frames would take away.
+    lenses : advice of each camera's guide.
+    mount_px : error of the mounts; None before it can be estimated.
+    worth : gain of the frame, relative to that of a board in the outline.
+    enough, waits : whether there are enough frames; whether there is no instruction until that is known.
+    advised_camera : index of the camera that the words are about.
+    targets : for each camera the outline (K, 2) to hold the board into, or None.
+    left, gain : after a calibration of the rig, its errors with their requirements, and the relative reduction of the
+        worst of them by two more frames.
     """
 
     lenses: tuple[Advice, ...]
@@ -78,16 +78,16 @@ class RigAdvice:
 
     @property
     def more_percent(self) -> float | None:
-        """What two more frames would bring."""
+        """Reduction of the error by two more frames."""
         return self.lenses[self.advised_camera].more_percent if self.gain is None else 100.0 * self.gain
 
 
 class RigGuide:
-    """Frames that all cameras took together, and what follows from them."""
+    """Frames that all cameras took together, and the advice that follows from them."""
 
     def __init__(self, names: Sequence[str], options: GuideOptions, executor: Executor | None = None) -> None:
         self.names, self.options = tuple(names), options
-        # What several cameras measure, they measure together.
+        # A requirement on what is measured is one on the rig, not on single cameras.
         alone = options if len(names) == 1 else replace(options, goal_mm=None)
         self.lenses = tuple(CaptureGuide(alone, executor) for _ in names)
         self._whole = WholeCalibrations(executor or Here(), whole_rig)
@@ -97,7 +97,7 @@ class RigGuide:
         self._asked: dict[int, tuple[str, list[Pixels | None]]] = {}
 
     def add(self, frame_observations: Sequence[FrameObservation]) -> None:
-        """Take a frame of every camera."""
+        """Add a frame of every camera."""
         self.frames.append(tuple(frame_observations))
         self._shared.clear()
         self._asked.clear()
@@ -131,7 +131,7 @@ class RigGuide:
         return replace(advice, take=not complaint, words=complaint.capitalize() or TAKING)
 
     def _of_lenses(self, advice: RigAdvice, frame_observations: Sequence[FrameObservation]) -> RigAdvice:
-        """Return what the lens that is worst off says; where nobody knows an error, that with the fewest frames."""
+        """Return the advice for the lens with the largest error; without errors, for that with the fewest frames."""
         lenses = advice.lenses
         badly = [(a.enough, a.waits, -a.share, len(lens.views)) for lens, a in zip(self.lenses, lenses, strict=True)]
         advised_camera = min(range(len(lenses)), key=lambda c: badly[c])
@@ -154,7 +154,7 @@ class RigGuide:
         )
 
     def _of_mount(self, advice: RigAdvice, frame_observations: Sequence[FrameObservation]) -> RigAdvice:
-        """Return what the camera whose mount is least sure says."""
+        """Return the advice for the camera with the least certain mount."""
         c = advice.advised_camera
         if c not in self._asked:
             self._asked[c] = self._shared_target(c)
@@ -162,7 +162,7 @@ class RigGuide:
         return replace(advice, words=words, targets=tuple(targets), worth=self._mount_gain(c, frame_observations))
 
     def _of_rig(self, advice: RigAdvice, frame_observations: Sequence[FrameObservation], *, photo: bool) -> RigAdvice:
-        """Return what the rig's calibration says, once lenses and mounts seem good enough."""
+        """Return the advice by the rig's calibration, once lenses and mounts seem good enough."""
         self._go_on()
         steady = self._whole.steady(len(self.frames))
         if steady is None:
@@ -186,7 +186,7 @@ class RigGuide:
         return replace(advice, words=words, targets=tuple(targets), worth=worth)
 
     def _rig_is_enough(self, lenses: Sequence[Advice]) -> bool:
-        """Say whether the rig's calibration says so although some lens alone does not, as cameras help each other."""
+        """Say whether the rig's calibration is good enough although a lens alone is not: cameras help each other."""
         if not all(lens.has_many for lens in self.lenses):
             return False
         if not all(own.enough or own.share <= MAX_HELP for own in lenses):
@@ -200,8 +200,7 @@ class RigGuide:
             return False
 
     def _go_on(self) -> None:
-        """Take what has been calibrated meanwhile, and have calibrated what has come, once each lens is: the rig need
-        not find it again."""
+        """Use finished calibrations, and start one of new frames once each lens has its own: the rig reuses them."""
         if not all(lens.is_calibrated for lens in self.lenses):
             return
         frames = [[frame_observation.view for frame_observation in frame] for frame in self.frames]
@@ -222,7 +221,7 @@ class RigGuide:
         return int(np.argmax(counts))
 
     def _shared_of(self, c: int) -> SharedViews | None:
-        """Return the boards that camera `c` and its partner saw at once; None before there is one."""
+        """Return the boards that camera `c` and its partner saw at once; None where there are none."""
         if c not in self._shared:
             a = self._partner(c)
             pairs = [held for held in (self._held_by(a, c, frame) for frame in self.frames) if held is not None]
@@ -253,7 +252,7 @@ class RigGuide:
         return float(mount_error_px(shared, mount_information(shared).sum(axis=0)))
 
     def _mount_gain(self, c: int, frame_observations: Sequence[FrameObservation]) -> float:
-        """Return what this frame brings to the mount of camera `c`, as a part of what one more usual frame would."""
+        """Return the gain of this frame for the mount of camera `c`, relative to that of one more typical frame."""
         pair, shared = self._held_by(self._partner(c), c, frame_observations), self._shared_of(c)
         if pair is None:
             return 0.0
@@ -266,8 +265,8 @@ class RigGuide:
         return float((before - after) / max(before * typical, 1e-12))
 
     def _shared_target(self, c: int) -> tuple[str, list[Pixels | None]]:
-        """Return where to hold the board for the mount of camera `c`, in words and outlines: where both see all of it,
-        and it tells most."""
+        """Return where to hold the board for the mount of camera `c`, in words and outlines: completely in both views,
+        where it has most information."""
         a, shared = self._partner(c), self._shared_of(c)
         targets: list[Pixels | None] = [None] * len(self.names)
         words = f"Hold the board where {self.names[a]} and {self.names[c]} both see it"
@@ -290,7 +289,7 @@ class RigGuide:
         return f"{words}: {where} of {self.names[a]}", targets
 
     def state(self, frame_observations: Sequence[FrameObservation] | None, advice: RigAdvice | None) -> dict[str, Any]:
-        """Return what the page shows."""
+        """Return the state for the page."""
         out: dict[str, Any] = {"frames": len(self.frames), "least_frames": ENOUGH_FRAMES}
         if advice is not None:
             left = advice.left or advice.lenses[advice.advised_camera].left
@@ -320,7 +319,7 @@ class RigGuide:
 
 
 def _together(held: Sequence[HeldBoards]) -> HeldBoards:
-    """Return boards of one kind as one."""
+    """Return several poses of one board as one."""
     return HeldBoards(
         held[0].points_mm,
         np.concatenate([h.rotation for h in held]),

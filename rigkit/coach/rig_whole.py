@@ -1,7 +1,7 @@
-"""What `rigkit calibrate` says of all frames of a rig: whether there are enough, and what to take next where not.
+"""Full calibration of a rig from all its frames: whether there are enough, and what to take next where not.
 
-Lenses and mounts that are good enough each by itself need not be so together, and the rig may know its lenses better
-than they do alone. Only the rig's calibration is what the session will come to.
+Lenses and mounts that are each good enough may not be so together, and a rig may determine its lenses better than they
+do alone. Only the rig's calibration predicts the result of the session.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from rigkit.validation.sentinel.frames import Frames
 from rigkit.validation.sentinel.watch import monitored_rig
 
 Views = Sequence[BoardView | None]
-"""What the cameras saw at one moment, one a camera."""
+"""What the cameras saw at one moment, one entry per camera."""
 
 
 def whole_rig(
@@ -40,8 +40,8 @@ def whole_rig(
     sizes_px: Sequence[tuple[int, int]],
     begun: Sequence[BegunCalibration] = (),
 ) -> RigCalibration | None:
-    """Return what `calibrate` makes of frames of the cameras `names`; None where they do not determine the rig. `begun`
-    are the cameras as `whole_calibration` found them: most of the time goes by there."""
+    """Return the full calibration from frames of the cameras `names`; None where they do not determine the rig. `begun`
+    are intermediate results of `whole_calibration` for single cameras, which save most of the time."""
     views: dict[str, list[tuple[str, BoardView]]] = {name: [] for name in names}
     for k, frame in enumerate(frames):
         for name, view in zip(names, frame, strict=True):
@@ -55,10 +55,10 @@ def whole_rig(
 
 
 def left_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple[RemainingError, ...]:
-    """Return what a rig's calibration leaves of what is to become small: the error of each lens alone; that of all
-    projections, mounts included, where boards were; and of what is measured.
+    """Return the errors of a rig's calibration with their requirements: of each lens alone; of all projections, mounts
+    included, at the distance of the boards; and of what is measured.
 
-    Raises DegenerateError where that is nowhere in view.
+    Raises DegenerateError where that is outside all fields of view.
     """
     cameras, covariance = rig.quoted
     mounts = [own.cam_from_rig for own in rig.cameras]
@@ -76,7 +76,7 @@ def left_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple[RemainingEr
 
 @dataclass(frozen=True, eq=False)
 class RigKnown:
-    """What is known of a rig by its calibration, and what that leaves."""
+    """A calibrated rig, and its errors with their requirements."""
 
     monitored: Monitored
     left: tuple[RemainingError, ...]
@@ -84,12 +84,12 @@ class RigKnown:
 
     @classmethod
     def of(cls, rig: RigCalibration, options: GuideOptions) -> Self:
-        """Raises DegenerateError where what is to be measured is nowhere in view."""
+        """Raises DegenerateError where what is measured is outside all fields of view."""
         return cls(monitored_rig(rig), left_of_rig(rig, options), options)
 
     @cached_property
     def plan(self) -> Plan:
-        """The next two frames for what is farthest from what is wanted."""
+        """The next two frames for the error farthest from its requirement."""
         farthest, boards = max(self.left, key=lambda own: own.share), self.options.boards
         return Frames.of(self.monitored, boards, self.options.reach).plan(
             self.monitored, boards, farthest.requirement.goal, 2
@@ -114,7 +114,7 @@ class RigKnown:
         return f"Hold the board{together}: {where} of {names[first]}", targets
 
     def worth(self, frame: Views, *, photo: bool) -> float:
-        """Return what a frame brings, as a part of what the one asked for would."""
+        """Return the gain of a frame, relative to that of the view asked for."""
         monitored, plan = self.monitored, self.plan
         for camera, mount, view in zip(monitored.cameras, monitored.cam_from_rig, frame, strict=True):
             if view is None:

@@ -1,4 +1,4 @@
-"""The coach's page on this machine: nothing but the page's own requests, with the token of its address, is answered."""
+"""The local server of the coach's page: it answers only the page's own requests, with the token of its address."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from starlette.responses import Response
 
 MAX_UPLOAD_BYTES = 64_000_000
-"""A lossless picture of 20 megapixels."""
+"""A lossless image of 20 megapixels."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; img-src 'self' blob: data:; media-src 'self' blob:; "
     "style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -35,13 +35,13 @@ LOCAL = ("127.0.0.1", "localhost", "[::1]")
 
 
 def new_token() -> str:
-    """Return a token that nobody guesses."""
+    """Return a random token that cannot be guessed."""
     return secrets.token_urlsafe(24)
 
 
 def coach_app(coach: Coach, token: str, hosts: tuple[str, ...] = LOCAL, *, camera: str = "page") -> Starlette:
-    """Return the application. `hosts` are the names under which it may be asked; `camera` is "page" where the browser's
-    camera is used, "server" where frames come from this machine's, "folder" and "recording" where they are files.
+    """Return the application. `hosts` are the host names that it accepts; `camera` is "page" for the browser's camera,
+    "server" for cameras of this machine, "folder" and "recording" for files.
 
     Raises InstallationError where starlette is missing.
     """
@@ -91,14 +91,14 @@ def coach_app(coach: Coach, token: str, hosts: tuple[str, ...] = LOCAL, *, camer
             Route("/{token}/{what:str}", act, methods=["POST"]),
         ]
     )
-    # A redirect would come before the token and the host are looked at.
+    # A redirect would be sent before token and host are checked.
     app.router.redirect_slashes = False
     app.state.preview = coach_preview
     return app
 
 
 def _refused(request: Request, token: str, hosts: tuple[str, ...]) -> Response | None:
-    """Refuse what is not the page's own: another token, host or origin."""
+    """Return a refusal of requests that are not the page's own: another token, host or origin; else None."""
     from starlette.responses import PlainTextResponse
 
     given = str(request.path_params.get("token", ""))
@@ -120,7 +120,7 @@ def _refused(request: Request, token: str, hosts: tuple[str, ...]) -> Response |
 
 
 async def _body_of(request: Request) -> bytes | None:
-    """Return what was sent; None where it is too much, without reading it all."""
+    """Return the body of a request; None where it is too large, without reading all of it."""
     announced = request.headers.get("content-length", "0")
     if not announced.isdecimal() or len(announced) > len(str(MAX_UPLOAD_BYTES)) or int(announced) > MAX_UPLOAD_BYTES:
         return None
@@ -134,8 +134,8 @@ async def _body_of(request: Request) -> bytes | None:
 
 
 def _parts(data: bytes, sizes: str | None) -> list[bytes]:
-    """Return the pictures in what was sent, one after the other, each of so many bytes as `sizes` ("12,34") says;
-    raises InputError where these are not the whole."""
+    """Return the images in a body, which follow each other with the lengths in bytes given by `sizes` ("12,34");
+    raises InputError where these do not add up to the whole."""
     if sizes is None:
         return [data] if data else []
     announced = sizes.split(",")
@@ -160,10 +160,10 @@ def _done(coach: Coach, what: str, parts: list[bytes]) -> dict[str, Any] | None:
 
 
 def own_address() -> str:
-    """Return the address of this machine in its network; nothing is sent. Raises InputError where it has none."""
+    """Return the address of this machine in its network, without sending anything; raises InputError without one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            # Any address beyond this network will do: which of our own would be asked for it?
+            # Any address outside this network gives the interface by which it would be reached.
             probe.connect(("192.0.2.1", 9))
         except OSError as error:
             raise InputError("coach: --lan: this machine is in no network") from error
@@ -171,7 +171,7 @@ def own_address() -> str:
 
 
 def serve(app: Starlette, host: str, port: int, ready: Callable[[int], None]) -> None:
-    """Serve until Ctrl-C; `ready` is told the port, which 0 leaves to the system.
+    """Serve until Ctrl-C; `ready` is called with the port, which the system chooses for 0.
 
     Raises InstallationError where uvicorn is missing, InputError where the port is taken.
     """

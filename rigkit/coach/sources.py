@@ -1,4 +1,4 @@
-"""Frames that do not come from the page: folders that are watched, or cameras of this machine."""
+"""Frames that do not come from the page: from watched folders, or from cameras of this machine."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from rigkit.io.media.images import IMAGE_ENDINGS, read_image
 
 POLL_S = 0.3
 SETTLED_S = 0.2
-"""A file that has not grown for so long is whole."""
+"""A file that has not grown for this time is complete."""
 
 _log = logging.getLogger(__name__)
 
 
 class Frame(NamedTuple):
-    """An image a camera, taken together, and the file that it is from; "" of a camera."""
+    """One image per camera, taken together, and the file it is from; "" for a camera."""
 
     images: list[NDArray[Any]]
     source: str = ""
 
 
 def frames_of_folders(folders: Sequence[Path], *, until_idle_s: float = float("inf")) -> Iterator[Frame]:
-    """Return every picture in a folder, those to come as well, by name; of several folders, one a camera, those of one
-    name, or of one number, as soon as all are there. Ends when none has come for `until_idle_s`.
+    """Yield every image in a folder by name, also those still to come; of several folders, one per camera, the images
+    of the same name or number, as soon as all are there. Ends when none has come for `until_idle_s`.
 
-    Raises InputError at once where there is no such folder, later where it is gone. A picture that cannot be read is
-    told of.
+    Raises InputError at once for a missing folder, later where it has gone. An unreadable image is reported and
+    skipped.
     """
     for folder in folders:
         if not folder.is_dir():
@@ -59,7 +59,7 @@ def _polled_frames(folders: Sequence[Path], until_idle_s: float) -> Iterator[Fra
                 )
             except InputError as error:
                 _log.warning("left out: %s", error)
-                # A slow copy may have rested: it is read again once it has grown.
+                # A slow copy may have paused: it is read again once it has grown.
                 unread[name] = state
                 continue
             seen.add(name)
@@ -68,7 +68,7 @@ def _polled_frames(folders: Sequence[Path], until_idle_s: float) -> Iterator[Fra
 
 
 def _settled(paths: Sequence[Path]) -> tuple[tuple[int, int], ...] | None:
-    """Return when each picture was written, ns, and its bytes; None where one still is, or is gone while we look."""
+    """Return the time of writing, ns, and size of each file; None where one is incomplete, or has just gone."""
     try:
         found = [path.stat() for path in paths]
     except OSError:
@@ -86,7 +86,7 @@ def _pictures(folder: Path) -> list[Path]:
 
 
 def _moments(folders: Sequence[Path]) -> dict[str, list[Path]]:
-    """Return the pictures of every moment that all cameras have, one a camera, by its name and in its order."""
+    """Return by name, in order, the images of every moment that all cameras have, one per camera."""
     found = [_pictures(folder) for folder in folders]
     if len(found) == 1:
         return {path.name: [path] for path in found[0]}
@@ -94,7 +94,7 @@ def _moments(folders: Sequence[Path]) -> dict[str, list[Path]]:
     try:
         frames = frames_of_images({name: list(own) for name, own in by_path.items()})
     except InputError:
-        # Nothing yet that all have.
+        # No image yet that all cameras have.
         return {}
     moments: dict[str, dict[str, Path]] = {}
     for camera, own in frames.items():
@@ -104,8 +104,8 @@ def _moments(folders: Sequence[Path]) -> dict[str, list[Path]]:
 
 
 def device_frames(numbers: Sequence[int]) -> Iterator[Frame]:
-    """Return frames of cameras of this machine, the newest each time; raises InputError at once where there is none,
-    later where one is gone."""
+    """Yield the newest frames of cameras of this machine; raises InputError at once where there is none, later where
+    one has gone."""
     sources = [cv2.VideoCapture(number) for number in numbers]
     first = _moment(sources, numbers)
 
@@ -122,7 +122,7 @@ def device_frames(numbers: Sequence[int]) -> Iterator[Frame]:
 
 def _moment(sources: Sequence[cv2.VideoCapture], numbers: Sequence[int]) -> Frame:
     """Return an image of each camera; raises InputError where one gives none."""
-    # All are told to take theirs before any is fetched, so that they are of one moment.
+    # All are triggered before any image is fetched, so that they are of one moment.
     grabbed = [source.grab() for source in sources]
     read = [source.retrieve() if good else (False, None) for good, source in zip(grabbed, sources, strict=True)]
     silent = [f"{number}" for (got, frame), number in zip(read, numbers, strict=True) if not got or frame is None]

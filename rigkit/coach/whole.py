@@ -1,8 +1,8 @@
-"""What `rigkit calibrate` says of the frames so far. It takes seconds: another process finds it, and the page goes on.
+"""Full calibrations of the frames so far, in another process: they take seconds, during which the page stays live.
 
-A quick calibration takes a lens for one of two models and a board for bowed. All of `calibrate` tries every model and
-shape of board on frames held out, and counts in its sigmas that another may be the right one. Only that is what the
-session will come to, so only that may say that there are frames enough.
+A quick calibration assumes one of two lens models, and warped boards. The full `calibrate` compares all models and
+shapes of boards by cross-validation, and includes the inadequacy of the model in its covariance. The session will end
+with it, so only it decides whether there are enough frames.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from rigkit.core.progress import silent
 from rigkit.planning.information import Knowledge
 
 STEADY = 0.15
-"""By this part of itself the held-out error may differ from that of fewer frames. One that comes to nine others and is
-predicted 15 % worse in rms than they are together has residuals twice as large as theirs."""
+"""Largest relative change of the cross-validation error since fewer frames. For a tenth frame to raise the rms of nine
+by 15 % when predicted, its residuals must be twice as large as theirs."""
 
 
 class WithHeldOut(Protocol):
-    """What was calibrated with frames held out."""
+    """A calibration with a cross-validation error."""
 
     @property
     def heldout_rms_px(self) -> float | None: ...
@@ -42,8 +42,8 @@ Found = TypeVar("Found", bound=WithHeldOut)
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WholeCalibration:
-    """A calibration, what is known by it, for what is to be taken next, how sure it says that the lens is, and what its
-    rig need not find again."""
+    """A full calibration, the knowledge of the camera for planning, the camera with its covariance as stated to users,
+    and intermediate results that the rig's calibration reuses."""
 
     calibration: Calibration
     knowledge: Knowledge
@@ -56,7 +56,7 @@ class WholeCalibration:
 
 
 def whole_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> WholeCalibration | None:
-    """Return what `calibrate` makes of frames, each of which is an image; None where they do not determine the lens."""
+    """Return the full calibration from frames, one image each; None where they do not determine the lens."""
     named = [replace(view, image=f"{k:04d}") for k, view in enumerate(views)]
     request = Request(
         size_px=size_px, model="auto", degree=None, board="auto", folds=FOLDS, progress=silent, pupil="auto"
@@ -70,8 +70,8 @@ def whole_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> W
 
 
 class WholeCalibrations(Generic[Found]):
-    """Calibrations of the first frames of a capture, one at a time, by `calibrated`, which gets the frames and what
-    belongs to them, in another process. `latest` is that of most frames, of which there are `count`."""
+    """Calibrations of the first frames of a capture, one at a time, in another process, by `calibrated`, called with
+    the frames and further arguments. `latest` is that of the most frames, of which there are `count`."""
 
     def __init__(self, executor: Executor, calibrated: Callable[..., Found | None]) -> None:
         self.latest: Found | None = None
@@ -81,21 +81,21 @@ class WholeCalibrations(Generic[Found]):
         self._asked: tuple[int, Future[Found | None]] | None = None
 
     def go_on(self, frames: Sequence[Any], *given: object) -> bool:
-        """Take what has been calibrated meanwhile, and have calibrated what has come; say whether there is news."""
+        """Use finished calibrations, and start one of new frames; say whether any has finished."""
         news = False
         while True:
-            # A session that goes on has no held-out error of fewer frames to compare with.
+            # A resumed session has no error of fewer frames to compare with: these are calibrated too.
             self.ask(frames if self.is_new(frames) else frames[:-1], *given)
             if not self.arrived():
                 return news
             news = True
 
     def is_new(self, frames: Sequence[Any]) -> bool:
-        """Say whether so many frames have not been calibrated."""
+        """Say whether the calibration of this number of frames has not finished."""
         return len(frames) not in self._heldout_rms_px
 
     def ask(self, frames: Sequence[Any], *given: object) -> None:
-        """Have frames calibrated, if that is not known, and nothing else is under way."""
+        """Start a calibration of frames, unless it has finished or another is running."""
         if self._asked is not None or not self.is_new(frames):
             return
         try:
@@ -106,14 +106,14 @@ class WholeCalibrations(Generic[Found]):
         self._asked = len(frames), future
 
     def arrived(self) -> bool:
-        """Say whether there is a new one."""
+        """Say whether a new one has finished."""
         if self._asked is None or not self._asked[1].done():
             return False
         (count, future), self._asked = self._asked, None
         try:
             found = future.result()
         except (BrokenProcessPool, CancelledError):
-            # Without its process the page stands still for a moment, but the capture goes on.
+            # Without the process, calibrations block the page for a moment, but the capture goes on.
             self._executor = Here()
             return False
         self._heldout_rms_px[count] = None if found is None else found.heldout_rms_px
@@ -123,7 +123,7 @@ class WholeCalibrations(Generic[Found]):
         return True
 
     def steady(self, count: int) -> bool | None:
-        """Say whether the held-out error of so many frames is that of fewer; None: nobody knows yet."""
+        """Say whether the error of this number of frames agrees with that of fewer; None where one is missing."""
         before = max((n for n in self._heldout_rms_px if n < count), default=None)
         if before is None or count not in self._heldout_rms_px:
             return None
