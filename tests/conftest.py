@@ -14,11 +14,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 THOROUGH = Path(__file__).with_name("thorough.txt")
 LEFT_OUT = {line for line in THOROUGH.read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
-"""Names of tests, or of files: of all their tests."""
+"""Ids of tests, or names of files with all their tests."""
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """The quick run does not import a file of which it leaves out all."""
+    """Skip the import of files that the quick run leaves out completely."""
     quick = "not thorough" in config.getoption("markexpr") and collection_path.is_relative_to(ROOT)
     return True if quick and collection_path.relative_to(ROOT).as_posix() in LEFT_OUT else None
 
@@ -35,7 +35,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection(session: pytest.Session) -> None:
-    """The second of two processes imports the last file first: what one has compiled, the other need not compile."""
+    """Import the last file first in the second of two processes: code that one has compiled is cached for the other."""
     if getattr(session.config, "workerinput", {}).get("workerid") == "gw1":
         files = (file.resolve() for name in session.config.args for file in Path(name).rglob("test_*.py"))
         for file in sorted(files, reverse=True):
@@ -45,12 +45,12 @@ def pytest_collection(session: pytest.Session) -> None:
 
 
 def pytest_configure() -> None:
-    """Collecting makes very many objects that stay: nobody looks for circles among them again and again."""
+    """Switch garbage collection off while tests are collected: the many new objects stay, so each pass is wasted."""
     gc.disable()
 
 
 def pytest_collection_finish() -> None:
-    """From here on memory is cleared as ever, of what comes now."""
+    """Switch garbage collection on again, for objects created from now on."""
     gc.freeze()
     gc.enable()
 
@@ -63,7 +63,7 @@ def rng(request: pytest.FixtureRequest) -> np.random.Generator:
 
 @pytest.fixture(scope="session")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with left01.jpg, right01.jpg, ... of `helpers.stereo_pictures`, to read, not to write."""
+    """A folder with left01.jpg, right01.jpg, ... of `helpers.stereo_pictures`; read-only."""
     from helpers.stereo_pictures import write_pictures
 
     folder = tmp_path_factory.mktemp("pictures")
@@ -73,5 +73,5 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Commands start no processes of their own unless a test asks for some (-j 2): each costs seconds of imports."""
+    """Commands start no worker processes unless a test asks for them (-j 2): each costs seconds of imports."""
     monkeypatch.setattr("os.cpu_count", lambda: 1)

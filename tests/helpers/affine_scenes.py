@@ -24,7 +24,7 @@ GRID = np.stack(np.meshgrid(np.arange(6.0), np.arange(8.0)), axis=-1).reshape(-1
 
 @dataclass(frozen=True)
 class Corners:
-    """N corners of any number of pairs."""
+    """N corners of any number of image pairs."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -49,7 +49,7 @@ class Corners:
         return len(self.points)
 
     def directions(self, *, chords: bool = False) -> DirectionPairs:
-        """Horizontal, vertical, diagonal: exact derivatives, or the paper's chords to the next corner."""
+        """Directions along rows, columns and diagonals: exact derivatives, or the paper's chords to the next corner."""
         first, second = (self.chord1, self.chord2) if chords else (self.exact1, self.exact2)
         return DirectionPairs(image1=first, image2=second, valid=np.ones(first.shape[:2], dtype=bool))
 
@@ -71,7 +71,7 @@ def see(
 ) -> Corners | None:
     """Both views of boards at the given poses; None where a corner is behind a camera or too oblique."""
     seen = []
-    # Whether all are seen first: most poses that are drawn show one of them from the side.
+    # Visibility of all boards first: most random poses show one of them edge-on.
     for cam1_from_board in cam1_from_boards:
         flat = np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
         points = cam1_from_board.apply(flat)
@@ -163,7 +163,7 @@ def special_pairs(rng: np.random.Generator, trials: int, pose: str, turn_deg: fl
 def turned(
     directions: DirectionPairs, sigma_deg: float, rng: np.random.Generator, images: str = "12"
 ) -> DirectionPairs:
-    """Every direction turned by an independent Gaussian angle, its length kept."""
+    """Every direction rotated by an independent Gaussian angle, with its length unchanged."""
 
     def turn(d: np.ndarray) -> np.ndarray:
         angle = np.radians(sigma_deg) * rng.normal(size=d.shape[:-1])

@@ -1,4 +1,4 @@
-"""Three boards mounted to each other like the walls and the floor of a room's corner, before one camera or a rig."""
+"""Three boards arranged like the walls and the floor of a room's corner, seen by one camera or a rig."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ DIFFERENT = (Board("floor", 9, 6, 30.0, 30.0), Board("left", 8, 5, 30.0, 30.0), 
 
 
 def corner_of_a_room(rng: np.random.Generator, boards: Sequence[Board]) -> dict[str, Rigid3]:
-    """Return room_from_board: each board a little off a wall's edges, the walls a little off right angles."""
+    """Return room_from_board of boards shifted from a wall's edges, on walls that are not quite perpendicular."""
     axes = np.eye(3)
     out = {}
     for k, board in enumerate(boards):
         x, y = axes[k], axes[(k + 1) % 3]
-        # Seen from inside the corner the board's z axis goes into its wall.
+        # From inside the corner, the board's z axis points into its wall.
         rotation = exp_so3(np.radians(1.0) * rng.normal(size=3)) @ np.stack([y, x, np.cross(y, x)], axis=-1)
         out[board.board_id] = Rigid3(rotation, (40.0 + 15.0 * k) * x + (55.0 - 10.0 * k) * y)
     return out
 
 
 def looking_in(rng: np.random.Generator, distance_mm: float, spread: float = 0.25) -> Rigid3:
-    """Return rig_from_room of a rig that looks into the corner from somewhere along its diagonal."""
+    """Return rig_from_room of a rig that looks into the corner from a point near its diagonal."""
     look = -np.ones(3) / np.sqrt(3.0)
     right = np.cross(look, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -52,8 +52,8 @@ def target_views(
     fewest: int = 3,
     shuffled: bool = False,
 ) -> dict[str, list[tuple[str, BoardView]]]:
-    """Return frames in which every camera sees at least `fewest` boards; `shuffled`: boards of one size are named, and
-    counted from either end, at random in every image."""
+    """Return frames in which every camera sees at least `fewest` boards; `shuffled`: boards of equal size are named,
+    and numbered from either end, at random in every image."""
     out: dict[str, list[tuple[str, BoardView]]] = {name: [] for name in cameras}
     done = 0
     for _ in range(5000):

@@ -1,4 +1,4 @@
-"""Geometry-only captures of chessboards: exact corners of random trihedral scenes, and those of the kept captures."""
+"""Geometry-only captures of chessboards: exact corners of random trihedral scenes, and of the recorded captures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LAB_PAIRS = tuple(
 
 @dataclass(frozen=True)
 class Scene:
-    """Two views of some boards: exact pixels of every corner (NaN where not seen) and poses."""
+    """Two views of some boards: exact pixels of every corner (NaN where not visible) and poses."""
 
     boards: tuple[Board, ...]
     camera1: Camera
@@ -59,8 +59,8 @@ def view(boards: tuple[Board, ...], camera: Camera, cam_from_board: dict[str, Ri
 
 
 def trihedral_scene(rng: np.random.Generator, boards: tuple[Board, ...], camera: Camera) -> Scene:
-    """Three boards on the right wall, the floor and the left wall of a corner, shifted and turned at random in their
-    planes; two cameras that look at the corner from random places; all corners inside both images."""
+    """Three boards on the right wall, the floor and the left wall of a corner, shifted and rotated at random in their
+    planes; two cameras that look at the corner from random positions; all corners inside both images."""
     for _ in range(5000):
         cam1_from_world, cam2_from_world = _random_camera(rng), _random_camera(rng)
         world_from_board = {
@@ -86,7 +86,7 @@ def _random_camera(rng: np.random.Generator) -> Rigid3:
 
 
 def _on_wall(rng: np.random.Generator, board: Board, wall: int) -> Rigid3:
-    """world_from_board: z into the wall (-x, down or -z), turned in the plane by a quarter turn and +-20 degrees."""
+    """world_from_board: z into the wall (-x, down or -z), rotated in the plane by a quarter turn and +-20 degrees."""
     into = np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])[wall]
     along = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])[wall]
     level = np.stack([along, np.cross(into, along), into], axis=1)
@@ -110,7 +110,7 @@ def detection(
     *,
     named: bool = False,
 ) -> BoardDetection:
-    """A detection of the corners that are seen, in the board's own order, with noise."""
+    """A detection of the visible corners, in the board's own order, with noise."""
     seen = np.isfinite(pixels).all(axis=1)
     noise = 0.0 if rng is None else rng.normal(size=(len(pixels), 2)) * sigma_px
     noisy = (pixels + noise)[seen]
@@ -121,7 +121,7 @@ def detection(
 
 
 def lab_camera(truth: dict) -> KannalaBrandt:
-    """Kannala-Brandt fitted to the ray tracer's lens, theta = k1 r + k3 r^3: good to about 1e-3 px."""
+    """Kannala-Brandt fitted to the ray tracer's lens, theta = k1 r + k3 r^3: accurate to about 1e-3 px."""
     lens = truth["lens_truth"]
     radius_mm = np.linspace(0.0, 4.7, 400)
     theta = sum(k * radius_mm ** (i + 1) for i, k in enumerate(lens["k"]))
@@ -129,7 +129,7 @@ def lab_camera(truth: dict) -> KannalaBrandt:
 
 
 def lab_scene(name: str) -> Scene:
-    """The exact corners of one kept capture; skips where they are absent."""
+    """The exact corners of one recorded capture; skips the test where it is absent."""
     truth = json.loads((shared_data("lab-a") / "captures" / name / "truth.json").read_text())
     size = truth["board"]
     ids = sorted(truth["view1"])
@@ -149,7 +149,7 @@ def lab_scene(name: str) -> Scene:
 
 
 def scrambled(detections: list[BoardDetection], rng: np.random.Generator) -> list[BoardDetection]:
-    """The detections in random order, each that looks the same turned by 180 degrees turned at random."""
+    """The detections in random order, those of rotationally symmetric boards turned by 180 degrees at random."""
     return [
         d.turned(2 * int(rng.integers(2))) if (d.columns + d.rows) % 2 == 0 else d
         for d in (detections[k] for k in rng.permutation(len(detections)))
@@ -159,7 +159,7 @@ def scrambled(detections: list[BoardDetection], rng: np.random.Generator) -> lis
 def both_views(
     scene: Scene, rng: np.random.Generator, sigma_px: float = 0.05
 ) -> tuple[list[BoardDetection], list[BoardDetection]]:
-    """Nameless, shuffled detections of all boards in both images."""
+    """Shuffled detections, without names, of all boards in both images."""
     views = []
     for pixels in (scene.pixels1, scene.pixels2):
         found = [detection(b, pixels[b.board_id], rng, sigma_px) for b in scene.boards]
@@ -168,7 +168,7 @@ def both_views(
 
 
 def true_corners(found: BoardDetection, pixels: dict[str, np.ndarray]) -> tuple[str, np.ndarray]:
-    """Which board a detection really is, and which of its corners each corner is; found by position."""
+    """The true board of a detection, and the index of each of its corners there; found by position."""
     distance = {i: np.linalg.norm(p[:, None] - found.pixels[None], axis=-1) for i, p in pixels.items()}
     board_id = min(distance, key=lambda i: np.nanmax(np.nanmin(distance[i], axis=0)))
     return board_id, np.nanargmin(distance[board_id], axis=0)
@@ -183,8 +183,8 @@ def noisy_pair(
     known_as: Camera | None = None,
     declared: Sequence[Board] | None = None,
 ) -> MatchedPair:
-    """Match the boards of a scene from corners with noise, as one camera `known_as` sees them, or the scene's own, and
-    as other boards where those are `declared`."""
+    """Match the boards of a scene from noisy corners, with the camera `known_as` for the scene's own, and with the
+    boards `declared` for the true ones."""
     one, two = (
         [detection(b, np.array(d.pixels), rng, sigma_px) for b, d in zip(boards, exact, strict=True)]
         for exact in scene.detections()

@@ -1,4 +1,4 @@
-"""Pages in a real browser: a probe, a script at their end, says what it found."""
+"""Pages in a real browser: a probe, a script at the end of the page, reports its results."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ QUIET = [
 
 
 def chromium() -> str:
-    """Return Chromium's command; skips the test where there is none."""
+    """Return Chromium's command; skips the test where it is not installed."""
     for name in ("chromium", "chromium-browser", "google-chrome"):
         found = shutil.which(name)
         if found:
@@ -34,7 +34,7 @@ def chromium() -> str:
 
 
 def loaded(page: Path, *options: str, seconds: float = 120.0) -> str:
-    """Return a page as it is when its scripts have run; nothing may be written to the console."""
+    """Return the HTML of a page after its scripts have run; fails on any console output."""
     profile = f"--user-data-dir={page.with_suffix('.profile')}"
     command = [chromium(), *QUIET, *options, profile, "--dump-dom", page.as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=True)
@@ -43,7 +43,7 @@ def loaded(page: Path, *options: str, seconds: float = 120.0) -> str:
 
 
 def probed(text: str, folder: Path) -> list[str]:
-    """Return what the probe in a page left in `document.body.dataset.probe`, split at its bars."""
+    """Return the results of the probe in `document.body.dataset.probe`, split at its bars."""
     page = folder / "page.html"
     page.write_text(text, encoding="utf-8")
     reported = re.search(r'data-probe="([^"]*)"', loaded(page))

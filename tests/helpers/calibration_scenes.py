@@ -1,4 +1,4 @@
-"""Synthetic calibration views with everything known: lenses from 60 to 200 degrees, boards anywhere in their view."""
+"""Synthetic calibration views with known truth: lenses of 60 to 200 degrees, boards anywhere in their field of view."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CENTRE = np.array([808.0, 615.0])
 
 
 def lens(name: str, centre: FloatArray = CENTRE) -> Camera:
-    """Return one of the lenses with its optical axis at `centre`."""
+    """Return the lens of this name with its optical axis at `centre`."""
     return LENSES[name](np.asarray(centre, dtype=float))
 
 
@@ -57,7 +57,7 @@ def random_views(
     for _ in range(20000):
         if len(views) == count:
             break
-        # Uniform in the image's radius, so that the rim is visited as often as it is large.
+        # Density proportional to the angle from the axis: uniform over the area of an equidistant image.
         angle = np.radians(reach_deg) * np.sqrt(rng.random())
         about = rng.uniform(-np.pi, np.pi)
         direction = np.array([np.sin(angle) * np.cos(about), np.sin(angle) * np.sin(about), np.cos(angle)])
@@ -93,7 +93,7 @@ def noisy_view(
     *,
     board: Board = BOARD,
 ) -> BoardView:
-    """Return the view of a board in one pose: its corners that are on the image."""
+    """Return the view of a board in one pose: its corners inside the image."""
     pixels, valid = camera.project(cam_from_board.apply(board.points()))
     valid &= camera.on_image(pixels)
     noisy = pixels[valid] + noise_px * rng.standard_normal((int(valid.sum()), 2))
@@ -102,7 +102,7 @@ def noisy_view(
 
 
 def with_outliers(views: list[BoardView], share: float, size_px: float, rng: np.random.Generator) -> list[BoardView]:
-    """Return the views with a share of the corners moved by `size_px` in random directions."""
+    """Return the views with a part of the corners moved by `size_px` in random directions."""
     out = []
     for view in views:
         pixels = view.pixels.copy()
@@ -118,7 +118,7 @@ def with_outliers(views: list[BoardView], share: float, size_px: float, rng: np.
 def projection_difference(
     camera: Camera, truth: Camera, reach_deg: float, *, covered: FloatArray | None = None
 ) -> FloatArray:
-    """Return |pixel - true pixel| over the image out to `reach_deg`, after the rotation that makes it smallest.
+    """Return |pixel - true pixel| over the image out to `reach_deg`, after the rotation that minimises it.
 
     `covered` (M, 2): only grid pixels within 30 px of one of these.
     """
@@ -145,13 +145,13 @@ def projection_difference(
 
 
 def _facing(direction: FloatArray) -> FloatArray:
-    """Return the rotation of a board that looks straight at the camera from `direction`."""
+    """Return the rotation of a board in `direction` that faces the camera."""
     helper = np.array([1.0, 0.0, 0.0]) if abs(direction[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     x = unit(cross(cross(direction, helper), direction))
     return np.stack([x, cross(direction, x), direction], axis=-1)
 
 
 def heldout(result: Calibration | Candidate) -> float:
-    """Return the held-out error of what has one."""
+    """Return the cross-validation error; fails where there is none."""
     assert result.heldout_rms_px is not None
     return result.heldout_rms_px

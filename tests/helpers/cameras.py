@@ -1,4 +1,4 @@
-"""Cameras with every parameter non-trivial, one or more a model, for tests that run over the registry."""
+"""Cameras with every parameter non-trivial, one or more per model, for tests over the registry."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rigkit.cameras.registry import MODELS, camera_model
 
 SIZE_PX = (1280, 960)
 
-# A lens of 2 x 100 degrees as a polynomial: f(rho) of a0 .. a6 in units of 450 px, made to be monotone.
+# A lens of 2 x 100 degrees as a polynomial: f(rho) of a0 .. a6 in units of 450 px, chosen to be monotonic.
 _SCARAMUZZA = np.array([1.0, -0.31, 0.02, -0.015, 0.003, -0.002])
 
 PARAMETERS: dict[str, list[float]] = {
@@ -29,7 +29,7 @@ PARAMETERS: dict[str, list[float]] = {
 
 
 def sample_cameras() -> dict[str, Camera]:
-    """Return cameras by label; every model of the registry is among them, or this raises."""
+    """Return cameras by label; raises where a model of the registry is missing."""
     cameras: dict[str, Camera] = {}
     for label, parameters in PARAMETERS.items():
         name = next(m for m in sorted(MODELS, key=len, reverse=True) if label.startswith(m))

@@ -23,7 +23,7 @@ def shared_data(sub: str) -> Path:
 
 
 def read_grey(path: Path) -> np.ndarray:
-    """Return the image as OpenCV reads it in shades of grey; a test whose image is missing fails."""
+    """Return the image in grey levels as OpenCV reads it; fails where it is missing."""
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     assert image is not None, path
     return image

@@ -1,4 +1,4 @@
-"""Clouds seen from their origin: a square before a wall."""
+"""Point clouds with a depth edge: a square in front of a wall, seen from the origin."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from rigkit.core.cloud import OrientedCloud
 
 NEAR_MM, FAR_MM, HALF = 1000.0, 4000.0, 0.2
-"""A square at one distance before a wall at another, half its side over its distance."""
+"""Distances of the square and the wall, and the square's half side over its distance."""
 
 
 def cloud_of(points: np.ndarray, normals: np.ndarray) -> OrientedCloud:

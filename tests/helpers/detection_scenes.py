@@ -1,4 +1,4 @@
-"""Rendered chessboard scenes with exact corners, and how detections are held against them."""
+"""Rendered chessboard scenes with exact corners, and the comparison of detections with them."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class Scene:
     cam_from_world: Rigid3
 
     def image(self, rng: np.random.Generator, *, blur_px: float = 0.7, **photometry: Any) -> np.ndarray:
-        # Blur of this size is rendered from fewer sub-samples as well, in two thirds of the time.
+        # With such blur fewer sub-samples give the same image, in two thirds of the time.
         optics = Optics(blur_px, supersample=2 if blur_px >= 0.6 else 4)
         light = radiance(self.boards, self.camera, self.cam_from_world, optics=optics)
         settings = {"noise_levels": 2.0, "vignetting": 0.25, **photometry}
         return np.asarray(develop(light, Photometry(**settings), rng))
 
     def truth(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return grid (N, 2) and exact pixels (N, 2) of the corners in view of each board."""
+        """Return grid (N, 2) and exact pixels (N, 2) of the visible corners of each board."""
         out = []
         for placed in self.boards:
             pixels, valid = placed.see(self.camera, self.cam_from_world)
@@ -80,7 +80,7 @@ def single(
     shift_mm: tuple[float, float] = (0.0, 0.0),
     **kwargs: Any,
 ) -> Scene:
-    """Return one board, its middle at `distance_mm` before the regular camera, turned by the rotation vector."""
+    """Return one board with its centre at `distance_mm` in front of the regular camera, in the given rotation."""
     turn = exp_so3(np.asarray(rotation, dtype=np.float64))
     half = [0.5 * board.square_x_mm * (board.columns - 1), 0.5 * board.square_y_mm * (board.rows - 1), 0.0]
     middle = turn @ np.array(half)
@@ -89,7 +89,7 @@ def single(
 
 
 def errors_by_place(found: BoardDetection, truth: BoardDetection) -> np.ndarray:
-    """Return found minus true pixels by place in the grid, (N, 2): another board would be off by whole squares."""
+    """Return found minus true pixels by grid position, (N, 2): of another board they are off by whole squares."""
     return found.pixels - truth.lattice()[found.grid[:, 1], found.grid[:, 0]]
 
 
@@ -99,14 +99,14 @@ def errors_by_position(found: BoardDetection, truth: np.ndarray) -> np.ndarray:
 
 
 def match(found: tuple[BoardDetection, ...], truth: list[tuple[np.ndarray, np.ndarray]]) -> list[BoardDetection]:
-    """Return the detection of each true board: the one whose middle is nearest."""
+    """Return the detection of each true board: the one with the nearest centre."""
     return [
         min(found, key=lambda d: np.linalg.norm(d.pixels.mean(axis=0) - pixels.mean(axis=0))) for _, pixels in truth
     ]
 
 
 def printed_text() -> np.ndarray:
-    """Return an image of letters and signs, which have corners like boards'."""
+    """Return an image of letters and symbols, which have corners similar to a board's."""
     image = np.full((300, 500), 230, np.uint8)
     for line in range(13):
         cv2.putText(image, "HHH ### xxx 8888 +++ %%% mmm " * 2, (3, 20 + 22 * line), 0, 0.5, 20, 1, cv2.LINE_AA)
@@ -114,7 +114,7 @@ def printed_text() -> np.ndarray:
 
 
 def dots(size_px: tuple[int, int], radius_px: int) -> np.ndarray:
-    """Return an image of dots, 30 px from one to the next."""
+    """Return an image of dots, spaced by 30 px."""
     image = np.full(size_px[::-1], 220, np.uint8)
     for v in range(20, size_px[1], 30):
         for u in range(20, size_px[0], 30):

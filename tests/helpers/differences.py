@@ -1,4 +1,4 @@
-"""Derivatives by central differences, against which every analytic derivative is held."""
+"""Derivatives by central differences, with which every analytic derivative is compared."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 STEP_REL = 1e-6
-"""Best for float64 (error of the formula ~ step^2, of rounding ~ 1e-16 / step), measured on fisheye cameras."""
+"""Best for float64 (truncation error ~ step^2, rounding error ~ 1e-16 / step), measured on fisheye cameras."""
 
 
 def central_difference(
@@ -15,7 +15,7 @@ def central_difference(
 ) -> np.ndarray:
     """Return d function / d x by central differences: function (..., n) -> (..., m) gives (..., m, n).
 
-    `steps` (n,) or a number: absolute steps; by default STEP_REL times the size of each entry, at least 1.
+    `steps` (n,) or a number: absolute steps; by default STEP_REL times the magnitude of each entry, at least 1.
     """
     x = np.asarray(x, dtype=np.float64)
     columns = []
@@ -27,7 +27,7 @@ def central_difference(
         up, down = x.copy(), x.copy()
         up[..., k] += h
         down[..., k] -= h
-        # The step that was really taken, after rounding.
+        # The actual step, after rounding.
         taken = up[..., k] - down[..., k]
         columns.append((function(up) - function(down)) / np.expand_dims(taken, -1))
     return np.stack(columns, axis=-1)

@@ -1,4 +1,4 @@
-"""A page in a real browser that a test looks at and types into: the DevTools protocol over a pipe."""
+"""A page in a real browser that a test reads and types into: the DevTools protocol over a pipe."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import Any
 from helpers.browser import chromium
 
 PATIENCE_S = 60.0
-"""For one answer of the browser."""
+"""Timeout for one answer of the browser."""
 
 
 class DrivenPage:
-    """A page at an address; `complaints` are what its scripts wrote to the console or did not catch."""
+    """A page at an address; `complaints` are its console messages and uncaught errors."""
 
     def __init__(
         self, url: str, profile: Path, *options: str, size_px: tuple[int, int] = (1366, 900), before: str = ""
@@ -31,7 +31,7 @@ class DrivenPage:
             "--remote-debugging-pipe", f"--user-data-dir={profile}", f"--window-size={size_px[0]},{size_px[1]}",
             *options, "about:blank",
         ]  # fmt: skip
-        # The browser reads commands from 3 and writes answers to 4.
+        # The browser reads commands from file descriptor 3 and writes answers to 4.
         shell = f'exec "$@" 3<&{to_browser} 4>&{from_browser}'
         self._process = subprocess.Popen(
             ["bash", "-c", shell, "chromium", *command],
@@ -71,12 +71,12 @@ class DrivenPage:
         )
 
     def press(self, key: str) -> None:
-        """Press and let go of a key that writes a character."""
+        """Press and release a key that types a character."""
         for kind in ("keyDown", "keyUp"):
             self._ask("Input.dispatchKeyEvent", type=kind, key=key, text=key if kind == "keyDown" else "")
 
     def picture(self, path: Path) -> None:
-        """Write what the page looks like, as PNG."""
+        """Write a screenshot, as PNG."""
         path.write_bytes(base64.b64decode(self._ask("Page.captureScreenshot")["data"]))
 
     def close(self) -> None:

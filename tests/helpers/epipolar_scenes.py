@@ -1,4 +1,4 @@
-"""Random pairs of views with exact geometry: points on small tilted facets, their affinities, noise on both."""
+"""Random pairs of views with exact geometry: points on small tilted facets, their affinities, both with noise."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FISHEYE = KannalaBrandt((1624, 1240), np.array([420.0, 418.0, 810.0, 622.0, -0.0
 
 
 def pose_of(kind: str, rng: np.random.Generator) -> Rigid3:
-    """A random pose of a type, baseline 300 mm."""
+    """A random relative pose of this kind, baseline 300 mm."""
     if kind == "planar":
         phi = rng.uniform(0.0, 2.0 * np.pi)
         return Rigid3(exp_so3([0.0, rng.uniform(-0.17, 0.17), 0.0]), [300 * np.sin(phi), 0.0, 300 * np.cos(phi)])
@@ -50,7 +50,7 @@ def pair(
     while len(points) < count:
         drawn += 1
         if given is None and drawn > 40 * (len(points) + 5):
-            # The two views hardly overlap: another pose.
+            # The fields of view hardly overlap: another pose.
             pose, points, drawn = pose_of(kind, rng), [], 0
         if camera is FISHEYE:
             x = unit(rng.normal(size=3) * [1, 1, 0.7]) * rng.uniform(600, 2000)
@@ -78,7 +78,7 @@ def pair(
 
 
 def pictures(rng: np.random.Generator, points: np.ndarray, pose: Rigid3, noise_px: float = 0.3) -> Matches:
-    """Matches of those of the points that lie in both pictures of the regular camera."""
+    """Matches of those of the points that are in both images of the regular camera."""
     q1, q2 = (REGULAR.project(x)[0] + noise_px * rng.normal(size=(len(x), 2)) for x in (points, pose.apply(points)))
     seen = ((q1 > 0.0) & (q2 > 0.0) & (q1 < REGULAR.size_px) & (q2 < REGULAR.size_px)).all(axis=1)
     sigma = np.full(int(seen.sum()), max(noise_px, 1e-6))
@@ -86,7 +86,7 @@ def pictures(rng: np.random.Generator, points: np.ndarray, pose: Rigid3, noise_p
 
 
 def plane_in_sight(rng: np.random.Generator, noise_px: float = 0.3) -> tuple[Matches, Rigid3]:
-    """Matches of one slanted plane seen from general positions, 50 to 150 of them, and the true pose."""
+    """Matches of one slanted plane seen from general positions, 50 to 150 of them, and the true relative pose."""
     while True:
         pose = Rigid3(exp_so3(0.1 * rng.normal(size=3)), unit(rng.normal(size=3) * [1.0, 1.0, 0.5]) * 250.0)
         normal = unit(np.append(0.5 * rng.normal(size=2), 1.0))
@@ -98,7 +98,7 @@ def plane_in_sight(rng: np.random.Generator, noise_px: float = 0.3) -> tuple[Mat
 
 
 def joined(first: Matches, second: Matches) -> Matches:
-    """All points of both, without affinities."""
+    """Matches of both sets, without affinities."""
     names = ("pixels1", "pixels2", "rays1", "rays2", "jacobians1", "jacobians2", "sigma1_px", "sigma2_px")
     columns = {
         name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in (*names, "board_index", "grid")
@@ -147,7 +147,7 @@ def board_pair(
 
 
 def affinities(matches: Matches) -> np.ndarray:
-    """The affinities of matches that have some."""
+    """The affinities of matches; fails where there are none."""
     assert matches.A21 is not None
     return matches.A21
 
@@ -166,5 +166,5 @@ def pose_errors_deg(found: Rigid3, true: Rigid3) -> tuple[float, float]:
 
 
 def same_up_to_sign(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the largest difference of two matrices of which the sign means nothing."""
+    """Return the largest difference of two matrices that are equal up to sign."""
     return float(min(np.abs(a - b).max(), np.abs(a + b).max()))

@@ -1,4 +1,4 @@
-"""What a session of simulated images holds of the focal length, its images' common errors known exactly."""
+"""The information of a simulated session about the focal length, with known correlations within each image."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ LENSES = ("reg", "wide", "fish")
 
 
 class FocalSigmas(NamedTuple):
-    """Standard deviations of the focal length, as a part of it: the least there is (Cramér-Rao), and that of least
-    squares of single corners."""
+    """Relative standard deviations of the focal length: the lower bound (Cramér-Rao), and that of least squares with
+    independent corners."""
 
     least: float
     least_squares: float
 
 
 def focal_sigmas(name: str, corners_px: float, images_px: float, seed: int) -> FocalSigmas:
-    """Return how sure a session is, with errors of `corners_px` of each corner and `images_px` in each of five smooth
-    modes that the corners of an image have in common."""
+    """Return the standard deviations for a session with independent errors of `corners_px` and, in each image, common
+    errors of `images_px` in each of five smooth modes."""
     camera, rng = lens(name), np.random.default_rng(seed)
     _, rotations, translations = random_views(camera, IMAGES, rng, reach_deg=REACH_DEG[name], noise_px=0.0)
     x, y = (BOARD.grid() / (np.array(BOARD.size) - 1.0) * 2.0 - 1.0).T
@@ -46,7 +46,7 @@ def focal_sigmas(name: str, corners_px: float, images_px: float, seed: int) -> F
         left = _without(by_lens, by_pose)
         normal += left.T @ left
         scatter += left.T @ noise @ left
-    # Parameters differ by many powers of ten.
+    # Parameters differ by many orders of magnitude.
     scale = 1.0 / np.sqrt(np.diag(normal))
     inverse = np.linalg.inv(normal * scale[:, None] * scale) * scale[:, None] * scale
     covariances = np.linalg.inv(information), inverse @ scatter @ inverse
@@ -55,8 +55,8 @@ def focal_sigmas(name: str, corners_px: float, images_px: float, seed: int) -> F
 
 
 def best_powers(name: str, corners_px: float, images_px: float) -> tuple[float, float]:
-    """Return how often a focal length longer by LONGER is found at CHANCE by a test that knows what it looks for: with
-    the least standard deviation there is, and with that of least squares."""
+    """Return the power, at significance level CHANCE, of a test for a focal length longer by LONGER: with the least
+    standard deviation possible, and with that of least squares."""
     each = [focal_sigmas(name, corners_px, images_px, seed) for seed in range(SESSIONS)]
     normal = NormalDist()
     limit = normal.inv_cdf(1.0 - CHANCE / 2.0)
@@ -66,6 +66,6 @@ def best_powers(name: str, corners_px: float, images_px: float) -> tuple[float, 
 
 
 def _without(rows: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return derivatives less what a pose explains of them."""
+    """Return derivatives with the part that a pose explains projected out."""
     own, _ = np.linalg.qr(pose)
     return np.asarray(rows - own @ (own.T @ rows))

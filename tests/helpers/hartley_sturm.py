@@ -1,4 +1,4 @@
-"""The global optimum of the two-view pixel correction, which Lindstrom's two iterations are compared with.
+"""The global optimum of the two-view pixel correction, the reference for Lindstrom's two iterations.
 
 R. Hartley and P. Sturm, "Triangulation", CVIU 1997.
 """
@@ -17,8 +17,8 @@ def correct_hartley_sturm(pixels1: Pixels, pixels2: Pixels, F21: Mat3) -> tuple[
     -----
     The stationary epipolar lines are the roots of a polynomial of degree six in t. Here t = scale * tan(w), which
     makes it a trigonometric polynomial in 2w: no leading coefficient can vanish and t at infinity is an ordinary
-    point. The cost is evaluated at the angles of all six roots, real or not, and at infinity, because a nearly double
-    real root may come out of rounding as a complex pair.
+    point. The cost is evaluated at the angles of all six roots, real or not, and at infinity, because rounding errors
+    may turn a nearly double real root into a complex pair.
     """
     q1, q2 = np.asarray(pixels1, dtype=np.float64), np.asarray(pixels2, dtype=np.float64)
     u, _, vt = np.linalg.svd(F21)
@@ -51,7 +51,7 @@ def correct_hartley_sturm(pixels1: Pixels, pixels2: Pixels, F21: Mat3) -> tuple[
     foot2 = _foot(np.concatenate([-f2 * q, p, q], axis=1))
     out1 = (np.swapaxes(rotation1[:, :2, :2], -1, -2) @ foot1[..., None])[..., 0] + q1
     out2 = (np.swapaxes(rotation2[:, :2, :2], -1, -2) @ foot2[..., None])[..., 0] + q2
-    # On an epipole every partner fits: nothing to correct.
+    # On an epipole every partner satisfies the constraint: no correction.
     keep = ~np.isfinite(np.concatenate([out1, out2], axis=1)).all(axis=1, keepdims=True)
     return np.where(keep, q1, out1), np.where(keep, q2, out2)
 

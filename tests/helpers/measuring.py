@@ -1,4 +1,4 @@
-"""What points measure, by the definition of the quantity: held against certificates."""
+"""Quantities measured from points by their definition, the reference for certificates."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rigkit.validation.certificate.contracts import Quantity
 
 
 def read_off(quantity: Quantity, points: FloatArray) -> FloatArray:
-    """What points (N, K, 3) measure, (N, ways), by the definition of the quantity."""
+    """The quantity measured from points (N, K, 3) by its definition, (N, ways)."""
     if quantity is Quantity.ANGLE:
         a, b = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
         cosine = np.sum(a * b, axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)

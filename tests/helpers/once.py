@@ -1,4 +1,4 @@
-"""What is dear to make, made once for all processes of a run of the tests."""
+"""Expensive fixtures, made once for all processes of a test run."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ Made = TypeVar("Made")
 
 
 def once_a_run(factory: pytest.TempPathFactory, name: str, make: Callable[[], Made]) -> Made:
-    """Return what `make` returns: the first process of this run that asks for `name` calls it, and pickles the result.
+    """Return the result of `make`: the first process of this run that asks for `name` calls it, and pickles the result.
 
-    A process that asks meanwhile waits. Nothing outlives the run: it lies in the run's own temporary folder.
+    Other processes wait meanwhile. The result is kept in the run's own temporary folder.
     """
     folder = factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
@@ -35,7 +35,7 @@ def once_a_run(factory: pytest.TempPathFactory, name: str, make: Callable[[], Ma
 
 @contextmanager
 def _alone(lock: Path) -> Iterator[None]:
-    """Only one process at a time is inside; on Windows, where files are locked otherwise, each makes its own."""
+    """Hold a lock that one process has at a time; without fcntl, on Windows, there is none and each process makes it."""
     with lock.open("w") as file:
         with suppress(ImportError):
             fcntl = importlib.import_module("fcntl")

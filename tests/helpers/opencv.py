@@ -1,4 +1,4 @@
-"""What tests ask of the OpenCV that is installed."""
+"""Properties of the installed OpenCV that tests depend on."""
 
 from __future__ import annotations
 

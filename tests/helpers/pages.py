@@ -1,4 +1,4 @@
-"""What a page says, read back from its HTML, against what `--json` has of it."""
+"""Contents of a page, parsed from its HTML and compared with those in `--json`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SKIPPED = ("script", "style", "svg", "nav", "button")
 
 
 class Page(HTMLParser):
-    """The words of the first screens, and every table with its title."""
+    """The text of the first screens, and every table with its title."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -56,20 +56,20 @@ class Page(HTMLParser):
 
 
 def plain(words: str) -> str:
-    """Return words without what is punctuation between a badge and its sentence."""
+    """Return text without the punctuation between a badge and its sentence."""
     return re.sub(r"[\s:]+", " ", words).strip().lower()
 
 
 def facts_of(page: dict[str, Any]) -> tuple[list[str], list[dict[str, Any]]]:
-    """Return all words and all tables of a page's facts, those of its parts too."""
+    """Return all sentences and all tables of a page's facts, those of its parts included."""
     parts = [page, *page["parts"].values()]
     words = [w for p in parts for w in (f"{p['badge']} {p['headline']}", *p["sentences"], p["basis"])]
     return words, [table for p in parts for table in p["tables"]]
 
 
 def assert_all_is_in(html: str, page: dict[str, Any], also: tuple[str, ...] = ()) -> None:
-    """Every sentence of the first screens, and every cell of every table, is in the JSON too, as a number to the digits
-    shown; `also`: how paragraphs begin that repeat figures or explain a word."""
+    """Check that every sentence of the first screens, and every cell of every table, is in the JSON, numbers to the
+    digits shown; `also`: beginnings of paragraphs that repeat figures or explain a term."""
     read = Page(html)
     words, tables = facts_of(page)
     known = [plain(w) for w in words]
@@ -92,7 +92,7 @@ def _same(head: list[str], rows: list[list[str]], table: dict[str, Any]) -> bool
     if len(rows) != len(table["rows"]):
         return False
     for row, known in zip(rows, table["rows"], strict=True):
-        # Pictures stand in a column of their own.
+        # Pictures have a column of their own, first in the row.
         shown = row[len(row) - len(known) :]
         if not all(_as_shown(text, value) for text, value in zip(shown, known.values(), strict=True)):
             return False
@@ -100,7 +100,7 @@ def _same(head: list[str], rows: list[list[str]], table: dict[str, Any]) -> bool
 
 
 def _as_shown(text: str, cell: Any) -> bool:
-    """Say whether a cell's text is the value, to its digits."""
+    """Say whether a cell's text equals the value, to the digits shown."""
     value = cell["value"] if isinstance(cell, dict) else cell
     if isinstance(value, str):
         return text == re.sub(r"\s+", " ", value).strip()

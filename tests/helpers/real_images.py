@@ -1,4 +1,4 @@
-"""A few images of real boards, where the captures outside the repository are there."""
+"""A few images of real boards, from the captures outside the repository."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CHOSEN = {
 
 @functools.cache
 def real_images() -> dict[str, np.ndarray]:
-    """Return those images that are there, grey, by their names."""
+    """Return those that are present, in grey, by name."""
     found = {name: CAPTURES / path for name, path in CHOSEN.items()}
     read = {name: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for name, path in found.items() if path.is_file()}
     return {name: image for name, image in read.items() if image is not None}

@@ -1,4 +1,4 @@
-"""Reconstructions made from exact geometry: three boards whose faces stand at chosen angles, seen by two cameras."""
+"""Exact reconstructions of three boards on faces at given angles, seen by two cameras."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CAM2_FROM_CAM1 = Rigid3(exp_so3(np.array([0.05, -0.25, 0.08])), np.array([280.0,
 
 
 def trihedral_poses(boards: tuple[Board, ...] = BOARDS, angles_deg: tuple[float, ...] = (90.0, 90.0, 90.0)) -> list:
-    """cam1_from_board of three boards whose faces stand at `angles_deg` (1-2, 1-3, 2-3)."""
+    """cam1_from_board of three boards whose faces are at `angles_deg` (1-2, 1-3, 2-3)."""
     cosines = -np.cos(np.deg2rad(angles_deg))
     gram = np.eye(3)
     gram[0, 1], gram[0, 2], gram[1, 2] = cosines

@@ -28,9 +28,9 @@ def mounts() -> dict[str, tuple[Camera, Rigid3]]:
 def rig_views(
     rng: np.random.Generator, frames: int, *, chain: bool = False, bumps_mm: np.ndarray | float = 0.0
 ) -> Views:
-    """Return frames seen by all cameras that have the board in view; with `chain` never by first and last at once.
+    """Return frames seen by all cameras that have the board in view; with `chain` never by the first and last together.
 
-    `bumps_mm` (54, 3) is how far the corners are from where the board is said to have them.
+    `bumps_mm` (54, 3) is the deviation of the corners from the board's nominal shape.
     """
     views: Views = {name: [] for name in mounts()}
     k = 0

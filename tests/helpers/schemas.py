@@ -1,4 +1,4 @@
-"""Documents held against the published schemas."""
+"""Validation of documents with the published schemas."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import jsonschema
 from rigkit.io.schema import SCHEMAS
 
 FREE = ("frames", "check")
-"""What is no file of anybody's: a record of frames, and how a coach's page is asked."""
+"""Documents without a published schema: the record of frames, and requests to a coach's page."""
 
 
 @functools.cache
@@ -19,7 +19,7 @@ def validator(name: str) -> jsonschema.Draft202012Validator:
 
 
 def faults(document: Any) -> list[str]:
-    """What is wrong with a document that names its schema; nothing with one that names none."""
+    """Errors of a document by the schema that it names; [] for one that names none."""
     schema = document.get("schema", "") if isinstance(document, dict) else ""
     if not str(schema).startswith("rigkit."):
         return []

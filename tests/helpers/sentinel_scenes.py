@@ -1,4 +1,4 @@
-"""Boards held before a lens whose calibration is checked."""
+"""Boards held in front of a lens whose calibration is checked."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from rigkit.validation.sentinel.watch import monitored_camera
 
 NOISE_PX = 0.03
 CHANGED_PX = 0.25
-"""Change of the projection, rms after the best rotation: what three views show beyond doubt."""
+"""Change of the projection, rms after the best rotation, that three views detect with certainty."""
 
 
 def best_held(camera: Camera, board: Board, count: int, sigma_px: float, reach: Reach | None = None) -> list[Rigid3]:
-    """Return where a board is best held before a lens that nobody knows yet."""
+    """Return the most informative poses of a board for a lens without a calibration."""
     known = Knowledge.guessed(camera, CornerError(sigma_px))
     plan = plan_views(known, [board], projection_goal(camera), count, reach=reach)
     return [view.cam_from_board for view in plan.views]
@@ -34,7 +34,7 @@ def best_held(camera: Camera, board: Board, count: int, sigma_px: float, reach: 
 
 @cache
 def poses_held(name: str, count: int, reach: Reach | None = None) -> list[Rigid3]:
-    """Return where the board is best held before a lens of `calibration_scenes`."""
+    """Return the most informative poses of the board for a lens of `calibration_scenes`."""
     return best_held(lens(name), BOARD, count, NOISE_PX, reach)
 
 
@@ -45,7 +45,7 @@ def checked(calibration: Calibration, camera: Camera, rng: np.random.Generator) 
 
 
 def known_rig(mount: Rigid3, lens_sigmas: list[float], rotation_sigma_rad: float, freedom: float) -> Monitored:
-    """Return a rig of two wide lenses, whose second camera is placed to 0.01 mm."""
+    """Return a rig of two wide lenses, with the position of its second camera known to 0.01 mm."""
     camera = lens("wide")
     return Monitored(
         names=("left", "right"),
@@ -58,7 +58,7 @@ def known_rig(mount: Rigid3, lens_sigmas: list[float], rotation_sigma_rad: float
 
 
 def scene_pixels(pose: Rigid3, count: int, noise_px: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return where both cameras of such a rig see up to `count` points of a scene."""
+    """Return the pixels in both cameras of such a rig of up to `count` points of a scene."""
     camera = lens("wide")
     rays, valid = camera.unproject(rng.uniform([100.0, 100.0], [1500.0, 1100.0], (count, 2)))
     points = rays[valid] * rng.uniform(700.0, 4000.0, (int(valid.sum()), 1))

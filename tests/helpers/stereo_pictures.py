@@ -1,4 +1,4 @@
-"""A newcomer's pictures: JPEGs of a board by two cameras side by side, ray-traced; the fixture `pictures` has them."""
+"""Ray-traced JPEGs of a board by two cameras side by side, as a new user takes them; for the fixture `pictures`."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def write_pictures(folder: Path) -> None:
 
 
 def of_one_camera(pictures: Path, folder: Path) -> Path:
-    """Return a folder with the pictures of one camera, as cameras name them."""
+    """Return a folder with the images of one camera, named as cameras do."""
     folder.mkdir(parents=True)
     for k, path in enumerate(sorted(pictures.glob("left*.jpg"))):
         shutil.copy(path, folder / f"DSC_{k:04d}.JPG")

@@ -1,4 +1,4 @@
-"""A corner of three textured walls, seen by any camera: images, and the exact surface behind every pixel."""
+"""A corner of three textured walls, seen by any camera: images, and the exact surface at every pixel."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SMALL_LENSES: dict[str, Camera] = {
 }
 TURN = exp_so3(np.array([0.05, -0.25, 0.1]))
 CAM2_FROM_CAM1 = Rigid3(TURN, -TURN @ [320.0, -60.0, 60.0])
-"""Of two views of `Corner.of_a_room`."""
+"""For two views of `Corner.of_a_room`."""
 
 OVERSAMPLING = 2
 TEXEL_MM = 1.0
@@ -53,7 +53,7 @@ class Corner:
     @classmethod
     @functools.cache
     def of_a_room(cls, seed: int = 20) -> Corner:
-        """A corner 1.3 m in front of camera 1, its diagonal towards the camera, the floor below, textures drawn."""
+        """A corner 1.3 m in front of camera 1, diagonal towards the camera, floor at the bottom, random textures."""
         diagonal = unit(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]).sum(axis=0))
         turn = exp_so3(unit(np.cross(diagonal, [0, 0, -1.0])) * np.arccos(diagonal @ [0, 0, -1.0]))
         axes = exp_so3(np.array([0.1, -0.15, 0.4])) @ turn
@@ -80,7 +80,7 @@ class Corner:
         return rays * ranges[:, None], -normals * np.sign(np.sum(normals * rays, axis=1))[:, None]
 
     def image(self, camera: Camera, cam_from_cam1: Rigid3, rng: np.random.Generator) -> np.ndarray:
-        """Return what a camera sees, with a grey level of noise."""
+        """Return the camera's image, with noise of one grey level."""
         width, height = camera.size_px
         s = OVERSAMPLING
         u, v = np.meshgrid((np.arange(width * s) + 0.5) / s - 0.5, (np.arange(height * s) + 0.5) / s - 0.5)
@@ -93,11 +93,11 @@ class Corner:
         for k in range(3):
             on = (plane == k) & seen
             first, second = (at[on][:, [i for i in range(3) if i != k]] / TEXEL_MM).astype(np.float32).T
-            # OpenCV's maps may not be wider than 32767.
+            # cv2.remap accepts maps of at most 32767 columns.
             for part in np.array_split(np.flatnonzero(on), len(first) // 30000 + 1):
                 places = np.searchsorted(np.flatnonzero(on), part)
                 maps = first[None, places], second[None, places]
-                # Mirrored beyond its border.
+                # The texture is mirrored beyond its border.
                 out[part] = cv2.remap(self.textures[k], *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)[0]
         fine = out.reshape(height * s, width * s)
         image = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
