@@ -1,6 +1,6 @@
-"""AprilGrids: lattices of saddles whose lines are not evenly spaced, on the board's grid by the tags between them.
+"""AprilGrids: lattices of unevenly spaced saddles, placed on the board's grid by the tags in their squares.
 
-Where tags stand alone, there are no saddles: the tags are sought.
+Without squares between the tags there are no saddles: the tags are found by their outlines.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from rigkit.detection.tags.surface import SmoothMap
 from rigkit.detection.targets.base import Finder, Search
 
 FIRST_SEEN, MIN_SEEN_AT_FIRST = 0.9, 16
-"""Of the corners of a board in an image, so many seen on the finest level are enough, and so many at least: those left
-are few, and sought one by one."""
+"""Smallest share of the visible corners, and smallest number, that must be found on the finest level for the coarser
+ones to be skipped; the few missed ones are then searched for one by one."""
 
 
 class AprilGridFinder(Finder):
-    """Corners of tags are linked as those of chessboards are, only that opposite neighbours may lie further apart."""
+    """Corners are linked as those of chessboards, but the distances to opposite neighbours may differ more."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
         found = self._found(search, search.grey, boards)
         if found or search.grey.dtype == np.uint8:
             return found
-        # As of chessboards: beyond 8 bits a board may have a hundredth of the range of brightness.
+        # As for chessboards: in images of more than 8 bits a board may use a hundredth of the range of brightness.
         seen = self._found(search, equalised(search.grey), boards)
         return self._found(search, stretched(search.grey, [item.lattice() for item in seen]), boards) if seen else []
 
     def _found(self, search: Search, image: GreyImage, boards: Sequence[Board]) -> list[BoardDetection]:
-        """Return what is seen of the boards in the image of a search, or in that image with other grey levels."""
+        """Return the detections of the boards in the image of a search, or in that image with other grey levels."""
         every = [TagBoard.of(board) for board in boards]
         found = []
         for inverted in (False, True):
@@ -52,14 +52,14 @@ class AprilGridFinder(Finder):
                 seen = tag_corners(grey, item, pixels, search.camera) if np.isfinite(pixels).any() else None
                 if seen is None or len(seen.grid) < search.min_corners:
                     continue
-                # Few that vouch for a place may be of another board, whose corners all fit.
+                # Tags that place less than half of the corners may be of another board, whose corners fit as well.
                 few = 2 * np.count_nonzero(np.isfinite(pixels[..., 0])) < len(seen.grid)
                 if not few or _confirmed(grey, item, seen):
                     found.append(seen)
         return found
 
     def _placed(self, grey: GreyImage, tags: Sequence[TagBoard]) -> Iterator[tuple[TagBoard, FloatArray]]:
-        """Yield the boards and their rough corners (R, C, 2), NaN where none is seen."""
+        """Yield the boards and their approximate corners (R, C, 2), NaN where not found."""
         joined = [item for item in tags if item.pattern.corner_squares]
         yield from ((item, placed_tags(grey, item)) for item in tags if not item.pattern.corner_squares)
         if not joined:
@@ -72,7 +72,7 @@ class AprilGridFinder(Finder):
             coarser = list(levels)
             corners, saddles = find_corners(coarser, corners)
             placed = list(_placed_by(corners, finest, grey, joined))
-            # Where light or ink runs over, tags and the squares between them meet on coarser levels only.
+            # Where light or ink spreads, tags and the squares between them touch on coarser levels only.
             for k, level in enumerate(coarser):
                 alone = each_once(saddles.by_level[k:])
                 if len(alone) < MIN_SEEN_AT_FIRST or any(np.isfinite(pixels).any() for _, pixels in placed):
@@ -84,7 +84,7 @@ class AprilGridFinder(Finder):
 def _placed_by(
     corners: Corners, finest: Level, image: GreyImage, boards: Sequence[TagBoard]
 ) -> Iterator[tuple[TagBoard, FloatArray]]:
-    """Yield the boards and those of the corners that are theirs (R, C, 2), NaN where none is."""
+    """Yield the boards and those of the `corners` that belong to them, (R, C, 2), NaN where there is none."""
     ratio = LENGTH_RATIO * max(max(item.pattern.spacing, 1.0 / item.pattern.spacing) for item in boards)
     lattices = list(build_lattices(corners, find_links(corners, finest, ratio)))
     for item in boards:
@@ -94,10 +94,10 @@ def _placed_by(
 
 
 def _or_lone_tags(image: GreyImage, tags: TagBoard, pixels: FloatArray) -> FloatArray:
-    """Return the rough corners `pixels` (R, C, 2) of a board, or those of its tags as they are found alone, if more.
+    """Return the approximate corners `pixels` (R, C, 2) of a board, or those of its tags found by outlines, if more.
 
-    Light that runs over by pixels parts tags from the squares between them, and leaves few saddles. Without any it is
-    no board with such squares, and most pictures without boards need not be searched for tags.
+    Light that spreads by pixels separates tags from the squares between them, and leaves few saddles. An image without
+    any saddle of the board is not searched for outlines: most of these show no board.
     """
     known = int(np.count_nonzero(np.isfinite(pixels[..., 0])))
     if not 0 < known < MIN_SEEN_AT_FIRST:
@@ -107,7 +107,7 @@ def _or_lone_tags(image: GreyImage, tags: TagBoard, pixels: FloatArray) -> Float
 
 
 def _confirmed(image: GreyImage, tags: TagBoard, seen: BoardDetection) -> bool:
-    """Return whether more of the tags that are seen are read as those that the board has there than as others."""
+    """Return whether most of the tags that are read in a detection are the board's tags at these places."""
     pixels = seen.lattice()
     quads = np.stack([pixels[::2, ::2], pixels[::2, 1::2], pixels[1::2, 1::2], pixels[1::2, ::2]], axis=2)
     whole = np.isfinite(quads).all(axis=(2, 3))
@@ -117,11 +117,11 @@ def _confirmed(image: GreyImage, tags: TagBoard, seen: BoardDetection) -> bool:
 
 
 def _nearly_whole(tags: TagBoard, pixels: FloatArray, shape: tuple[int, ...]) -> bool:
-    """Return whether so many corners (R, C, 2) are known that the rest is better sought where these foretell it."""
+    """Return whether so many corners (R, C, 2) are known that the others are better predicted from them."""
     known = np.isfinite(pixels[..., 0])
     count, wanted = int(np.count_nonzero(known)), known.size
     if FIRST_SEEN * wanted > count >= MIN_SEEN_AT_FIRST:
-        # What lies outside the image is not missing.
+        # Corners outside the image are not missed.
         all_seen = SmoothMap(tags.places[known], pixels[known]).at(tags.places.reshape(-1, 2)).pixels
         wanted = int(np.count_nonzero(((all_seen > 0.0) & (all_seen < np.array(shape[::-1]) - 1.0)).all(axis=1)))
     return bool(count >= max(MIN_SEEN_AT_FIRST, FIRST_SEEN * wanted))

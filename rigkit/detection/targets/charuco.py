@@ -1,8 +1,8 @@
-"""ChArUco boards: the corners of our own detector, with their places in the board from its markers.
+"""ChArUco boards: corners of our own detector, placed on the board by its markers.
 
-The markers in the squares of a lattice say where in the board it lies (turn and shift by vote, so that a misread marker
-does nothing). Where they do not, OpenCV finds markers by their outlines: the corners beside them name lattices, fill in
-what these have missed, and stand in for them. Where the corners are exactly, the edge model says, as for any board.
+The markers in the squares of a lattice determine its rotation and shift on the board by vote, so that a misread marker
+has no effect. If they do not, OpenCV detects markers by their outlines; corners beside these determine the places of
+lattices, and replace missed corners or lattices. All corners are refined by the edge model, as those of other boards.
 """
 
 from __future__ import annotations
@@ -41,24 +41,24 @@ from rigkit.kernels.boards import Picture
 from rigkit.kernels.surface import maps_of_quads
 
 SAME_CELLS = 0.2
-"""A marker's corner and a corner of a lattice are one within so many sides of a cell."""
+"""Largest distance of a marker's corner from the same corner of a lattice, in sides of a cell."""
 
 MIN_VOTES, AGREEING_VOTES = 3, 0.7
-"""Corners, and which part of them, that must give a lattice the same place in the board."""
+"""Smallest number of corners, and smallest share of them, that agree on the place of a lattice on the board."""
 
 MASKING_ROUNDS = 2
-"""Times that markers are wiped out and corners fitted anew: the second time from corners without their ink."""
+"""Rounds of removing markers and fitting corners: the second starts from corners that their ink does not affect."""
 
 MOVED_PX, MIN_MOVED, MIN_DRAWN = 0.05, 12, -0.5
-"""By how much markers are wiped out beside their places, corner by corner this way or that, to see how corners follow;
-coordinates that say it at least; and the least that is believed: sigmas are doubled then."""
+"""Random shift, per coordinate, of the corners around which markers are removed, to measure its effect on the fit;
+smallest number of coordinates for this; and lower limit of the effect, which doubles sigmas."""
 
 SEED_CONTRAST = 100.0
-"""Contrast that a corner starts with, grey levels: the fit measures it."""
+"""Initial contrast of a corner, in grey levels; the fit determines it."""
 
 
 class CharucoFinder(Finder):
-    """Lattices that markers name; they are no chessboards for anybody else."""
+    """Returns lattices placed by their markers; chessboards then do not use them."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
         lattices = search.lattices
@@ -73,14 +73,14 @@ class CharucoFinder(Finder):
 
 
 def _too_unlike(fitted: RefinedLattice, sure: BoolArray) -> BoolArray:
-    """Return which corners (R, C), but for those that are `sure`, leave too much for corners beside them."""
+    """Return which corners (R, C), except those that are `sure`, have far larger residuals than these."""
     left = fitted.relative_residual
     with np.errstate(invalid="ignore"):
         return np.asarray(~sure & (left > MAX_ADDED_RESIDUAL_MARKED * known_median(left[sure])))
 
 
 def _with_more(refined: RefinedLattice, detection: BoardDetection, board: Board) -> RefinedLattice:
-    """Return `refined` with the corners of a detection on its grid that it has not; itself where there are none."""
+    """Return `refined` with the missing corners from a detection on its grid; `refined` itself if there are none."""
     more = _of(board, detection.grid, detection.pixels)
     sigma = np.full(refined.sigma_px.shape, np.nan)
     sigma[detection.grid[:, 1], detection.grid[:, 0]] = detection.sigma_px
@@ -92,8 +92,8 @@ def _with_more(refined: RefinedLattice, detection: BoardDetection, board: Board)
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _MarkedBoard:
-    """A board's corners on its grid, the picture that they were placed in last, and what that shows: without its
-    markers, if these are taken away, the squares of the `board` alone."""
+    """A board's corners on its grid, the picture of their last fit, and the board `shown` there: if markers were
+    removed, the plain squares of the `board`."""
 
     refined: RefinedLattice
     board: Board
@@ -104,13 +104,13 @@ class _MarkedBoard:
 def _charuco_boards(
     search: Search, found: Sequence[RefinedLattice], boards: Sequence[Board]
 ) -> tuple[list[_MarkedBoard], list[RefinedLattice]]:
-    """Return the ChArUco boards in an image on their own grids, and the lattices that are none.
+    """Return the ChArUco boards in an image on their own grids, and the lattices that belong to none.
 
     Parameters
     ----------
     search : the image.
-    found : all lattices of the image.
-    boards : the ChArUco boards that may be there.
+    found : all lattices in the image.
+    boards : the ChArUco boards that may be in it.
     """
     image, rest = search.grey, list(found)
     pictures = [image] if search.stored is image else [image, search.stored]
@@ -131,12 +131,12 @@ def _charuco_boards(
 def _by_squares(
     image: GreyImage, lattices: Sequence[RefinedLattice], board: Board
 ) -> tuple[Lattice, list[RefinedLattice]]:
-    """Return the corners of a board that the markers in squares of lattices name, and the lattices that have none."""
+    """Return the corners of a board in lattices placed by the markers in their squares, and the other lattices."""
     whole, left = _empty(board), []
     for item in sorted(lattices, key=lambda item: -item.lattice.count):
         place = place_by_markers(image, item.lattice, board)
         part = _empty(board) if place is None else _onto(item.lattice.turned(place[0]), place[1], board)
-        # Two parts of one board share no place: what lies where another does is a board alike.
+        # Two parts of one board do not overlap: a lattice that overlaps another is of an identical board.
         if not part.count or (part.known & whole.known).any():
             left.append(item)
         else:
@@ -151,8 +151,8 @@ def _by_squares(
 def _by_outlines(
     pictures: Sequence[GreyImage], lattices: Sequence[RefinedLattice], board: Board
 ) -> tuple[Lattice, list[RefinedLattice]]:
-    """Return the corners of a board beside markers whose outlines are seen, those of lattices that have them first,
-    and the lattices that have none."""
+    """Return the corners of a board beside markers detected by their outlines, from lattices where these have them, and
+    the lattices that have none."""
     whole, left = _empty(board), []
     eight_bit = [np.clip(np.rint(picture), 0, 255).astype(np.uint8) for picture in pictures]
     grid, pixels = max((_marked_corners(picture, board) for picture in eight_bit), key=lambda seen: len(seen[0]))
@@ -166,7 +166,7 @@ def _by_outlines(
 
 
 def _marked_corners(image: np.ndarray, board: Board) -> tuple[IntArray, FloatArray]:
-    """Return (column, row) and rough pixels of the corners that OpenCV finds between the markers, (N, 2) each."""
+    """Return (column, row) and approximate pixels, (N, 2) each, of the corners that OpenCV finds between markers."""
     pattern = board.pattern
     assert isinstance(pattern, Charuco)
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, pattern.dictionary))
@@ -178,7 +178,7 @@ def _marked_corners(image: np.ndarray, board: Board) -> tuple[IntArray, FloatArr
     detector = cv2.aruco.CharucoDetector(target)
     corners, numbers, quads, markers = detector.detectBoard(image)
     if numbers is None or corners is None:
-        # OpenCV drops a board for one marker that is misread.
+        # OpenCV rejects a board because of one misread marker.
         if markers is None or not len(markers):
             return np.zeros((0, 2), np.int64), np.zeros((0, 2))
         return _between_markers(np.array(quads, dtype=np.float64).reshape(-1, 4, 2), np.ravel(markers), board)
@@ -187,7 +187,7 @@ def _marked_corners(image: np.ndarray, board: Board) -> tuple[IntArray, FloatArr
 
 
 def _between_markers(quads: FloatArray, markers: IntArray, board: Board) -> tuple[IntArray, FloatArray]:
-    """Return (column, row) and rough pixels of the corners where the two markers beside each (N, 4, 2) agree."""
+    """Return (column, row) and approximate pixels of the corners on which both adjacent markers (N, 4, 2) agree."""
     pattern = board.pattern
     assert isinstance(pattern, Charuco)
     places = pattern.places(*board.size)
@@ -213,8 +213,8 @@ def _between_markers(quads: FloatArray, markers: IntArray, board: Board) -> tupl
 def _empty(board: Board) -> Lattice:
     pattern, shape = board.pattern, (board.rows, board.columns)
     assert isinstance(pattern, Charuco)
-    # The square below the first edge has the colour of the one before the first corner; where it is white, brightness
-    # grows downwards across that edge, with the angle.
+    # The square below the first edge has the colour of the one before the first corner. If it is white, brightness
+    # increases downwards across that edge, with the angle.
     rising = pattern.first_black(board.rows) == pattern.inverted
     return Lattice(np.full((*shape, 2), np.nan), np.full(shape, np.nan), rising)
 
@@ -227,7 +227,7 @@ def _of(board: Board, grid: IntArray, pixels: FloatArray) -> Lattice:
 
 
 def _placed(lattice: Lattice, grid: IntArray, pixels: FloatArray, board: Board) -> Lattice | None:
-    """Return `lattice` on the grid of the board where the marked corners say so with one voice, else None."""
+    """Return `lattice` on the grid of the board if most marked corners agree on its place, else None."""
     known = lattice.known
     corners = lattice.pixels[known]
     distance = np.linalg.norm(corners[:, None] - pixels, axis=2)
@@ -257,7 +257,7 @@ def _side_px(lattice: Lattice) -> float:
 
 
 def _onto(lattice: Lattice, shift: IntArray, board: Board) -> Lattice:
-    """Return the board's lattice with the corners of `lattice`, moved by (column, row); what sticks out is left out."""
+    """Return the corners of `lattice`, shifted by (column, row), on the board's grid, without those outside of it."""
     row, column = np.nonzero(lattice.known)
     place = np.stack([column, row], axis=-1) + shift
     inside = ((place >= 0) & (place < board.size)).all(axis=1)
@@ -269,7 +269,7 @@ def _onto(lattice: Lattice, shift: IntArray, board: Board) -> Lattice:
 
 
 def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board, camera: Camera | None) -> _MarkedBoard:
-    """Return the corners fitted anew with windows that leave the markers out; those that then fail are dropped."""
+    """Return the corners fitted again in windows without markers; those whose fit fails are dropped."""
     known = refined.lattice.known
     if not known.any():
         return _MarkedBoard(refined, board, image, board)
@@ -277,10 +277,10 @@ def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board, cam
     narrow = _fitted(image, refined, board, blur)
     if float(np.median(gap_to_markers(board, shape.sides))) > (NEAR_SIGMAS + MARKER_BLURS) * blur + NEAR_PX:
         return _MarkedBoard(narrow, board, image, board)
-    # Their ink reaches into any window.
+    # Blurred ink of the markers reaches into any window.
     given = narrow
     if not narrow.lattice.known.all():
-        # Markers are wiped out around all that is seen, so that their ink is no reason to leave corners out.
+        # Missed corners are added first, so that the ink of markers is no reason to reject them.
         seen = completed(image, _detection(_MarkedBoard(narrow, board, image, board)), [board], camera)
         given = _with_more(narrow, seen, board)
     return _with_markers_masked(image, given, narrow.lattice.known, board, blur) or _MarkedBoard(
@@ -291,13 +291,13 @@ def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board, cam
 def _with_markers_masked(
     image: GreyImage, given: RefinedLattice, sure: BoolArray, board: Board, blur: float
 ) -> _MarkedBoard | None:
-    """Return the corners `given` fitted anew in the picture without the markers, but for those that are not `sure` (R,
-    C) and fit badly there; None where markers cannot be wiped out."""
+    """Return the corners `given`, fitted again in the picture without markers, except those that are not `sure` (R, C)
+    and fit badly there; None if markers cannot be removed."""
     empty, some_more = replace(board, pattern=Chessboard()), bool((given.lattice.known & ~sure).any())
     picture, before, after, narrow, light = image, blur, blur, given, None
-    # The places of those that were added are rough.
+    # The added corners are only approximate: they need one round more.
     for turn in range(MASKING_ROUNDS + some_more):
-        # Of corners without ink it is known how much light that takes.
+        # Later rounds use the loss of light measured around corners that ink does not affect.
         masked = without_markers(image, narrow, board, after, light if turn >= MASKING_ROUNDS else None)
         if masked is None:
             return None
@@ -305,10 +305,10 @@ def _with_markers_masked(
         fitted = _fitted(picture, given, empty, before)
         if turn > 0 and some_more:
             fitted = fitted.without(_too_unlike(fitted, sure))
-        # What ink is left the first time is in no picture of empty squares, and this takes longest.
+        # After the first removal there is ink left, which the picture of plain squares lacks; and this step is slow.
         narrow = placed_together(picture, fitted) if turn > 0 else fitted
         after = float(np.median(narrow.blur_px[narrow.lattice.known]))
-    # Wide windows see how crookedly the squares are printed, as those of plain chessboards do.
+    # Wide windows show irregular printing of the squares, as for plain chessboards.
     alone = narrow.sigma_px / narrow.scatter / (1.0 + _drawn_by_markers(image, light, given, narrow, board, before))
     every = (slice(0, sure.shape[0]), slice(0, sure.shape[1]))
     scatter = float(scatter_factors(narrow.lattice.pixels, alone, [every])[0])
@@ -318,13 +318,13 @@ def _with_markers_masked(
 def _drawn_by_markers(
     image: GreyImage, light: Picture | None, given: RefinedLattice, found: RefinedLattice, board: Board, blur: float
 ) -> float:
-    """Return how far corners go back, in parts of the shift, where their markers are wiped out a little beside.
+    """Return the shift of corners when markers are removed around shifted corners, relative to minus that shift.
 
-    What is left of such markers draws a corner to where it belongs. Wiped out beside corners that are off by e, they
-    leave corners off by P n - c e: n is the noise, P n what it does on a chessboard, and c what is returned. Done over
-    and over that ends at e = P n / (1 + c): markers, too, say where corners are.
+    The remaining ink of such markers attracts a corner to its true position. Removed around corners with errors e, they
+    leave corners with errors P n - c e: n is the noise, P n its effect on a chessboard, and c is returned. Iteration
+    converges to e = P n / (1 + c), because markers, too, contain information on the corners.
 
-    given, found : the corners around which markers were wiped out, and where they were then found.
+    given, found : the corners around which markers were removed, and as they were then fitted.
     """
     off = MOVED_PX * np.random.default_rng(0).choice([-1.0, 1.0], found.lattice.pixels.shape)
     lateral = replace(given, lattice=replace(given.lattice, pixels=given.lattice.pixels + off))
@@ -341,11 +341,11 @@ def _drawn_by_markers(
 
 
 def _fitted(image: GreyImage, refined: RefinedLattice, board: Board, blur: float) -> RefinedLattice:
-    """Return the corners of `refined` fitted anew on `image`, from edges of s `blur`, without those that fail."""
+    """Return the corners of `refined` fitted again in `image` with initial blur s `blur`, without those that fail."""
     lattice = refined.lattice
     known = lattice.known
     shape = fit_cells(lattice.pixels, known)
-    # A corner that a shadow crosses, or a finger, bends no lines: it is uncertain, and says so.
+    # A corner in a shadow or beside a finger has a large sigma, so that it does not bend its lines.
     curvatures = line_curvatures_to_fit(lattice.pixels, refined.sigma_px, known, shape.sides, RADIUS_PX)
     fit = fit_corners(image, board, known, shape, lattice.pixels[known], lattice.signs()[known], blur, curvatures)
     shared = shared_noise(fit, shape.sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))

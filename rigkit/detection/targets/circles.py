@@ -1,4 +1,4 @@
-"""Circle grids: every lattice of circles of the image, on the grids of the boards whose circles they can be."""
+"""Circle grids: all lattices of circles in the image, on the grids of the boards that they fit."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rigkit.detection.targets.base import Finder, Search
 
 
 class CirclesFinder(Finder):
-    """Grids with a place in one board are named after it, if no other board and no other grid can be meant."""
+    """A grid is identified if its place on one board is unique, and no other board and no other grid fits."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
-        """A quick look that sees no board may have missed its faint circles: the next one takes its time."""
+        """Return the detections. A quick search may miss faint circles: if it finds no board, a full one follows."""
         found = self._seen(search, boards, quick=True) if search.quick else []
         return found or self._seen(search, boards, quick=False)
 
