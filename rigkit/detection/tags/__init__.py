@@ -1,1 +1,1 @@
-"""AprilTags: reading their codes, and where their corners are."""
+"""AprilTags and ArUco markers: reading their codes, placing them on boards, and fitting their corners."""

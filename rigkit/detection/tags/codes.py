@@ -1,8 +1,8 @@
 """Reading the code of a tag whose four corners are known.
 
-The brightness at the middle of every module is compared with that of every tag that may be there, in its four
-orientations, by correlation: no threshold, so that slanted light, blur and low contrast cost little. Borders count like
-bits: a black square without a code is no tag.
+The brightness at the middles of the modules is correlated with all possible tags in their four orientations. There is
+no threshold of brightness, so that uneven light, blur and low contrast have little effect. Modules of the border count
+like bits: a black square without a code is no tag.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.kernels.surface import read_codes, read_modules
 
 MIN_LIKENESS = 0.7
-"""Correlation of a tag with its code at least. Of a code of 36 bits, bits at random reach 0.7 with one of 600 tags once
-in some thousand squares; blur as wide as a module still leaves 0.8."""
+"""Smallest correlation of a tag with its code. With 36 bits, random bits reach 0.7 with one of 600 tags once in some
+thousand squares; blur as wide as a module still leaves 0.8."""
 
 MIN_PREDICTED_LIKENESS = 0.6
-"""The same where one tag is foretold and no other, nor this one turned, is more like what is seen: tags of 1.2 px a
-module at the rim of a fisheye, blurred by 0.7 px, have 0.63 and others 0.5 there (RENDERED)."""
+"""The same for a predicted tag, if no other tag or orientation has a larger correlation: tags of 1.2 px a module at the
+rim of a fisheye, blurred by 0.7 px, have 0.63 there, and others 0.5 (RENDERED)."""
 
 MIN_CODE_CONTRAST = 1.5
-"""Standard deviation of the modules' brightness, grey levels: less is paper, or a black square. Ink ten levels
-darker than paper makes 4."""
+"""Smallest standard deviation of the modules' brightness, in grey levels: paper or a black square has less, ink ten
+levels darker than paper makes 4."""
 
 MIN_SCATTER = 1e-6
-"""Correlations that scatter less are all the same: rounding."""
+"""Smallest standard deviation of correlations: smaller ones are due to rounding."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Codes:
-    """What the tags that may be there look like.
+    """The codes of the tags that may be in an image.
 
     Attributes
     ----------
-    modules : on a side, with the border.
+    modules : number of modules along a side, with the border.
     numbers : (4 N,) tag of each code.
-    turns : (4 N,) quarter turns, with the angle growing from right to down, by which the code is turned.
+    turns : (4 N,) rotation of the code in quarter turns, in the direction from right to down.
     patterns : (4 N, modules^2) brightness, of mean 0 and length 1.
     """
 
@@ -52,7 +52,7 @@ class Codes:
 
     @classmethod
     def of(cls, pattern: AprilGrid, numbers: IntArray) -> Codes:
-        """Return the codes of the tags of these numbers."""
+        """Return the codes of the tags with these numbers."""
         return _codes(pattern.dictionary, pattern.border, pattern.numbering, tuple(numbers.tolist()))
 
 
@@ -68,13 +68,13 @@ def _codes(dictionary: str, border: int, numbering: str, numbers: tuple[int, ...
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TagCode:
-    """What was read in N quadrilaterals.
+    """The codes read in N quadrilaterals.
 
     Attributes
     ----------
-    number : (N,) tag that it is most like.
-    turns : (N,) quarter turns by which the tag is turned against the quadrilateral's first corner.
-    likeness : (N,) correlation, 0 where there is nothing to read.
+    number : (N,) tag with the largest correlation.
+    turns : (N,) rotation of the tag relative to the quadrilateral's first corner, in quarter turns.
+    likeness : (N,) correlation, 0 if the contrast is too low.
     """
 
     number: IntArray
@@ -87,7 +87,7 @@ class TagCode:
 
 
 def read_tags(image: GreyImage, quads: FloatArray, codes: Codes) -> TagCode:
-    """Return the codes in the quadrilaterals (N, 4, 2), corners in order of growing angle from u to v."""
+    """Return the codes in the quadrilaterals (N, 4, 2), corners in the order of increasing angle from u to v."""
     if not len(quads):
         return TagCode(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     best, most = read_codes(image, quads, codes.modules, codes.patterns, MIN_CODE_CONTRAST)
@@ -95,8 +95,8 @@ def read_tags(image: GreyImage, quads: FloatArray, codes: Codes) -> TagCode:
 
 
 def excess_likeness(image: GreyImage, quads: FloatArray, codes: Codes) -> FloatArray:
-    """Return how much more each code is like a quadrilateral (N, 4, 2) than codes are on average, in their scatter: (N,
-    4 T) for each code of `codes`; 0 where there is nothing to read."""
+    """Return the correlations (N, 4 T) of N quadrilaterals (N, 4, 2) with all codes, minus their mean over the codes,
+    in their standard deviations; 0 if the contrast is too low."""
     bright, spread = read_modules(image, quads, codes.modules)
     likeness = bright @ codes.patterns.T
     excess = likeness - likeness.mean(axis=1, keepdims=True)
@@ -105,6 +105,6 @@ def excess_likeness(image: GreyImage, quads: FloatArray, codes: Codes) -> FloatA
 
 
 def transferred(homography: FloatArray, points: FloatArray) -> FloatArray:
-    """Return points (P, 2) under every homography (N, 3, 3), as (N, P, 2)."""
+    """Return points (P, 2) mapped by each homography (N, 3, 3), (N, P, 2)."""
     image = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ np.swapaxes(homography, 1, 2)
     return np.asarray(image[..., :2] / image[..., 2:])

@@ -1,12 +1,12 @@
-"""The corners of a board of tags as finely as those of a chessboard.
+"""The subpixel fit of the corners of a board of tags.
 
-Where tags stand alone, four squares never meet: their corners are those of single squares, to which the same edge model
-is fitted in another form, with all that it leaves taken for noise.
+Lone tags have corners of single squares: a variant of the edge model is fitted to them, and all its residuals count as
+noise.
 
-Where small squares fill the corners between tags, the corners of tags are saddles like those of chessboards, only that
-their lines are not evenly spaced: a side of a tag to one side, the gap to the next to the other. The edge model is
-fitted in windows that reach half way to the neighbours, and are so narrow that they end before the tag's code. Tags too
-small for that are fitted whole (`rigkit.detection.tags.whole`).
+If small squares fill the corners between tags, the corners are saddles like those of chessboards, but their lines are
+unevenly spaced: the neighbours are a side of a tag away in one direction, and the gap to the next tag in the other. The
+edge model is fitted in windows that reach half way to the neighbours, and are narrow enough to end before the tag's
+code. Tags that are too small for that are fitted as a whole (`rigkit.detection.tags.whole`).
 """
 
 from __future__ import annotations
@@ -46,51 +46,51 @@ from rigkit.kernels.tag_board import CORNER_COLUMNS, TagBoardFit, TagCornerRules
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 MIN_TAG_CORNERS = 4
-"""One tag."""
+"""Smallest number of corners of a board: those of one tag."""
 
 MIN_PREDICTING_CORNERS = 8
-"""Corners that a missing one can be foretold from: those of two tags."""
+"""Smallest number of corners from which missing ones are predicted: those of two tags."""
 
 MAX_PREDICTED_GAIN = 4.0
-"""Predictions from corners around count up to this standard deviation, for corners of standard deviation 1."""
+"""Largest standard deviation of a prediction from neighbouring corners of standard deviation 1."""
 
 WIDE_BLUR = 0.15
-"""A missing corner is first sought with edges so wide, in widths of the gap between tags."""
+"""Blur of the first fit of a missing corner with an uncertain prediction, in widths of the gap between tags."""
 
 MAX_TAG_ROUNDS = 12
-"""Rounds in which missing corners are added, each foretold by those of the one before."""
+"""Largest number of rounds in which missing corners are added, or outliers dropped, each after a new map."""
 
 NOTHING_NEAR_PX, MIN_EDGE_CONTRAST = 1e4, 10.0
-"""Of tags that stand alone no neighbouring lines are reckoned with; and grey levels between ink and paper that the fit
-starts from at least."""
+"""Distance of neighbouring lines from lone tags, large enough to have no effect; and smallest initial contrast, in grey
+levels."""
 
 FEW_CORNERS = 12
-"""Corners that say how blurred the image is, to a few hundredths."""
+"""Number of corners from which the blur of the image is estimated, to a few hundredths."""
 
 BETTER_KNOWN, ROUGH_PX = 0.5, 0.25
-"""Lines are looked at again where corners scatter no more than this part of what those did that told of them first:
-else what differs is as wrong now. And all are fitted again where those scattered by more: saddles never do, only
-corners of outlines, which lie in whole pixels."""
+"""Corners are fitted again with new curvatures of their lines only if the scatter of the corners is at most this part
+of the scatter of those that gave the old curvatures: otherwise the new ones are as inaccurate. All are fitted again if
+the old scatter exceeds ROUGH_PX: that of saddles never does, only that of corners of outlines, at whole pixels."""
 
 CURVED_SIGMAS = 0.3
-"""Corners are fitted again where their lines bend otherwise by this part of their sigmas: left alone it would add a
-twentieth to their errors."""
+"""Smallest deviation of a corner's lines from those that it was fitted with, in its sigmas, for which it is fitted
+again: ignored, it would add a twentieth to the error."""
 
 TAG_OUTLIER, OUTLIER_TEST_GAIN = 6.0, 1.5
-"""A corner that lies off where those around have it by more than this, times what is usual and its own standard
-deviation together, is covered in part; where their prediction has no larger gain: at the ends of a board it errs."""
+"""Smallest leave-one-out error of an outlier, for example a partly covered corner, relative to the typical error and
+its own sigma combined; and largest gain of predictions for this test: at the ends of a board they are inaccurate."""
 
 
 def tag_corners(image: GreyImage, tags: TagBoard, pixels: FloatArray, camera: Camera | None) -> BoardDetection | None:
-    """Return the corners of a board whose rough corners are `pixels` (R, C, 2), NaN where unknown; None for too few.
+    """Return the corners of a board from approximate ones, `pixels` (R, C, 2), NaN where unknown; None if too few fit.
 
-    Corners that the rough ones foretell, or a calibrated `camera`, are added where they are seen.
+    Missing corners that can be predicted, by the others or by a calibrated `camera`, are added if they are visible.
     """
     fitter = _Fitter(image, tags, pixels, camera)
     fitter.first()
     if fitter.count < MIN_TAG_CORNERS:
         return None
-    # What the lattice lacks is added before corners are fitted again; what only finer ones foretell, after that.
+    # Missed corners are added before the others are fitted again; those that only better corners predict, afterwards.
     fitter.again()
     fitter.completed()
     fitter.without_outliers()
@@ -106,7 +106,7 @@ def tag_corners(image: GreyImage, tags: TagBoard, pixels: FloatArray, camera: Ca
 
 @functools.cache
 def _rules(border: float, mirrored: bool, rounded: bool) -> TagCornerRules:
-    """Return the rules of the fit; `border` in sides of a tag, else as of `edge_rules`."""
+    """Return the rules of the fit; `border` in sides of a tag, the others as for `edge_rules`."""
     return TagCornerRules.of(
         first=edge_rules(*FIRST_PASS, False, rounded),
         last=edge_rules(*LAST_PASS, mirrored, rounded),
@@ -143,14 +143,14 @@ def _rules(border: float, mirrored: bool, rounded: bool) -> TagCornerRules:
 
 
 class _Fitter:
-    """The fit of one board's corners in one image, from the rough `pixels` (R, C, 2)."""
+    """The fit of one board's corners in one image, from approximate `pixels` (R, C, 2)."""
 
     def __init__(self, image: GreyImage, tags: TagBoard, pixels: FloatArray, camera: Camera | None) -> None:
         self.image, self.tags, self.camera = image, tags, camera
         joined = tags.pattern.corner_squares
         rules = _rules(tags.pattern.border / tags.codes.modules, joined, image.dtype == np.uint8)
         self.fit = TagBoardFit(image, tags.packed, rules, pixels)
-        # A camera's map is that of one state; what the corners tell alone needs nobody between the rounds.
+        # A camera's map is valid for one state only; a map through the corners is updated by the kernel itself.
         self.rounds = MAX_TAG_ROUNDS if camera is None else 1
 
     @property
@@ -160,18 +160,18 @@ class _Fitter:
 
     @property
     def count(self) -> int:
-        """How many corners are known."""
+        """Number of known corners."""
         return int(np.count_nonzero(~np.isnan(self.fit.corners[:, 0])))
 
     def base(self, state: BoardState) -> Callable[[FloatArray], TagSurface] | None:
-        """Return the map that the camera has of the board whose corners are known so far."""
+        """Return the camera's map of the board, with its pose from the known corners; None if there is none."""
         if self.camera is None or np.count_nonzero(state.known) < MIN_GUIDE_CORNERS:
             return None
         pose = Guide.of(self.tags.board, self.camera, state).cam_from_board
         return None if pose is None else partial(seen_surface, self.camera, pose, np.array(self.tags.board.squares_mm))
 
     def guide(self) -> None:
-        """Tell the fit the camera's map, if there is one and the state is not the one of before."""
+        """Pass the camera's map to the fit, if there is a camera and the corners have changed."""
         if self.camera is not None and not self.fit.mapped:
             base = self.base(self.state)
             self.fit.set_base(None if base is None else base(self.tags.places.reshape(-1, 2)).rows)
@@ -182,34 +182,33 @@ class _Fitter:
         return SmoothMap(rows_where(self.tags.places, known), rows_where(state.pixels, known), self.base(state))
 
     def first(self) -> None:
-        """Fit the rough corners, leave out those that fail, and add those missing that they foretell."""
+        """Fit the approximate corners, drop those that fail, and add missing ones that these predict."""
         self.guide()
         self.fit.fit_all()
         if self.fit.add(1, by_this_map=True):
             self.completed()
 
     def completed(self) -> None:
-        """Add the missing corners that are seen, each round of them foretold by those before."""
+        """Add the missing corners that are visible, each round predicted by the corners of the previous one."""
         for _ in range(0, MAX_TAG_ROUNDS, self.rounds):
             self.guide()
             if not self.fit.add(self.rounds):
                 break
 
     def again(self) -> None:
-        """Fit those corners again whose lines bend otherwise than when they were fitted, if that is known better
-        now."""
+        """Fit those corners again for which a better estimate of the curvature of their lines is known now."""
         self.guide()
         self.fit.fit_bent()
 
     def without_outliers(self) -> None:
-        """Leave out corners that lie where those around them cannot have them."""
+        """Drop corners that contradict their neighbours."""
         for _ in range(0, MAX_TAG_ROUNDS, self.rounds):
             self.guide()
             if not self.fit.drop(self.rounds):
                 break
 
     def last(self) -> tuple[BoardState, float]:
-        """Return the corners as they finally are, and the factor of their sigmas."""
+        """Return the final corners and the factor of their sigmas."""
         joined = self.tags.pattern.corner_squares
         factor = self.fit.sigma_factor(factor_rules(LAST_PASS[0])) if joined else 1.0
         state = self.state

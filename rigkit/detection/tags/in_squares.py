@@ -1,7 +1,7 @@
-"""Where a lattice lies in a ChArUco board, by the markers in its squares.
+"""The place of a lattice on a ChArUco board, from the markers in its squares.
 
-The lattice says where the squares are, so that no marker's outline need be found: what blur, faint light or few pixels
-leave of a code is compared with those of the board.
+The lattice determines the squares, so that markers need no visible outlines: codes that are blurred, faint or small are
+correlated with those of the board.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from rigkit.detection.tags.placing import MIN_TAGS_OF_PLACE, place_together, squ
 from rigkit.kernels.surface import maps_of_quads
 
 MIN_MARKERS, AGREEING_MARKERS = 3, 0.7
-"""Markers, and which part of those read, that give a lattice the same place: of a board of the other pattern, or with
-other columns, the markers of every second row do."""
+"""Smallest number of markers, and smallest share of those read, that agree on the place of a lattice: on a board of the
+other pattern, or with other columns, only the markers of every second row agree."""
 
 LIKE_BETTER_ROWS = 0.5
-"""A row of markers agrees with a place if they are like their codes by so much, at least, of what those of the better
-half of the rows are: of a board of the other pattern, every second row is by 0."""
+"""Smallest mean likeness of a row of markers that agrees with a place, relative to the better half of the rows: on a
+board of the other pattern, every second row has 0."""
 
 MAX_PREDICTION_GAIN = 8.0
-"""Corners beyond those known are foretold up to this standard deviation, for corners of standard deviation 1."""
+"""Largest standard deviation of predicted corners beyond the known ones of standard deviation 1."""
 
 ADJACENT_MARKERS = 2
-"""Markers that touch a corner within the board."""
+"""Number of markers that touch a corner inside the board."""
 
 
 def vouched_by_markers(boards: Sequence[Board], image: GreyImage, lattice: Lattice) -> bool:
-    """Return whether the markers in the squares of a lattice, all together, make it one of these ChArUco boards.
+    """Return whether all markers in a lattice's squares, together, place it on one of these ChArUco boards.
 
-    The ink of markers, blurred, spoils the fit of corners beside it, which then looks like that of anything but a
-    board: with squares of 12 to 22 px, blurred by 1.5 and 2 px, the evidence of the corners is -0.2 to -4 (REAL).
+    The blurred ink of markers disturbs the fit of the corners beside them, so that the evidence of the corners is that
+    of no board: -0.2 to -4 with squares of 12 to 22 px, blurred by 1.5 and 2 px (REAL).
     """
     return any(_place_together(image, lattice, board) is not None for board in boards)
 
 
 def place_by_markers(image: GreyImage, lattice: Lattice, board: Board) -> tuple[int, IntArray] | None:
-    """Return quarter turns and the shift (2,) that take a lattice to the grid of a ChArUco board; None where its
-    markers do not say it with one voice."""
+    """Return the quarter turns and the shift (2,) from a lattice to the grid of a ChArUco board; None if its markers do
+    not agree."""
     squares, cells = squares_of(lattice, dark=_pattern(board).inverted)
     if len(squares) < MIN_MARKERS:
         return None
@@ -64,7 +64,7 @@ def place_by_markers(image: GreyImage, lattice: Lattice, board: Board) -> tuple[
 
 
 def _place_together(image: GreyImage, lattice: Lattice, board: Board) -> tuple[int, IntArray] | None:
-    """Return, as `place_by_markers`, where all markers in the squares of a lattice say that it lies, which may be too
+    """Return the place of a lattice, as `place_by_markers`, from all markers in its squares together, which may be too
     blurred to be read one by one."""
     squares, cells = squares_of(lattice, dark=_pattern(board).inverted)
     if len(squares) < MIN_TAGS_OF_PLACE:
@@ -84,15 +84,15 @@ def _place_together(image: GreyImage, lattice: Lattice, board: Board) -> tuple[i
     of_row = np.bincount(row[inside][own]), np.bincount(row[inside][own], excess[inside][own, codes[own] + -turns % 4])
     means = np.sort(of_row[1][of_row[0] > 0] / of_row[0][of_row[0] > 0])
     agreeing = means > LIKE_BETTER_ROWS * means[len(means) // 2 :].mean()
-    # The first square lies before the first corner.
+    # The first square is the one before the first corner.
     return (turns, shift - 1) if agreeing.mean() >= AGREEING_MARKERS else None
 
 
 def between_markers(image: GreyImage, pixels: FloatArray, board: Board) -> FloatArray:
-    """Return rough corners (R, C, 2) of a ChArUco board, NaN where unknown, with those between two markers that are
-    read where the known corners foretell them: what covers a corner covers one of the two."""
+    """Return the approximate corners (R, C, 2) of a ChArUco board, NaN where unknown, with those added that lie between
+    two markers read where the known corners predict them: what covers a corner covers one of the two."""
     places = _places(board)
-    # The squares of the outermost markers end where the board does.
+    # The squares of the outermost markers extend to the ends of the board.
     grown = np.pad(pixels, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
     rows, columns = places[:, 1, None] + np.array([0, 0, 1, 1]), places[:, 0, None] + np.array([0, 1, 1, 0])
     read = np.zeros(len(places), np.bool_)
@@ -124,15 +124,15 @@ def between_markers(image: GreyImage, pixels: FloatArray, board: Board) -> Float
 
 
 def likeness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, numbers: IntArray, board: Board) -> FloatArray:
-    """Return how like the markers of these `numbers` (N,) the `squares` of a ChArUco board are, as `excess_likeness`.
+    """Return the `excess_likeness` (N,) of `squares` of a ChArUco board to the markers of these `numbers` (N,).
 
-    By chance it has mean 0 and standard deviation 1. It is 0 where there is nothing to read, NaN where the corners do
-    not foretell the square, or foretell it out of the image.
+    Random squares have mean 0 and standard deviation 1. It is 0 if the contrast is too low, NaN if the square cannot be
+    predicted from the corners, or is outside of the image.
 
     Parameters
     ----------
     pixels : (R, C, 2) corners, NaN where unknown.
-    squares : (N, 2) column and row, the one before the first corner (0, 0), or one beyond the board's.
+    squares : (N, 2) column and row; (0, 0) is before the first corner, and those one beyond the board are allowed.
     """
     quads = _outlines(image, pixels, squares, board)
     inside = np.isfinite(quads).all(axis=(1, 2))
@@ -145,7 +145,7 @@ def likeness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, numbers
 
 
 def brightness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, board: Board) -> FloatArray:
-    """Return the brightness (N, K) of the modules that markers in these squares have; NaN and else as `likeness_at`."""
+    """Return the brightness (N, K) of the marker modules in these squares; NaN and arguments as for `likeness_at`."""
     modules = marker_codes(board).modules
     middles = (np.stack(np.meshgrid(*2 * [np.arange(modules)]), axis=-1).reshape(-1, 2) + 0.5) / modules
     quads = _outlines(image, pixels, squares, board)
@@ -156,7 +156,7 @@ def brightness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, board
 
 
 def _outlines(image: GreyImage, pixels: FloatArray, squares: IntArray, board: Board) -> FloatArray:
-    """Return the outlines (N, 4, 2) of the markers in squares; NaN and else as `likeness_at`."""
+    """Return the outlines (N, 4, 2) of the markers in squares; NaN and arguments as for `likeness_at`."""
     grown = np.pad(pixels, ((2, 2), (2, 2), (0, 0)), constant_values=np.nan)
     wanted = np.zeros(grown.shape[:2], np.bool_)
     rows, columns = (squares[:, k, None] + 1 + np.array(step) for k, step in ((1, (0, 0, 1, 1)), (0, (0, 1, 1, 0))))
@@ -195,12 +195,12 @@ def _read(image: GreyImage, squares: FloatArray, board: Board) -> TagCode:
 
 
 def _as_printed(image: GreyImage, board: Board) -> GreyImage:
-    """Return the image with markers dark on white."""
+    """Return the image with dark markers on white."""
     return 255 - image if _pattern(board).inverted else image
 
 
 def _within(squares: FloatArray, board: Board) -> FloatArray:
-    """Return the outlines of the markers in squares (N, 4, 2)."""
+    """Return the outlines (N, 4, 2) of the markers in squares (N, 4, 2)."""
     margin = 0.5 * (1.0 - _pattern(board).marker_mm / np.array(board.squares_mm))
     unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     return transferred(maps_of_quads(squares), margin + unit * (1.0 - 2.0 * margin))

@@ -1,4 +1,4 @@
-"""Reading markers of any dictionary in one image: squares are outlined once, and each is read once for every number of
+"""Reading markers of any dictionary in one image: quadrilaterals are detected once, and sampled once for each number of
 modules that markers have."""
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from rigkit.detection.tags.quads import quadrilaterals
 from rigkit.kernels.surface import read_modules
 
 MIN_DARK_BORDER = 0.65
-"""Of the modules of a marker's border, this part at least is darker than the middle between its darkest and its
-brightest module: as much as OpenCV asks, so that few squares are compared with thousands of markers."""
+"""Smallest share of the modules of a marker's border that are darker than the middle between its darkest and brightest
+module. It is OpenCV's limit, so that few squares are compared with thousands of markers."""
 
 MIN_MARKER_LIKENESS, MIN_MARKER_MARGIN = 0.85, 0.02
-"""Correlation of a marker with its code at least, and by how much that of any other marker is less. Of what OpenCV
-reads in REAL pictures, made smaller by up to 4 and blurred by up to 4 px, the least has 0.88; a square whose 16 bits
-are chance is within one bit of some of 1000 markers, 0.93, but of several."""
+"""Smallest correlation of a marker with its code, and smallest difference to that with any other marker. The smallest
+correlation of markers that OpenCV reads in REAL images, reduced by up to 4 and blurred by up to 4 px, is 0.88; a square
+with 16 random bits is within one bit of some of 1000 markers, 0.93, but of several."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ReadMarkers:
-    """N markers of one dictionary, each number once.
+    """N markers of one dictionary, all with different numbers.
 
     Attributes
     ----------
-    corners : (N, 4, 2) as the marker stands upright, in order of growing angle from u to v.
+    corners : (N, 4, 2) from the upright marker's first one, in the order of increasing angle from u to v.
     numbers : (N,)
     likeness : (N,) correlation with their codes.
     """
@@ -43,7 +43,7 @@ class ReadMarkers:
 
 
 def read_markers(image: GreyImage, dictionaries: Sequence[str]) -> dict[str, ReadMarkers]:
-    """Return the markers that are seen in an image, by dictionary, those left out of which there are none."""
+    """Return the markers in an image by dictionary, without dictionaries that have none."""
     quads = quadrilaterals(image)
     by_side: dict[int, list[tuple[str, Codes]]] = {}
     for name in dictionaries:
@@ -60,8 +60,8 @@ def read_markers(image: GreyImage, dictionaries: Sequence[str]) -> dict[str, Rea
 
 
 def _framed(image: GreyImage, quads: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:
-    """Return those of the quads (N, 4, 2) that have dark borders, and the brightness of their modules (N, side^2), of
-    mean 0 and length 1."""
+    """Return the quads (N, 4, 2) with dark borders, and the brightness of their modules (N, side^2), of mean 0 and
+    length 1."""
     if not len(quads):
         return quads, np.zeros((0, side * side))
     bright, spread = read_modules(image, quads, side)
@@ -74,7 +74,7 @@ def _framed(image: GreyImage, quads: FloatArray, side: int) -> tuple[FloatArray,
 
 
 def _of_kind(quads: FloatArray, bright: FloatArray, codes: Codes) -> ReadMarkers:
-    """Return the markers of a dictionary that quads (N, 4, 2) are, of each number the one most like it."""
+    """Return the markers of a dictionary in the quads (N, 4, 2), the most similar one for each number."""
     every = np.arange(len(quads))
     likeness = bright @ codes.patterns.T
     best = likeness.argmax(axis=1) if len(quads) else np.zeros(0, np.int64)

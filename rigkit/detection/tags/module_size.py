@@ -1,9 +1,8 @@
-"""How large the modules of tags are, and with them how wide tags were printed, whatever light and ink have done to
-their edges.
+"""The size of the modules of tags, and with it the printed size of the tags, if light or ink has moved their edges.
 
-Too much light lets bright parts run over into dark ones, ink that spreads dark ones into bright ones: tags seem smaller
-or larger than they are, and the gaps between them larger or smaller. The bits of a code grow and shrink around their
-middles, and tags around theirs, so that these tell the size of a module, and how far edges have moved.
+Too much light spreads bright parts into dark ones, and ink dark parts into bright ones: tags seem smaller or larger
+than they are, and the gaps between them larger or smaller. The bits of a code and the tags grow or shrink around their
+own middles. The middles give the size of a module and the displacement of edges.
 """
 
 from __future__ import annotations
@@ -19,29 +18,29 @@ from rigkit.detection.tags.codes import transferred
 from rigkit.kernels.surface import maps_of_quads
 
 SAMPLES, STRIDE = 8, 2
-"""Parts of a module along each of its sides by which edges are moved, and from one to the next of those that are looked
-at."""
+"""Samples of a module along each of its sides, by which edges are moved, and the step between the samples that are
+compared."""
 
 ENOUGH_TAGS = 12
-"""Tags, evenly spread over those seen, that are looked at: what more of them say is the same."""
+"""Largest number of tags that are evaluated, evenly spread over those found: more of them change nothing."""
 
 OUTLINE_STEP = 0.5
-"""Widths of tags that are tried, modules: between them likeness is a parabola."""
+"""Step between the sides of tags that are tried, in modules: in between, the correlation is a parabola."""
 
 EDGE_MOVES = np.arange(-4, 5) / SAMPLES
-"""By how much edges may have moved into what is dark, modules: at half a module a lone bit is gone."""
+"""Displacements of edges into dark parts that are tried, in modules: at half a module a single bit vanishes."""
 
 
 @dataclass(frozen=True, slots=True)
 class ModuleSize:
-    """What the codes of tags that lie beside each other say of their print, in modules.
+    """Size of adjacent tags as printed, from their codes, in modules.
 
     Attributes
     ----------
-    outline : the side of the quadrilaterals that were taken for the tags.
-    moved : how far bright parts have run over into dark ones; negative where dark ones have into bright ones.
-    side : a tag's, where its edges were printed.
-    squares : there are dark squares between the corners of tags.
+    outline : side of the given quadrilaterals.
+    moved : displacement of edges into dark parts; negative if dark parts have spread into bright ones.
+    side : printed side of a tag.
+    squares : whether there are dark squares between the corners of tags.
     """
 
     outline: float
@@ -51,19 +50,19 @@ class ModuleSize:
 
 
 def module_size(image: GreyImage, upright: FloatArray, bits: BoolArray, step: float) -> ModuleSize | None:
-    """Return how large the modules of tags are, from all of them together; None where their codes do not say.
+    """Return the size of the modules of all tags together; None if no edge of the tags is visible.
 
     Parameters
     ----------
-    upright : (N, 4, 2) corners of what was taken for the tags, as it turned out to stand upright.
+    upright : (N, 4, 2) quadrilaterals of the tags, from the upright tag's first corner.
     bits : (N, B, B) which bits of their codes are black.
-    step : from one tag to the next, in sides of these quadrilaterals.
+    step : distance from one tag to the next, in sides of these quadrilaterals.
     """
     some = slice(None, None, -(-len(upright) // ENOUGH_TAGS))
     upright, bits, count = upright[some], bits[some], bits.shape[1]
     maps = maps_of_quads(upright)
     outlines = np.arange(count + 1.0, count + 6.0, OUTLINE_STEP)
-    # From the middle of the first bit to that of the last: beyond, edges move to one side only.
+    # From the middle of the first bit to that of the last one: beyond, edges move in one direction only.
     along = (np.arange(0, SAMPLES * (count - 1), STRIDE) + 0.5) / SAMPLES - 0.5 * (count - 1)
     places = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
     models = _normal(_codes(bits))
@@ -82,7 +81,7 @@ def module_size(image: GreyImage, upright: FloatArray, bits: BoolArray, step: fl
 
 
 def _codes(bits: BoolArray) -> FloatArray:
-    """Return the brightness of codes (N, B, B) where it is looked at, with edges moved: (D, N, K)."""
+    """Return the brightness (D, N, K) of codes (N, B, B) at the compared samples, for D displacements of edges."""
     count = bits.shape[1]
     # The border around the code is dark.
     fine = np.pad(~bits, ((0, 0), (1, 1), (1, 1))).astype(np.uint8)
@@ -98,14 +97,14 @@ def _codes(bits: BoolArray) -> FloatArray:
 
 
 def _normal(levels: FloatArray) -> FloatArray:
-    """Return rows (..., K) of mean 0 and length 1, 0 where all is the same."""
+    """Return rows (..., K) of mean 0 and length 1, or 0 if constant."""
     out = levels - levels.mean(axis=-1, keepdims=True)
     length = np.linalg.norm(out, axis=-1, keepdims=True)
     return np.asarray(np.where(length > 1e-9, out / np.maximum(length, 1e-9), 0.0), np.float64)
 
 
 def _peak(values: FloatArray, at: int) -> float:
-    """Return where the parabola through the largest of `values` and those beside it has its peak."""
+    """Return the peak of the parabola through the largest value, at index `at`, and its neighbours."""
     if not 0 < at < len(values) - 1:
         return float(at)
     before, here, after = values[at - 1 : at + 2]
@@ -114,10 +113,10 @@ def _peak(values: FloatArray, at: int) -> float:
 
 
 def _edges(image: GreyImage, maps: FloatArray, outline: float, count: int, pitch: float) -> tuple[float, bool] | None:
-    """Return the side of tags as their edges are seen, in modules, and whether there are dark squares between them;
-    None where no edge is seen between the codes.
+    """Return the visible side of tags, in modules, and whether there are dark squares between them; None if no edge is
+    visible between the codes.
 
-    `outline` is the side of what `maps` (N, 3, 3) take the unit square to, `pitch` the way from tag to tag.
+    `maps` (N, 3, 3) map the unit square to quadrilaterals of side `outline`; `pitch` is the distance from tag to tag.
     """
     # From the end of a code to the middle of the gap, along lines through all of its bits.
     out = np.arange(0.5 * count, 0.5 * pitch + 0.5 / SAMPLES, 1.0 / SAMPLES)
@@ -127,7 +126,7 @@ def _edges(image: GreyImage, maps: FloatArray, outline: float, count: int, pitch
     seen = sample(image, transferred(maps, 0.5 + neighbours.reshape(-1, 2) / outline))
     levels = np.median(seen.reshape(len(maps), 4, len(out), count), axis=(0, 1, 3))
     half = 0.5 * (levels.min() + levels[-1])
-    # The border is darkest; from there on it is sought where the gap begins.
+    # The border is darkest; from there outwards the edge is the beginning of the gap.
     darkest = int(levels.argmin())
     beyond = np.flatnonzero(levels[darkest:] >= half)
     if not len(beyond) or not darkest + beyond[0]:

@@ -1,4 +1,4 @@
-"""Lattices of corners on the grids of tag boards: every tag read says where its lattice lies; most of them agree."""
+"""The place of lattices of corners on boards of tags, by a vote of the tags read in their squares."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ from rigkit.detection.tags.codes import Codes, excess_likeness, read_tags
 from rigkit.kernels.tag_board import TagsOfBoard, squares_of_lattice, vote_place
 
 MIN_BITS = 30
-"""Bits, in all agreeing tags together, that say where a lattice lies: one tag of 36, two of 25 or 16."""
+"""Smallest number of bits in all agreeing tags together: one tag of 36, two of 25 or 16."""
 
 AGREEING_TAGS = 0.4
-"""Part of the squares of a lattice where tags would be in the place that tags give it, which are read as those tags: a
-code by chance stands alone, dirt and glare cover a few."""
+"""Smallest share of the squares with tags in a place on the board that are read as these tags: misread codes agree with
+no others, and dirt and glare cover a few tags."""
 
 AGREEING_READ = 0.7
-"""Part of the squares read in that place, as whatever tag, that are read as the tag there: codes of few bits are often
-misread, and in the mirror image of a board of nine tags of 16 bits eight are read and four agree (RENDERED). Where blur
-makes that of a board's own tags, all of them together are asked."""
+"""Smallest share of the squares read as any tag in a place that are read as the tag there: codes of few bits are often
+misread; in the mirror image of a board of nine tags of 16 bits eight are read and four agree (RENDERED). If blur causes
+misreadings of a board's own tags, all tags are evaluated together."""
 
 SURE_EXCESS = 6.0
-"""All tags of a lattice together are more like their codes than like others by so many times the scatter of what chance
-makes, normal for a sum of many: one in a billion, with hundreds of places to try."""
+"""Smallest excess correlation of all tags of a lattice together with their codes, in standard deviations of random
+ones; the sum of many is normal: one in a billion, with hundreds of places to try."""
 
 AHEAD = 2.0
-"""So much more than of any other place."""
+"""Smallest difference of the excess to that of any other place."""
 
 MIN_TAGS_OF_PLACE = 4
-"""Fewer tags are read one by one, or not at all."""
+"""Smallest number of tags that are evaluated together; fewer are read one by one."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class TagBoard:
-    """A board of tags and what is needed to read it and to place its corners (R, C).
+    """A board of tags with the data for reading it and placing its corners (R, C).
 
     Attributes
     ----------
-    numbers : (R / 2, C / 2) of its tags, which look as `codes` say.
-    firsts : (highest number + 1, 2) the (column, row) of the first corner of each.
+    numbers : (R / 2, C / 2) of its tags, with `codes`.
+    firsts : (highest number + 1, 2) the (column, row) of the first corner of each tag.
     places : (R, C, 2) of its corners, in sides of a tag.
-    steps : (R, C, 2, 2) how far it is to the corners above and below, right and left, within the tag or across the gap.
-    signs : (R, C) +1 where brightness grows with the angle across the line along the row, else -1.
-    packed : the same as kernels take it.
+    steps : (R, C, 2, 2) distances to the corners above and below, right and left, within the tag or across the gap.
+    signs : (R, C) +1 where brightness increases with the angle across the line along the row, else -1.
+    packed : the same for kernels.
     """
 
     board: Board
@@ -66,7 +66,7 @@ class TagBoard:
 
     @staticmethod
     def of(board: Board) -> TagBoard:
-        """Return that of a board; those of boards asked for before are kept."""
+        """Return the cached data of a board."""
         return _tag_board(board)
 
 
@@ -113,7 +113,7 @@ def _tag_board(board: Board) -> TagBoard:
 
 
 def placed_lattices(image: GreyImage, lattices: Sequence[Lattice], board: TagBoard) -> tuple[FloatArray, set[int]]:
-    """Return the corners of `board` (R, C, 2), NaN where none is known, and which of the lattices showed them."""
+    """Return the corners of `board` (R, C, 2), NaN where unknown, and the indices of the lattices that have them."""
     columns, rows = board.board.size
     pixels = np.full((rows, columns, 2), np.nan)
     found: list[tuple[int, int, IntArray, FloatArray]] = []
@@ -125,7 +125,7 @@ def placed_lattices(image: GreyImage, lattices: Sequence[Lattice], board: TagBoa
             cells = grid_turned(np.stack([column, row], axis=-1), lattice.size, turns) + shift
             found.append((votes, n, cells, lattice.pixels[row, column]))
     used = set()
-    # What most tags vouch for comes first; two lattices of one board do not overlap.
+    # In decreasing order of agreeing tags; two lattices of one board do not overlap.
     for _, n, cells, own in sorted(found, key=lambda item: -item[0]):
         column, row = cells.T
         inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
@@ -141,7 +141,7 @@ def placed_lattices(image: GreyImage, lattices: Sequence[Lattice], board: TagBoa
 def _place_together(
     image: GreyImage, size: tuple[int, int], quads: FloatArray, cells: IntArray, board: TagBoard
 ) -> Place | None:
-    """Return where a lattice of this size lies by all tags in its squares `quads` (N, 4, 2) at `cells` (N, 2)."""
+    """Return the place of a lattice of this size from all tags in its squares, `quads` (N, 4, 2) at `cells` (N, 2)."""
     if len(quads) < MIN_TAGS_OF_PLACE:
         return None
     codes_at = np.full((board.board.rows, board.board.columns), -1)
@@ -150,11 +150,11 @@ def _place_together(
 
 
 Place = tuple[int, int, IntArray]
-"""How many tags say it, quarter turns and shift (2,) that take a lattice to the board's grid."""
+"""Number of tags that agree, and quarter turns and shift (2,) from a lattice to the board's grid."""
 
 
 def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> Place | None:
-    """Return where a lattice lies on the board."""
+    """Return the place of a lattice on the board; None if it is unknown."""
     quads, cells = squares_of(lattice, dark=True)
     tags = read_tags(image, quads, board.codes)
     sure = np.flatnonzero(tags.read)
@@ -168,7 +168,7 @@ def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> Place | None:
     own = tagged & (column >= 0) & (row >= 0)
     own &= (column < board.board.columns) & (row < board.board.rows)
     least = max(AGREEING_TAGS * np.count_nonzero(own), AGREEING_READ * np.count_nonzero(own & tags.read))
-    # A lattice may go on over a board beside this one, most of whose tags are not read as this one's.
+    # A lattice may extend over an adjacent board, most of whose tags are not read as this one's.
     least = max(least, 0.5 * np.count_nonzero(tagged & tags.read))
     if votes * bits < MIN_BITS or votes < least:
         return _place_together(image, lattice.size, quads, cells, board)
@@ -176,15 +176,15 @@ def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> Place | None:
 
 
 def place_together(excess: FloatArray, cells: IntArray, size: tuple[int, int], codes_at: IntArray) -> Place | None:
-    """Return where a lattice lies whose codes may be too blurred to be read one by one: where all of them together are
-    most like the codes that the board has there. None where that may be chance.
+    """Return the place of a lattice whose codes may be too blurred to be read one by one: the one with the largest
+    correlation of all of them with the board's codes. None if it may be random.
 
     Parameters
     ----------
-    excess : (N, 4 T) how like each code its squares are, as `excess_likeness`.
+    excess : (N, 4 T) correlation of its squares with all codes, as `excess_likeness`.
     cells : (N, 2) column and row of the squares.
     size : (columns, rows) of the lattice.
-    codes_at : (R, C) which code stands upright in each square of the board, -1 where none does.
+    codes_at : (R, C) the upright code in each square of the board, -1 for none.
     """
     marked = excess.any(axis=1)
     if np.count_nonzero(marked) < MIN_TAGS_OF_PLACE:
@@ -202,7 +202,7 @@ def place_together(excess: FloatArray, cells: IntArray, size: tuple[int, int], c
         inside = (column >= 0) & (column < wide) & (row >= 0) & (row < tall)
         codes = np.where(inside, codes_at[np.where(inside, row, 0), np.where(inside, column, 0)], -1)
         own = codes >= 0
-        # Turned back by `turn`, the tag stands upright.
+        # Rotated back by `turn`, the tag is upright.
         total = np.where(own, excess[np.arange(len(cells)), codes + (-turn) % 4], 0.0).sum(axis=1)
         count = own.sum(axis=1)
         score = np.where(count < MIN_TAGS_OF_PLACE, 0.0, total / np.sqrt(np.maximum(count, 1)))
@@ -215,16 +215,16 @@ def place_together(excess: FloatArray, cells: IntArray, size: tuple[int, int], c
 
 
 def squares_of(lattice: Lattice, *, dark: bool) -> tuple[FloatArray, IntArray]:
-    """Return the dark or the bright squares of a lattice: corners (N, 4, 2) in order of growing angle from u to v, and
-    the (column, row) of their first corners (N, 2)."""
-    # Brightness falls with the angle across the edge from a dark square's first corner along the row.
+    """Return the dark or the bright squares of a lattice: corners (N, 4, 2) in the order of increasing angle from u to
+    v, and the (column, row) of their first corners (N, 2)."""
+    # Brightness decreases with the angle across the edge from a dark square's first corner along the row.
     return squares_of_lattice(lattice.pixels, dark == lattice.rising)
 
 
 def voted_place(lattice: Lattice, cells: IntArray, turns: IntArray, places: IntArray) -> tuple[int, int, IntArray]:
-    """Return how many tags agree most, and on which quarter turns and shift (2,) from a lattice to the board's grid.
+    """Return the largest number of tags that agree, and on which quarter turns and shift (2,) to the board's grid.
 
-    The tags lie in the squares `cells` (N, 2) of the lattice, turned by `turns` (N,) quarter turns against it, and in
-    those `places` (N, 2) of the board.
+    The tags are in the squares `cells` (N, 2) of the lattice, rotated by `turns` (N,) quarter turns relative to it, and
+    have the `places` (N, 2) on the board.
     """
     return vote_place(cells, turns, places, lattice.size)

@@ -1,5 +1,5 @@
-"""Tags that stand alone: dark quadrilaterals are sought, their codes identify them, and a tag that does not lie where
-the others have it is dropped."""
+"""Lone tags: dark quadrilaterals are detected and identified by their codes; a tag that contradicts the places of the
+others is dropped."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from rigkit.detection.tags.placing import MIN_BITS, TagBoard
 from rigkit.kernels.surface import maps_of_quads
 
 MIN_PERIMETER, MIN_OUTLINE_PX = 0.015, 12
-"""Of a quadrilateral, in widths of the image: tags of 8 px in 2000; and pixels of its outline."""
+"""Smallest length of a quadrilateral's outline, in widths of the image (tags of 8 px in 2000), and in pixels."""
 
 THRESHOLD_SIDES, DARKER_THAN_MEAN = (3, 13, 23), 7.0
-"""Ink is darker by so many grey levels than the mean over squares of these sides, px: the smallest parts what almost
-touches, the largest closes borders that are blurred."""
+"""Sides of the squares, px, over whose means ink is darker by this many grey levels: the smallest one separates what
+almost touches, the largest one closes blurred borders."""
 
 OFF_OUTLINE, MIN_SIDE_OF_OUTLINE, MIN_BORDER_PX = 0.03, 0.05, 3
-"""What four corners describe of an outline is off it by this part of its length at most, their sides are no shorter
-than this part; and they lie so far within the image."""
+"""Largest deviation of an outline from the polygon of its four corners, and smallest side of that polygon, in lengths
+of the outline; and smallest distance of the corners from the border of the image."""
 
 NEAR_PLACE, AGREEING_OTHERS = 0.25, 0.4
-"""Two tags agree where they lie to each other as on the board, within this part of their distance, for lenses distort;
-a tag is kept where this part of the others agree with it: a code read by chance agrees with none."""
+"""Largest error of the relative position of two tags that agree, in their distance, as lenses distort; and smallest
+share of the others with which a tag agrees: a misread code agrees with none."""
 
 
 def placed_tags(image: GreyImage, board: TagBoard) -> FloatArray:
-    """Return the rough corners (R, C, 2) of the tags of `board` in an image, NaN where none is seen."""
+    """Return the approximate corners (R, C, 2) of the tags of `board` in an image, NaN where not found."""
     columns, rows = board.board.size
     pixels = np.full((rows, columns, 2), np.nan)
     quads = quadrilaterals(image)
     tags = read_tags(image, quads, board.codes)
-    # The same tag is seen several times: at the outer and at the inner border.
+    # The same tag is found several times: at the outer and at the inner border.
     order = np.flatnonzero(tags.read)[np.argsort(-tags.likeness[tags.read], kind="stable")]
     _, first = np.unique(tags.number[order], return_index=True)
     own = order[first]
@@ -55,12 +55,12 @@ def placed_tags(image: GreyImage, board: TagBoard) -> FloatArray:
 
 
 def quadrilaterals(image: GreyImage) -> FloatArray:
-    """Return quadrilaterals (N, 4, 2) of an image that may be tags, corners in order of growing angle from u to v.
+    """Return quadrilaterals (N, 4, 2) that may be tags, corners in the order of increasing angle from u to v.
 
-    Outlines of what is darker than the mean around it, by squares of several sizes, that four corners describe. So
-    markers are sought by Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers
-    under occlusion", Pattern Recognition 47 (2014), section 4.1. In four fifths of the time cv2.aruco would try to read
-    them, too, but knows neither wide borders nor more than one dictionary.
+    They are the outlines with four corners of regions darker than the mean over squares of several sizes, as in
+    Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under occlusion",
+    Pattern Recognition 47 (2014), section 4.1. cv2.aruco spends four fifths of its time on reading them, too, and
+    supports neither wide borders nor more than one dictionary.
     """
     grey = image if image.dtype == np.uint8 else np.clip(np.rint(image), 0, 255).astype(np.uint8)
     fewest = max(MIN_PERIMETER * max(grey.shape), MIN_OUTLINE_PX)
@@ -84,7 +84,7 @@ def quadrilaterals(image: GreyImage) -> FloatArray:
 
 
 def _proper(quads: FloatArray, lengths: IntArray, shape: tuple[int, ...]) -> FloatArray:
-    """Return the convex of the quads (N, 4, 2), in order of growing angle, whose sides are no small parts of the
+    """Return the convex quads (N, 4, 2), in order of increasing angle, whose sides are long enough relative to the
     `lengths` (N,) of their outlines, and which the border of the image does not cut."""
     side = np.roll(quads, -1, axis=1) - quads
     after = np.roll(side, -1, axis=1)
@@ -98,22 +98,22 @@ def _proper(quads: FloatArray, lengths: IntArray, shape: tuple[int, ...]) -> Flo
 
 
 def _outwards(quads: FloatArray) -> FloatArray:
-    """Return the quads (N, 4, 2) with edges where the picture has them: outlines run through the middles of the
-    outermost dark pixels, half a pixel inside."""
+    """Return the quads (N, 4, 2) moved to the edges: outlines run through the middles of the outermost dark pixels,
+    half a pixel inside."""
     away = [quads - np.roll(quads, sign, axis=1) for sign in (1, -1)]
     lengths = [np.maximum(np.linalg.norm(side, axis=2, keepdims=True), 1e-9) for side in away]
     return np.asarray(quads + 0.5 * (away[0] / lengths[0] + away[1] / lengths[1]))
 
 
 def _agreeing(corners: FloatArray, place: IntArray, step: float) -> BoolArray:
-    """Return which tags with `corners` (N, 4, 2) and first corners `place` (N, 2) of the board lie where others say.
+    """Return which tags with `corners` (N, 4, 2) and first corners `place` (N, 2) on the board agree with the others.
 
-    `step` is from tag to tag, in sides of a tag.
+    `step` is the distance from tag to tag, in sides of a tag.
     """
     tag = 0.5 * step * place + 0.5
     middle = corners.mean(axis=1)
     inverse = np.asarray(np.linalg.inv(maps_of_quads(corners)), np.float64)
-    # Where each tag (first index) has the others, in its own sides from its own first corner, and where it should.
+    # Positions of the others (second index) seen from each tag, in its sides from its first corner, and as printed.
     has = np.stack([transferred(inverse[k : k + 1], middle)[0] for k in range(len(middle))])
     should = tag - tag[:, None] + 0.5
     sign = np.linalg.norm(tag - tag[:, None], axis=2)

@@ -1,7 +1,7 @@
-"""Where the points of a board whose points are not evenly spaced lie in an image, and how its lines run there.
+"""The map from a board with unevenly spaced points to an image, and the directions and curvatures of its lines there.
 
-A smooth map from the board's plane to the image, told by a calibrated camera from the board's pose, corrected by what
-the points around leave over, or by the points around alone.
+It is a smooth map: the projection of a calibrated camera for the board's pose, corrected by a polynomial through the
+residuals of the points, or a map through the points only.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from rigkit.kernels.surface import Polynomials, TagSurface, perspective, project
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 MAX_LEVERAGE = 0.99
-"""A point that a term is there for alone is foretold by nothing."""
+"""Largest leverage of a point: one with more determines a term alone, so that nothing else predicts it."""
 
 POINTS_A_TERM = 2.5
-"""Points that there must be for each coefficient."""
+"""Smallest number of points per coefficient."""
 
 NEAREST_DEPTH = 0.1
-"""A perspective in which a point of the board is nearer than this part of the mean distance is no camera's: the lens is
-a wide fisheye."""
+"""Smallest depth of a point of the board relative to the mean: a perspective with a smaller one is not that of a
+camera, but the lens is a wide fisheye."""
 
 CURVATURES = (0.0, 0.15, 0.3, 0.45, 0.55, 0.65, 0.75, 0.85, 0.92)
-"""Of half a space, what the outermost point may lie off the axis of a fisheye."""
+"""Angles of the outermost point from the axis of a fisheye that are tried, in parts of 90 degrees."""
 
 SMALL_ANGLE, DIFFERENCE = 1e-4, 0.02
-"""Its tangent is the angle, to 1e-8; and half the step of derivatives, in units of the board."""
+"""Angle that equals its tangent to 1e-8; and half the step of derivatives, in units of the board."""
 
 CHORD = 0.4
-"""Derivatives of a camera's projection are chords of this many sides of a tag to either side."""
+"""Step, in sides of a tag, of the differences of a camera's projection."""
 
 
 class SmoothMap:
-    """A smooth map through points at `places` (N, 2) of which the `pixels` (N, 2) are known.
+    """A smooth map through points at `places` (N, 2) with known `pixels` (N, 2).
 
-    It is the map `base` of the board's plane, by default the perspective that fits best, and a polynomial for what that
-    leaves: the lens, and the print. The polynomial has the degree that foretells points best that it was not fitted to.
+    It is the map `base` of the board's plane, by default the best perspective, plus a polynomial through its residuals
+    due to distortion and printing. The degree of the polynomial has the smallest leave-one-out error.
     """
 
     def __init__(
@@ -63,21 +63,21 @@ class SmoothMap:
             self._base, self._polynomial = partial(projected, fitted[0]), fitted[1]
 
     def at(self, wanted: FloatArray) -> TagSurface:
-        """Return the map at `wanted` (M, 2), NaN where the base has none."""
+        """Return the map at `wanted` (M, 2), NaN where the base is undefined."""
         return self._polynomial.added_to(self._base and self._base(wanted), wanted, most_certain=False)
 
     def beyond(self, wanted: FloatArray) -> TagSurface:
-        """Return the map at `wanted` (M, 2), which may lie outside the points."""
+        """Return the map at `wanted` (M, 2), which may be outside of the points."""
         return self._polynomial.added_to(self._base and self._base(wanted), wanted, most_certain=True)
 
     def left_out(self) -> tuple[FloatArray, FloatArray]:
-        """Return how far (N,) the points lie off where the others have them, px, and the gain (N,) of those."""
+        """Return the leave-one-out errors (N,) of the points, px, and the gains (N,) of these predictions."""
         return self._polynomial.off, self._polynomial.gain
 
     def scatter(self) -> float:
-        """Return how far the points usually lie off where the others have them, px per axis, beside what those err by.
+        """Return the standard deviation of the points from their leave-one-out errors, px per axis.
 
-        Where the map has too few terms for the lens, that is more than what points are known to.
+        If the map has too few terms for the lens, it is larger than the uncertainty of the points.
         """
         return self._polynomial.scatter / MEDIAN_OF_RAYLEIGH
 
@@ -85,10 +85,10 @@ class SmoothMap:
 def wide_perspective(
     places: FloatArray, pixels: FloatArray, centre: FloatArray
 ) -> Callable[[FloatArray], TagSurface] | None:
-    """Return the perspective that fits the points best through a lens that may be a fisheye; None where none does.
+    """Return the best perspective through a lens that may be a fisheye; None if there is none.
 
-    Rays of a fisheye make angles with its axis, here through `centre` (2,), as pixels have distances from that, r = f
-    theta. Of CURVATURES for 1 / f, in parts of what would see half a space, the best leaves a smooth rest.
+    Its axis passes through `centre` (2,), and a ray at the angle theta to the axis is seen at the distance r = f theta.
+    1 / f is the one with the smallest residuals for CURVATURES.
     """
     away = pixels - centre
     radius = np.hypot(away[:, 0], away[:, 1])
@@ -108,7 +108,7 @@ def wide_perspective(
 
 
 def _curved(homography: FloatArray, bend: float, centre: FloatArray, places: FloatArray) -> FloatArray:
-    """Return where a lens of 1 / f `bend` shows what a homography does of places (M, 2)."""
+    """Return the images of places (M, 2) by a homography and a lens with 1 / f = `bend`."""
     straight = projected(homography, places).pixels
     length = bend * np.hypot(straight[:, 0], straight[:, 1])
     shrunk = np.where(length > SMALL_ANGLE, np.arctan(length) / np.maximum(length, SMALL_ANGLE), 1.0)
@@ -116,13 +116,13 @@ def _curved(homography: FloatArray, bend: float, centre: FloatArray, places: Flo
 
 
 def _surface_of(seen: Callable[[FloatArray], FloatArray], places: FloatArray) -> TagSurface:
-    """Return a map and its derivatives at places (M, 2) by differences."""
+    """Return a map and its derivatives at places (M, 2), by differences."""
     pixels = np.array([seen(places + DIFFERENCE * at) for at in STENCIL])
     return TagSurface.made_of(*by_differences(pixels, DIFFERENCE))
 
 
 def seen_surface(camera: Camera, cam_from_board: Rigid3, unit_mm: FloatArray, wanted: FloatArray) -> TagSurface:
-    """Return the map at `wanted` (M, 2), in units of `unit_mm` (2,), as a camera sees it; NaN where it does not."""
+    """Return a camera's map at `wanted` (M, 2), in units of `unit_mm` (2,); NaN where it is not visible."""
     places = (wanted + CHORD * STENCIL[:, None]) * unit_mm
     points = np.concatenate([places, np.zeros((*places.shape[:2], 1))], axis=2)
     pixels, valid = camera.project(cam_from_board.apply(points))

@@ -1,4 +1,4 @@
-"""ChArUco boards that nobody has described: dictionary, counts, pattern and size of markers from what is read."""
+"""Unknown ChArUco boards: dictionary, size, pattern and size of the markers, from the markers read in images."""
 
 from __future__ import annotations
 
@@ -23,43 +23,43 @@ DICTIONARIES = (
     "DICT_ARUCO_MIP_36h12",
     *(f"DICT_APRILTAG_{code}" for code in ("36h11", "36h10", "25h9", "16h5")),
 )
-"""The largest of each kind."""
+"""The largest dictionary of each kind."""
 
 MIN_MARKER_SIDE = 0.35
-"""Of a marker, in squares."""
+"""Smallest side of a marker, in squares."""
 
 MIN_MARKERS_READ = 3
-"""Markers of one dictionary in an image whose numbers fit one board: one or two may be chance."""
+"""Smallest number of markers of one dictionary in an image whose numbers fit one board: one or two may be random."""
 
 MIN_SHARE_FITTING = 0.5
-"""Of the markers read in all images, those that lie where the board has them: nearly all, or few by chance."""
+"""Smallest share of the markers read in all images that fit the board: nearly all do, or few by chance."""
 
 SURE_OF_KIND = 2
-"""Images with markers after which only kinds seen before are looked for."""
+"""Number of images with markers after which only kinds seen before are read."""
 
 OFF_SQUARE = 0.2
-"""A marker's middle lies within so many squares of that of its square, as another marker beside it has it."""
+"""Largest distance, in squares, of a marker's middle from that of its square as predicted by another marker."""
 
 MAX_SQUARE_DISTANCE = 2
-"""Squares, along rows and columns, over which one marker says where another is."""
+"""Largest distance, in squares along rows and columns, over which one marker predicts another."""
 
 WITHIN_MARKER = 0.25
-"""A marker lies where another is read whose middle is this near, in diagonals of that one: the middles of two squares
+"""Two markers are at one place if their middles are closer than this, in diagonals of one: the middles of two squares
 with markers are at least a diagonal of a square apart."""
 
 Markers: TypeAlias = tuple[IntArray, IntArray, float]
-"""Numbers (N,), squares (N, 2) upright from any origin, side of a marker in squares."""
+"""Numbers (N,), squares (N, 2) of upright markers relative to any of them, side of a marker in squares."""
 
 
 @dataclass(eq=False, slots=True)
 class MarkerObservations:
-    """The markers of all images, by the squares they lie in.
+    """The markers of all images, by their squares.
 
     Attributes
     ----------
-    images : indices of those that show markers in squares.
-    kinds : (dictionary, inverted) -> markers.
-    markers : with the kind, of each image.
+    images : indices of those with markers in squares.
+    kinds : (dictionary, inverted) -> number of markers.
+    markers : the kind and the markers of each image.
     """
 
     images: list[int] = field(default_factory=list)
@@ -67,7 +67,7 @@ class MarkerObservations:
     markers: list[tuple[tuple[str, bool], Markers]] = field(default_factory=list)
 
     def look(self, index: int, image: GreyImage) -> bool:
-        """Read the markers of an image; say whether some lie in squares."""
+        """Read the markers of an image; return whether some of them are in squares."""
         for kind, read in self._read(np.clip(np.rint(image), 0, 255).astype(np.uint8)):
             own = _in_squares(read.corners, read.numbers)
             if own is not None:
@@ -78,7 +78,7 @@ class MarkerObservations:
         return False
 
     def _read(self, grey: np.ndarray[Any, np.dtype[np.uint8]]) -> list[tuple[tuple[str, bool], ReadMarkers]]:
-        """Return the kinds of markers that an image shows: those seen before, then those that more is like."""
+        """Return the markers in an image by kind: kinds seen before first, then by decreasing total correlation."""
         before = [kind for kind, _ in self.kinds.most_common(2)]
         wanted = before
         if len(self.images) < SURE_OF_KIND:
@@ -92,8 +92,8 @@ class MarkerObservations:
 
 
 def _read_best(seen: dict[str, ReadMarkers]) -> dict[str, ReadMarkers]:
-    """Return the markers without those that another dictionary reads better where they are: in the modules of a large
-    marker chance reads others of fewer bits, one or two of them in each, so that there are more of them."""
+    """Return the markers without those at places where another dictionary has a larger correlation: random markers of
+    fewer bits are read in the modules of large markers, one or two in each, and outnumber these."""
     own = {}
     for name, markers in seen.items():
         middle, best = markers.corners.mean(axis=1), np.ones(len(markers.numbers), np.bool_)
@@ -107,17 +107,17 @@ def _read_best(seen: dict[str, ReadMarkers]) -> dict[str, ReadMarkers]:
 
 
 def _in_squares(quads: FloatArray, numbers: IntArray) -> Markers | None:
-    """Return the largest group of markers whose places in squares follow from each other; None for too few."""
+    """Return the largest group of markers in squares that follow from each other; None if there are too few."""
     if len(numbers) < MIN_MARKERS_READ:
         return None
     middle = quads.mean(axis=1)
     inverse = np.linalg.inv(maps_of_quads(quads))
     seen = np.concatenate([middle, np.ones((len(middle), 1))], axis=1) @ np.swapaxes(inverse, 1, 2)
-    # Where each marker (first index) has the others, in its own sides from its own middle.
+    # Positions of the others (second index) relative to each marker, in its sides from its middle.
     offset = seen[..., :2] / seen[..., 2:] - 0.5
     distance = np.linalg.norm(offset, axis=2) + np.where(np.eye(len(middle)) > 0.0, np.inf, 0.0)
     nearest = offset[np.arange(len(middle)), distance.argmin(axis=1)]
-    # The nearest ones lie beyond a corner of the square.
+    # The nearest marker is diagonally adjacent.
     step = float(np.median(np.abs(nearest)))
     if not 1.0 < step < 1.0 / MIN_MARKER_SIDE:
         return None
@@ -133,8 +133,8 @@ def _in_squares(quads: FloatArray, numbers: IntArray) -> Markers | None:
 
 
 def laid_out(near: BoolArray, steps: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield the groups of N things of which each is `near` (N, N) another one: which (M,), and their places (M, 2) from
-    the first, as the `steps` (N, N, 2) from one to the other add up."""
+    """Yield the groups of N things that are linked by `near` (N, N): their indices (M,), and their places (M, 2)
+    relative to the first, as sums of the `steps` (N, N, 2) between them."""
     left = set(range(len(near)))
     while left:
         first = left.pop()
@@ -150,8 +150,8 @@ def laid_out(near: BoolArray, steps: IntArray) -> Iterator[tuple[IntArray, IntAr
 
 
 def guessed_charuco(seen: MarkerObservations, exactly: int | None = None) -> list[Board]:
-    """Return the ChArUco board that most markers are of, with squares of 1 mm: one of either pattern where the markers
-    fit both, none where no board is told. It has `exactly` so many rows, or those that were read."""
+    """Return the ChArUco board of most markers, with squares of 1 mm: both patterns if the markers fit both, none if
+    the markers determine no board. It has `exactly` so many rows, or by default those that were read."""
     if not seen.markers:
         return []
     (dictionary, inverted), _ = seen.kinds.most_common(1)[0]
@@ -165,7 +165,7 @@ def guessed_charuco(seen: MarkerObservations, exactly: int | None = None) -> lis
     if columns < 2:
         return []
     count = sum(len(numbers) for numbers, *_ in own)
-    # From two markers alone a number of columns follows that puts both in order.
+    # Two markers alone agree with any number of columns that follows from them.
     own = [read for markers in own if len((read := _in_order(*markers, columns))[0]) >= MIN_MARKERS_READ]
     if not own:
         return []
@@ -185,24 +185,24 @@ def guessed_charuco(seen: MarkerObservations, exactly: int | None = None) -> lis
             if first + len(pattern.places(*board.size)) > marker_count(pattern.dictionary):
                 continue
             fitting = sum(_fitting(pattern, board, numbers, places) for numbers, places, _ in own)
-            # Of boards that explain as many markers the smallest.
+            # Of boards that fit as many markers the smallest is chosen.
             found.append(((fitting, -rows), board))
     most = max((rank for rank, _ in found), default=(0, 0))
-    # What chance reads fits no board.
+    # Random markers fit no board.
     return [board for rank, board in found if rank == most and rank[0] >= MIN_SHARE_FITTING * count]
 
 
 def _in_order(numbers: IntArray, places: IntArray, side: float, columns: int) -> Markers:
-    """Return the markers of an image without those whose numbers are not what their squares make them on a board of so
-    many columns of corners: misread ones."""
-    # Every second square has a marker, so that numbers are known to half a marker.
+    """Return the markers of an image without misread ones, whose numbers contradict their squares on a board with this
+    many columns of corners."""
+    # Every second square has a marker, so that numbers are predicted to half a marker.
     first = numbers - 0.5 * ((columns + 1) * places[:, 1] + places[:, 0])
     kept = np.abs(first - np.median(first)) <= 1.0
     return numbers[kept], places[kept], side
 
 
 def _fitting(pattern: Charuco, board: Board, numbers: IntArray, places: IntArray) -> int:
-    """Return how many markers of an image lie where the board has them, moved by one shift."""
+    """Return the number of markers of an image that agree with the board after one common shift."""
     table = {pattern.first_marker + k: place for k, place in enumerate(pattern.places(*board.size))}
     shifts = Counter(
         tuple((table[int(n)] - 1 - p).tolist()) for n, p in zip(numbers, places, strict=True) if int(n) in table
@@ -211,8 +211,8 @@ def _fitting(pattern: Charuco, board: Board, numbers: IntArray, places: IntArray
 
 
 def _first_marker(own: list[Markers]) -> int:
-    """Return the smallest number seen; OpenCV's own boards begin with 0."""
+    """Return the number of the board's first marker: the smallest number seen, or 0 as on OpenCV's boards."""
     least = int(min(numbers.min() for numbers, *_ in own))
     most = int(max(numbers.max() for numbers, *_ in own))
-    # Where the first rows were never seen, numbers from 0 on are likelier than a board that begins with an odd one.
+    # If the range of numbers exceeds the smallest one, unseen first rows are more likely than an unusual first number.
     return 0 if least < most - least else least

@@ -1,7 +1,7 @@
-"""AprilGrids that nobody has described: family, border, numbering, counts and spacing from what is read.
+"""Unknown AprilGrids: family, border, numbering, size and spacing, from the tags read in images.
 
-Tags are read in the squares of lattices of corners, and, where an image shows no such lattice, as quadrilaterals that
-stand alone. Several boards are identified by their numbers: those of one lattice are of one board.
+Tags are read in the squares of lattices of corners, or, if an image has no such lattice, as lone quadrilaterals.
+Several boards are distinguished by their numbers: tags of one lattice are of one board.
 """
 
 from __future__ import annotations
@@ -30,49 +30,49 @@ from rigkit.detection.tags.unknown_charuco import DICTIONARIES, laid_out
 from rigkit.kernels.surface import maps_of_quads
 
 WIDEST_RATIO = 8.0
-"""A tag's side over the gap, or the other way round, at most."""
+"""Largest ratio of a tag's side to the gap, or of the gap to the side."""
 
 MIN_TAGS_READ = 3
-"""Tags of one family in a lattice: one may be chance among thousands of codes."""
+"""Smallest number of tags of one family in a lattice: one may be random among thousands of codes."""
 
 MIN_SHARE_COUNTED = 0.5
-"""Of the tags read in a lattice, those whose numbers count on from each other: nearly all, or hardly any by chance."""
+"""Smallest share of the tags read in a lattice with consecutive numbers: nearly all, or hardly any by chance."""
 
 MAX_LONE_STEP = 3.0
-"""From one lone tag to the next, in sides of a tag: `AprilGrid.spacing` is at most 2."""
+"""Largest distance from one lone tag to the next, in sides of a tag: `AprilGrid.spacing` is at most 2."""
 
 OFF_EDGE, OFF_BORDER = 0.25, 0.6
-"""Of a tag's side, modules: outlines further off the edges that were printed tell no spacing (on REAL images as they
-are, at most .19, where light or ink runs over by 1 to 3 px .4 to 2); and from where edges were printed to those of a
-border of whole modules. Borders are two modules a side apart: further than this from one, the next may be meant (those
-images have .0 to .7 with light, up to 1.6 with much ink)."""
+"""Largest difference of outlines from a tag's printed side, in modules, for which they determine the spacing (at most
+0.19 in REAL images, 0.4 to 2 if light or ink spreads by 1 to 3 px); and of the printed side from that with a border of
+whole modules. Sides of adjacent borders differ by two modules: with a larger difference the next border is possible
+(those images have 0.0 to 0.7 with light, up to 1.6 with much ink)."""
 
 OFF_TAG_PLACE = 0.2
-"""A tag beside another lies within so many steps of its place, as the other has it."""
+"""Largest distance of a tag from its place predicted by an adjacent one, in steps."""
 
 APRIL_TAGS = tuple((family, border) for family in TAG_FAMILIES for border in range(1, MAX_BORDER + 1))
 ARUCO_TAGS = tuple((dictionary, 1) for dictionary in DICTIONARIES if dictionary not in TAG_FAMILIES.values())
-"""Families that may be there, with the modules of their borders."""
+"""Families that may occur, with the modules of their borders."""
 
 Family: TypeAlias = tuple[str, int]
 """Family and modules of the border."""
 
 Kind: TypeAlias = tuple[str, int, bool]
-"""Family, modules of the border, whether tags stand alone."""
+"""Family, modules of the border, whether tags are without squares between their corners."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _SeenTags:
-    """Tags of one lattice, or lone ones beside each other.
+    """Tags of one lattice, or adjacent lone tags.
 
     Attributes
     ----------
-    image : its index.
+    image : index.
     numbers : (N,)
-    places : (N, 2) in tags from any of them, with the tags upright as OpenCV has them.
-    steps : (K,) from a tag to the one beside it, in sides of a tag, as often as that is seen.
-    rough : light or ink has moved the edges of tags, so that `steps` are known to some hundredths.
-    either : it may as well be another border.
+    places : (N, 2) in tags relative to any of them, with tags upright as in OpenCV.
+    steps : (K,) all distances of adjacent tags, in sides of a tag.
+    rough : light or ink has moved the edges of tags, so that `steps` are accurate to some hundredths only.
+    either : the border may be another one.
     """
 
     image: int
@@ -84,8 +84,8 @@ class _SeenTags:
     either: bool = False
 
     def counted(self) -> tuple[int, int, IntArray] | None:
-        """Return by how much numbers grow along a row and down a column, and which tags (N,) follow that; None where
-        tags beside each other do not say."""
+        """Return the increments of numbers along a row and down a column, and the indices (N,) of the tags with these;
+        None if adjacent tags do not determine them."""
         across, down = Counter[int](), Counter[int]()
         at = {tuple(place): int(number) for place, number in zip(self.places.tolist(), self.numbers, strict=True)}
         for (column, row), number in at.items():
@@ -95,7 +95,7 @@ class _SeenTags:
         if not across or not down:
             return None
         step, line = across.most_common(1)[0][0], down.most_common(1)[0][0]
-        # Upright as OpenCV draws tags, Kalibr's boards stand on their heads: numbers grow to the left, and down too.
+        # With tags upright as in OpenCV, Kalibr's boards are upside down: numbers increase to the left, and down.
         if abs(step) != 1 or line < 1:
             return None
         first = self.numbers - step * self.places[:, 0] - line * self.places[:, 1]
@@ -104,12 +104,12 @@ class _SeenTags:
 
 
 Counted: TypeAlias = tuple[_SeenTags, int, int, IntArray]
-"""With what `_SeenTags.counted` says of them."""
+"""Tags with the result of `_SeenTags.counted`."""
 
 
 @dataclass(eq=False, slots=True)
 class TagObservations:
-    """The tags of all images, as `seen`; `kinds` has the sum of likenesses of each kind. Inverted tags are white on
+    """The tags of all images, `seen`, and the sum of correlations by kind, `kinds`. Inverted tags are white on
     black."""
 
     families: tuple[Family, ...] = APRIL_TAGS
@@ -118,10 +118,10 @@ class TagObservations:
     seen: list[_SeenTags] = field(default_factory=list)
 
     def look(self, index: int, image: GreyImage) -> bool:
-        """Read the tags of an image; say whether there are some."""
+        """Read the tags of an image; return whether there are any."""
         image = 255 - image if self.inverted else image
         seen = Seen.of(image)
-        # Where light or ink runs over, tags and the squares between them meet on coarser levels only.
+        # Where light or ink spreads, tags and the squares between them touch on coarser levels only.
         for k in range(len(seen.levels)):
             at = seen.coarser(k) if k else seen
             if at is None:
@@ -142,10 +142,10 @@ class TagObservations:
     def _counts(
         self, index: int, size: tuple[int, int], quads: FloatArray, squares: IntArray, family: Family, codes: TagCode
     ) -> bool:
-        """Keep the tags of one family in a lattice, and say so, if their numbers are those of a board."""
+        """Return whether the tags of one family in a lattice have numbers of a board; if so, keep them."""
         turn = int(np.bincount(codes.turns[codes.read], minlength=4).argmax())
         own = codes.read & (codes.turns == turn)
-        # On a board every number stands once; what chance reads in squares that look alike is the same again and again.
+        # Every number occurs once on a board; random codes in similar squares are the same ones.
         if np.count_nonzero(np.unique(codes.number[own], return_counts=True)[1] == 1) < MIN_TAGS_READ:
             return False
         columns, rows = size
@@ -155,15 +155,14 @@ class TagObservations:
             image=index, kind=(*family, False), numbers=codes.number[own], places=places, steps=_steps(upright, places)
         )
         counted = seen.counted()
-        # Small families read something in most squares, but do not count with it.
+        # With small families random codes are read in most squares, but not with consecutive numbers.
         if counted is None or len(counted[2]) < max(MIN_TAGS_READ, MIN_SHARE_COUNTED * len(seen.numbers)):
             return False
         self._keep(seen, codes)
         return True
 
     def look_alone(self, index: int, image: GreyImage) -> bool:
-        """Read the tags of an image that stand alone, without squares between their corners; say whether there are
-        some."""
+        """Read the lone tags of an image, without squares between their corners; return whether there are any."""
         return self._look_alone(index, 255 - image if self.inverted else image)
 
     def _look_alone(self, index: int, image: GreyImage) -> bool:
@@ -171,8 +170,8 @@ class TagObservations:
         return any(self._count_alone(index, image, quads, *read) for read in _read_kinds(image, quads, self.families))
 
     def _count_alone(self, index: int, image: GreyImage, quads: FloatArray, family: Family, codes: TagCode) -> bool:
-        """Keep the lone tags of one family, and say so, if numbers of some beside each other are those of a board."""
-        # The same tag is seen several times: at the outer and at the inner border.
+        """Return whether adjacent lone tags of one family have numbers of a board; if so, keep them."""
+        # The same tag is found several times: at the outer and at the inner border.
         order = np.flatnonzero(codes.read)[np.argsort(-codes.likeness[codes.read], kind="stable")]
         own = order[np.unique(codes.number[order], return_index=True)[1]]
         upright = quads[own[:, None], (codes.turns[own, None] + np.arange(4)) % 4]
@@ -186,14 +185,14 @@ class TagObservations:
                 steps=_steps(upright[members], places),
             )
             counted = seen.counted()
-            # Chance reads codes, but does not count with them.
+            # Random codes do not have consecutive numbers.
             if counted is not None and len(counted[2]) >= MIN_TAGS_READ:
                 self._keep(self._as_printed(image, seen, upright[members]), codes)
                 shown = True
         return shown
 
     def _as_printed(self, image: GreyImage, seen: _SeenTags, upright: FloatArray) -> _SeenTags:
-        """Return lone tags, whose corners are `upright` (N, 4, 2), with the border and the steps of their print."""
+        """Return lone tags, with corners `upright` (N, 4, 2), with the border and steps as printed."""
         family = seen.kind[0]
         bits = dictionary_modules(TAG_FAMILIES.get(family, family))[seen.numbers]
         size = module_size(image, upright, bits, float(np.median(seen.steps))) if len(seen.steps) else None
@@ -216,8 +215,8 @@ class TagObservations:
 
 
 def _read_kinds(image: GreyImage, quads: FloatArray, families: Sequence[Family]) -> Iterator[tuple[Family, TagCode]]:
-    """Yield the families, with their borders, of which quadrilaterals may be tags, and what they are read as: those
-    first that they are most like."""
+    """Yield the families, with their borders, of which tags are read in quadrilaterals, and what is read, by decreasing
+    total correlation."""
     read = []
     for family, border in families:
         pattern = AprilGrid(1.0, family, border, numbering="opencv")
@@ -228,15 +227,15 @@ def _read_kinds(image: GreyImage, quads: FloatArray, families: Sequence[Family])
 
 
 def _steps(upright: FloatArray, places: IntArray) -> FloatArray:
-    """Return the steps between tags with corners (N, 4, 2) at `places` (N, 2), in sides of a tag (K,).
+    """Return the steps (K,) between adjacent tags with corners (N, 4, 2) at `places` (N, 2), in sides of a tag.
 
     The cross-ratio of the four corners on a line of two tags, with a step of t sides, is t^2 / (t^2 - 1): it needs no
-    homography of a small tag to reach the next one.
+    extrapolation of a small tag's homography.
     """
     at = {tuple(place): k for k, place in enumerate(places.tolist())}
     lines = []
     for (column, row), k in at.items():
-        # Corners are those at (0,0) (1,0) (1,1) (0,1).
+        # Corners are in the order (0,0) (1,0) (1,1) (0,1).
         for beside, edges in (((column + 1, row), ((0, 1), (3, 2))), ((column, row + 1), ((0, 3), (1, 2)))):
             if beside in at:
                 lines += [upright[[k, k, at[beside], at[beside]], [*edge, *edge]] for edge in edges]
@@ -253,12 +252,12 @@ def _steps(upright: FloatArray, places: IntArray) -> FloatArray:
 
 
 def _adjacent_tags(quads: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield groups of upright tags with corners (N, 4, 2) that stand in rows and columns: which (M,), and their places
+    """Yield groups of upright tags with corners (N, 4, 2) in rows and columns: their indices (M,), and their places
     (M, 2) in steps."""
     inverse = np.asarray(np.linalg.inv(maps_of_quads(quads)), np.float64)
     middle = quads.mean(axis=1)
     offset = np.stack([transferred(inverse[k : k + 1], middle)[0] for k in range(len(quads))]) - 0.5
-    # As two tags have each other: perspective beyond the homography of either cancels.
+    # The mean of both predictions: perspective beyond the homography of either cancels.
     offset = 0.5 * (offset - np.swapaxes(offset, 0, 1))
     distance = np.linalg.norm(offset, axis=2) + np.where(np.eye(len(quads)) > 0.0, np.inf, 0.0)
     step = float(np.median(distance.min(axis=1)))
@@ -271,14 +270,14 @@ def _adjacent_tags(quads: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class GuessedGrid:
-    """An AprilGrid that images show.
+    """An AprilGrid found in images.
 
     Attributes
     ----------
     board : with tags of 1 mm.
-    images : indices of those that show it.
+    images : indices of the images with it.
     rough : light or ink has moved the edges of its tags in all of them: its spacing is known to some hundredths.
-    either : it may as well be this board of another border.
+    either : this board with another border, if it fits as well.
     """
 
     board: Board
@@ -288,7 +287,7 @@ class GuessedGrid:
 
 
 def guessed_grids(seen: TagObservations) -> list[GuessedGrid]:
-    """Return the AprilGrids of the kind that most tags are of, those first that most tags are of."""
+    """Return the AprilGrids of the most frequent kind, by decreasing number of tags."""
     if not seen.seen:
         return []
     kind = seen.kinds.most_common(1)[0][0]
@@ -299,7 +298,7 @@ def guessed_grids(seen: TagObservations) -> list[GuessedGrid]:
             groups.append((item, *counted))
     out = []
     for cluster in _of_one_board(groups):
-        # Corners between squares lie where they were printed, whatever light and ink do.
+        # Light and ink do not move corners between squares.
         sure = [group for group in cluster if not group[0].rough]
         board = _board_of(cluster, kind, _steps_of(sure or cluster), seen.inverted)
         if board is not None:
@@ -315,7 +314,7 @@ def _steps_of(groups: Sequence[Counted]) -> FloatArray:
 
 
 def _of_other_border(board: Board) -> Board:
-    """Return the board of tags with the other border, whose modules are as large and as far from those of the next."""
+    """Return the board with the other border whose modules have the same size and distance to those of the next tag."""
     pattern = board.pattern
     assert isinstance(pattern, AprilGrid)
     border = MAX_BORDER + 1 - pattern.border
@@ -325,7 +324,7 @@ def _of_other_border(board: Board) -> Board:
 
 
 def _of_one_board(groups: Sequence[Counted]) -> list[list[Counted]]:
-    """Return the groups of tags by boards: from the least to the largest number of a group all are of one board."""
+    """Return the groups of tags by boards: groups whose ranges of numbers overlap are of one board."""
     clusters: list[tuple[int, list[Counted]]] = []
     for group in sorted(groups, key=lambda group: int(group[0].numbers[group[3]].min())):
         numbers = group[0].numbers[group[3]]
@@ -338,13 +337,13 @@ def _of_one_board(groups: Sequence[Counted]) -> list[list[Counted]]:
 
 
 def _board_of(cluster: Sequence[Counted], kind: Kind, steps: FloatArray, inverted: bool) -> Board | None:
-    """Return the board, with tags of 1 mm, that groups of its tags show, with `steps` (K,) from tag to tag; None where
-    they do not tell its spacing."""
+    """Return the board, with tags of 1 mm, of a cluster of groups with `steps` (K,) from tag to tag; None if there is
+    no valid one."""
     family, border, alone = kind
     (step, line), _ = Counter((step, line) for _, step, line, _ in cluster).most_common(1)[0]
     columns = line
     own = [(item.numbers[which], item.places[which]) for item, a, b, which in cluster if (a, b) == (step, line)]
-    # The number that a first column has, modulo the columns, is seen where a group is as wide as the board.
+    # The number of the first column, modulo the columns, is known from groups as wide as the board.
     wide = [(n, p) for n, p in own if np.ptp(p[:, 0]) + 1 == columns]
     firsts = Counter(int((n - (step * p[:, 0] - (step * p[:, 0]).min()))[0]) % columns for n, p in wide)
     remainder = firsts.most_common(1)[0][0] if firsts else 0

@@ -1,10 +1,10 @@
-"""Tags whose border is too narrow for the windows of their corners: the whole tag is fitted at once.
+"""The fit of whole tags, for tags with a border too narrow for the windows of single corners.
 
-An edge spreads two standard deviations of the blur to either side. Where a tag's border is narrower than four of them,
-no pixel near its corners shows their two lines and nothing of the code. But then the code is known, as is what lies
-around the tag: all of it is the model, and its four corners are what is sought. How the picture bends between them is
-told by the corners of the other tags. Where one of the four is not seen, the others are had from the whole tag all
-the same: it starts where those of other tags foretell it.
+An edge spreads two standard deviations of the blur to either side. If a tag's border is narrower than four of them, all
+pixels near its corners are affected by the code. But the code and the surroundings of the tag are known: the model is
+the image of all of it, with the four corners as parameters. The curvature of the map between them comes from the
+corners of the other tags. If some of the four corners are missing, the fit starts from their predictions by other tags,
+and gives the visible ones.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ from rigkit.kernels.tag_board import tag_heights
 from rigkit.kernels.tags import TagRules, fit_tags
 
 NARROW_BLURS = 2.0 * MARKER_BLURS
-"""A border narrower than this, s, has the code in all windows of its corners. On real images of a grid, made
-smaller and blurred until borders were 3.3 s wide, held-out errors fall from 0.097 to 0.079 px; at 3.7 s they are 0.097
-px either way. Wider ones are better alone (0.19 px; 0.24 px whole): printed modules and saturated paper are no model to
-a pixel."""
+"""Width of a border, in s, below which the windows of all its corners contain the code. On real images of a grid,
+reduced and blurred until borders were 3.3 s wide, held-out errors decrease from 0.097 to 0.079 px; at 3.7 s they are
+0.097 px in both cases. Wider ones are better fitted by corner (0.19 px; 0.24 px as a whole): printed modules and
+saturated paper do not follow the model to a pixel."""
 
 CURVATURE_SIGMAS = 0.3
-"""The middles of a tag's sides are known beside its corners to this part of what corners are: the bend comes from those
-of three tags or more, and a second difference of theirs has sqrt(6) of their sigma, the sagitta an eighth of that."""
+"""Standard deviation of the middles of a tag's sides relative to its corners, in their sigmas: the curvature comes from
+three tags or more; a second difference has sqrt(6) of their sigma, and the sagitta is an eighth of it."""
 
 EDGE_REACH_SIGMAS = 4.0
-"""Edges further from a pixel than this, s, are nothing to it."""
+"""Distance, in s, beyond which edges have no effect on a pixel."""
 
 ROUGH_STEP_PX = 0.1
-"""A step that ends a round after which tags are fitted again: what is left after it is a tenth of it."""
+"""Last step of a round after which tags are fitted again: the remaining error is a tenth of it."""
 
 MAX_TAKEN = 0.02
-"""The last step takes no more than this part of the squares that are left: sigmas are right to a hundredth. The light
-is not known beforehand, and one fitted a step later than the corners made sigmas up to four times too large."""
+"""Largest relative decrease of the sum of squares by the last step, for sigmas to a hundredth: initially the light is
+unknown, and if it was fitted one step after the corners, sigmas were up to four times too large."""
 
 
 def _rules(converged_px: float) -> TagRules:
@@ -74,16 +74,16 @@ def _rules(converged_px: float) -> TagRules:
 
 
 WHOLE_ROUNDS = (_rules(ROUGH_STEP_PX), WHOLE_RULES := _rules(LAST_PASS[2]))
-"""Whole tags are fitted again with the picture bent as their finer corners have it."""
+"""Whole tags are fitted a second time with the map through the improved corners."""
 
 PAPER_STEP = 2.0
-"""The whole step from ink to paper, in the contrast that the fit of the corner of a lone square has."""
+"""Difference of paper and ink, in contrasts of the fit of a lone square's corner."""
 
 TAG_CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
-"""Of a tag, as the lattice has them row by row."""
+"""Corners of a tag in the order of the lattice, row by row."""
 
 MAP_NODES = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 5)] * 2), axis=-1).reshape(-1, 2)
-"""Where in a tag its map is taken: nowhere beyond its corners, where a polynomial through all of them may run wild."""
+"""Points of a tag at which its map is evaluated: none outside, where a polynomial through all corners may diverge."""
 
 
 def with_whole_tags(
@@ -94,11 +94,11 @@ def with_whole_tags(
     map_of_state: Callable[[], SmoothMap],
     rules: TagRules,
 ) -> BoardState:
-    """Return the state with the corners of tags of narrow borders as the whole tags have them.
+    """Return the state with the corners of tags of narrow borders replaced by those of the fits of whole tags.
 
-    `places` (R, C, 2) of the corners, in sides of a tag; `map_of_state` makes the map through the corners of the state.
+    `places` (R, C, 2) of the corners, in sides of a tag; `map_of_state` returns the map through the corners of `state`.
     """
-    # What single corners have for blur is not to be relied on where the code is in their windows.
+    # The blur of single corners is not reliable if the code is in their windows.
     blur = known_median(state.blur)
     narrowest = NARROW_BLURS * blur * tags.codes.modules / tags.pattern.border
     if not (tag_heights(state.pixels)[1] < narrowest).any():
@@ -131,15 +131,15 @@ def with_whole_tags(
     better = mine[0][good], mine[1][good]
     pixels[better], sigma_px[better] = corners[good] + moves[good], found[good, 8:12]
     blurs[better], contrast[better] = found[good, 12:13], found[good, 13:14] / step
-    # A foretold corner that nothing showed by itself is no corner found.
+    # A predicted corner that was not found by itself is not reported.
     for values in (pixels, sigma_px, blurs, contrast):
         values[~state.known] = np.nan
     return replace(state, pixels=pixels, sigma_px=sigma_px, blur=blurs, contrast=contrast)
 
 
 def _predicted(state: BoardState, predicted: FloatArray, shape: tuple[int, ...]) -> tuple[FloatArray, BoolArray]:
-    """Return the corners (R, C, 2) with those `predicted` of tags of which some are known, if the image has all four,
-    and which tags (R / 2, C / 2) these are."""
+    """Return the corners (R, C, 2), filled with those `predicted` of partly known tags that are inside the image, and
+    which tags (R / 2, C / 2) these are."""
     inside = ((predicted > MARGIN_PX) & (predicted < np.array(shape[::-1]) - 1.0 - MARGIN_PX)).all(axis=2)
     known = state.known
     some, every, fits = (
@@ -152,7 +152,7 @@ def _predicted(state: BoardState, predicted: FloatArray, shape: tuple[int, ...])
 
 
 def _maps(first: FloatArray, corners: FloatArray, smooth: SmoothMap) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the maps from the image to N tags, their centres and scales as `kernels.tags.fit_tags` wants them.
+    """Return the maps from the image to N tags, their centres and scales, as for `kernels.tags.fit_tags`.
 
     `first` (N, 2) are the places of the tags' first corners on the board, `corners` (N, 4, 2) the pixels of all.
     """
@@ -171,9 +171,9 @@ def _maps(first: FloatArray, corners: FloatArray, smooth: SmoothMap) -> tuple[Fl
 
 
 def _ink(tags: TagBoard) -> tuple[BoolArray, FloatArray]:
-    """Return which cells of each tag and around it are dark, (R / 2, C / 2, M + 4, M + 4), and where they end.
+    """Return which cells in and around each tag are dark, (R / 2, C / 2, M + 4, M + 4), and the limits between cells.
 
-    Beside the M x M modules these are the gap to the next tags and, beyond, their borders.
+    Around the M x M modules these are the gap to the next tags and, beyond, their borders.
     """
     pattern, numbers = tags.pattern, tags.numbers
     modules = pattern.modules()[numbers]

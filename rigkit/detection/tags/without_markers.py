@@ -1,8 +1,8 @@
-"""An image of a board without the markers in its squares: what their ink takes from it is given back.
+"""Removal of the markers from an image of a ChArUco board, by adding the light that their ink absorbs.
 
-Blur brings the ink of markers into the windows of the corners beside them, and what lies there pulls corners by more
-than their sigmas say. But a board that is known says where its ink is, and how much light ink takes shows in the
-squares around: without it the image is that of a chessboard.
+Blur brings the ink of markers into the windows of adjacent corners, and shifts these by more than their sigmas. The
+board determines where the ink is, and the surrounding squares how much light it absorbs: with this light added, the
+image is that of a chessboard.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ from rigkit.detection.subpixel.whole_board import (
 from rigkit.kernels.boards import Picture, board_picture, board_places, sheet_places
 
 DRAWN_PX = 3.0
-"""Ink is drawn on the board with so many samples a px of the image, in the largest squares."""
+"""Number of samples per px of the image with which ink is drawn, for squares of median size."""
 
 MAX_SQUARE = 64
-"""Samples a square at most: sharp images do not ask for this."""
+"""Largest number of samples along a square; sharp images with larger squares need no removal."""
 
 MIN_LINES = 3
-"""Steps between corners have neighbours: of fewer rows and columns nobody says where their squares end."""
+"""Smallest number of rows and columns: fewer do not determine the ends of their squares."""
 
 AROUND_CORNER = np.ones((3, 3), np.uint8)
-"""Corners around those known are foretold so well that markers are wiped out around them, too."""
+"""Neighbourhood of known corners in which predictions are accurate enough for the removal of markers."""
 
 SHADE_SQUARES = 1.0
-"""Black and white are asked of the pixels around, weighted by a Gaussian of this standard deviation, squares."""
+"""Standard deviation, in squares, of the Gaussian weight of the pixels that determine black and white."""
 
 STEPS_OF_SHADE = 4.0
-"""They are asked at places so many to such a standard deviation."""
+"""Number of points per standard deviation at which black and white are evaluated."""
 
 MIN_MARKER_CONTRAST = 1e-3
-"""Of pixels weighted, the least variance of the board's picture (1 and -1) in which black and white are told apart."""
+"""Smallest weighted variance of the board's picture (1 and -1) for which black and white can be separated."""
 
 
 class WithoutMarkers(NamedTuple):
-    """A picture without markers, and how much light their ink took from it (H, W), where it is known."""
+    """A picture without markers, and the light that ink absorbs (H, W) where it is known."""
 
     picture: GreyImage
     light: Picture
@@ -63,16 +63,16 @@ class WithoutMarkers(NamedTuple):
 def without_markers(
     image: GreyImage, refined: RefinedLattice, board: Board, blur: float, light: Picture | None = None
 ) -> WithoutMarkers | None:
-    """Return `image` as if the squares of a ChArUco `board` were empty; None where too little of it is seen.
+    """Return `image` as if the squares of a ChArUco `board` were empty; None if too little of it is visible.
 
     Parameters
     ----------
     image : grey.
-    refined : the corners, on the grid of the board; those unknown are foretold by the others.
+    refined : the corners, on the grid of the board; missing ones are predicted from the others.
     blur : s of the edges, px.
-    light : how much ink takes, from corners hardly elsewhere; without, it is asked of the image.
+    light : light that ink absorbs, known from almost the same corners; by default it is estimated from the image.
     """
-    # What is half covered is foretold by the others rather than believed.
+    # Partly covered corners are predicted from the others.
     seen = _seen(np.where(uncertain(refined.sigma_px)[..., None], np.nan, refined.lattice.pixels))
     if seen is None:
         return None
@@ -103,8 +103,8 @@ def without_markers(
 
 
 def _seen(pixels: FloatArray) -> tuple[FloatArray, BoolArray, tuple[int, int]] | None:
-    """Return the part of a board's corners (R, C, 2), NaN where unknown, that is known, and one more all around, with
-    those unknown foretold; which are known; and row and column of the first. None where they are not foretold."""
+    """Return the known part of a board's corners (R, C, 2), with a margin of one corner and missing ones predicted;
+    which are known; and row and column of the first one. None if predictions fail."""
     known = np.isfinite(pixels[..., 0])
     spans = []
     for axis in (1, 0):
@@ -114,7 +114,7 @@ def _seen(pixels: FloatArray) -> tuple[FloatArray, BoolArray, tuple[int, int]] |
         spans.append(slice(max(int(lines[0]) - 1, 0), int(lines[-1]) + 2))
     part, known = pixels[spans[0], spans[1]].copy(), known[spans[0], spans[1]]
     while np.isnan(part[..., 0]).any():
-        # Ring by ring: far from all that are known polynomials run wild.
+        # Ring by ring: far from all known corners polynomials diverge.
         missing = np.isnan(part[..., 0])
         beside = missing & (cv2.dilate((~missing).astype(np.uint8), AROUND_CORNER) > 0)
         part[beside] = predicted(part, beside).pixels
@@ -125,7 +125,7 @@ def _seen(pixels: FloatArray) -> tuple[FloatArray, BoolArray, tuple[int, int]] |
 
 
 def _box(image: GreyImage, lattice: FloatArray, margin: float) -> tuple[int, int, int, int]:
-    """Return the first column and row, width and height of what shows a `lattice` (R, C, 2) and its surroundings."""
+    """Return the first column and row, width and height of the part of an image with a `lattice` (R, C, 2)."""
     around = lattice[1:-1, 1:-1].reshape(-1, 2)
     last = np.array(image.shape[::-1]) - 1.0
     low = np.clip(np.floor(around.min(axis=0) - margin), 0.0, last)
@@ -135,8 +135,8 @@ def _box(image: GreyImage, lattice: FloatArray, margin: float) -> tuple[int, int
 
 
 def _ink(board: Board, on_sheet: Picture, each: int, square_px: float) -> Picture:
-    """Return how much of each pixel is ink of markers, blurred by SHARP_PX: `on_sheet` (2, H, W) says where on `_sheet`
-    it lies."""
+    """Return the ink of markers (H, W), 0 to 1, blurred by SHARP_PX; `on_sheet` (2, H, W) are the places of the pixels
+    on `_sheet`."""
     columns, rows = on_sheet
     smooth = _blurred(_sheet(board, each), SHARP_PX * each / square_px)
     return np.asarray(cv2.remap(smooth, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
@@ -144,20 +144,20 @@ def _ink(board: Board, on_sheet: Picture, each: int, square_px: float) -> Pictur
 
 @functools.lru_cache(maxsize=8)
 def _sheet(board: Board, each: int) -> Picture:
-    """Return the ink of a board's markers, 1, on squares of `each` x `each` samples, from the one before the first
-    corner."""
+    """Return the ink of a board's markers, 0 to 1, with `each` x `each` samples per square, from the square before the
+    first corner."""
     columns, rows = board.size
     sheet = np.zeros(((rows + 1) * each, (columns + 1) * each), np.float32)
     scale = np.tile(each / np.array(board.squares_mm), 2)
     for x, y, wide, high in board.ink().rectangles * scale:
-        # Sides of modules fall between samples.
+        # Sides of modules are between samples.
         down, across = _covered(sheet.shape[0], y + each, high), _covered(sheet.shape[1], x + each, wide)
         sheet[down[0], across[0]] += np.outer(down[1], across[1]).astype(np.float32)
     return sheet
 
 
 def _covered(length: int, start: float, extent: float) -> tuple[slice, FloatArray]:
-    """Return which samples, of a row of `length`, lie between `start` and `extent` beyond it, and by which part."""
+    """Return the samples, in a row of `length`, from `start` over `extent`, and the covered part of each."""
     first, last = max(int(np.floor(start)), 0), min(int(np.ceil(start + extent)), length)
     samples = np.arange(first, last)
     part = np.minimum(samples + 1.0, start + extent) - np.maximum(samples, start)
@@ -165,8 +165,8 @@ def _covered(length: int, start: float, extent: float) -> tuple[slice, FloatArra
 
 
 def _contrast(image: Picture, picture: Picture, used: BoolArray, reach_px: float) -> Picture:
-    """Return by how much `image` grows with the `picture`, where it is `used`, in the pixels around each."""
-    # What changes so slowly is asked of means of many pixels.
+    """Return the regression slope (H, W) of `image` on `picture` around each pixel, from the pixels `used`."""
+    # The slope changes so slowly that it is computed from means of many pixels.
     step = max(int(reach_px / STEPS_OF_SHADE), 1)
     size = (-(-image.shape[1] // step), -(-image.shape[0] // step))
     weight = used.astype(np.float32)
