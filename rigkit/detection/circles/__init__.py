@@ -1,1 +1,1 @@
-"""Circle grids: blobs, lattices, the fit of circles, and which board a lattice is."""
+"""Circle grids: blobs, their lattices, the fit of circles, and the place of a lattice on a board."""

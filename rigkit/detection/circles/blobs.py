@@ -1,8 +1,8 @@
-"""Blobs that may be circles: what is darker or brighter than around it, closed, and of an ellipse's area.
+"""Blobs that may be circles: connected regions, darker or brighter than their surroundings, of an ellipse's area.
 
-On every level of a pyramid the image is compared with its local mean, so neither the light nor the contrast need be
-known, and a lattice of circles stays apart however much it is blurred: its local mean lies between circles and paper.
-A component of area N with covariance S is an ellipse where N = 4 pi sqrt(det S), whatever its slant.
+On every level of a pyramid the image is compared with its local mean, so that neither light nor contrast need be known.
+Blurred circles of a lattice remain separate, because the local mean is between those of circles and paper.
+A region with area N and covariance S is an ellipse if N = 4 pi sqrt(det S), for any slant.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from rigkit.detection.saddles.response import BASE_PIXELS, FloatImage, GreyImage
 WINDOW_PX = 31
 """Side of the square of the local mean, in pixels of a level."""
 BLOB_AREAS = (12.0, 500.0)
-"""Areas of the blobs that a level is searched for, px of the level: the window spans the largest, and what lies round
-it, and the ranges of neighbouring levels overlap by far more than two blobs of a grid differ."""
+"""Range of the areas of blobs on a level, in its pixels: the window covers the largest and its surroundings, and the
+ranges of adjacent levels overlap by far more than two blobs of a grid differ."""
 DEVIATIONS = 0.2
-"""A blob lies so many local deviations off the local mean; in a lattice these are about half its contrast."""
+"""Smallest difference from the local mean, in local standard deviations, in a lattice about half of its contrast."""
 SMOOTH_PX = 0.8
-"""Blur before the comparison: single noisy pixels are no blobs."""
+"""Blur before the comparison, so that single noisy pixels are no blobs."""
 FILLING = (0.88, 1.12)
-"""Area over that of the ellipse of the same moments: an ellipse has 1, of few pixels within 0.1 of it; a square 0.95,
-a triangle 0.83, what has holes or arms much less."""
+"""Range of the ratio of the area to that of the ellipse with the same moments: an ellipse has 1, within 0.1 for few
+pixels; a square 0.95, a triangle 0.83, regions with holes or arms much less."""
 MAX_ASPECT = 6.0
-"""Ratio of the axes: 80 degrees of slant."""
+"""Largest ratio of the axes: 80 degrees of slant."""
 SMALLEST_LEVEL = 48
-"""A level's shorter side, px: below, there is no room for three circles and their paper."""
+"""Smallest shorter side of a level, px: smaller ones have no room for three circles and their paper."""
 DUPLICATE = 0.5
-"""Blobs nearer than this part of their radius, of about one size, are one, seen on two levels."""
+"""Largest distance of two blobs of similar size that are one, found on two levels, in radii."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -43,7 +43,7 @@ class Blobs:
     ----------
     pixels : (N, 2) centroids.
     shape : (N, 2, 2) symmetric; maps the unit circle to the ellipse, px.
-    sign : (N,) +1 brighter than around it, -1 darker.
+    sign : (N,) +1 if brighter than the surroundings, -1 if darker.
     """
 
     pixels: FloatArray
@@ -57,12 +57,12 @@ class Blobs:
         return Blobs(self.pixels[which], self.shape[which], self.sign[which])
 
     def radius_px(self) -> FloatArray:
-        """Return the radii (N,) of circles as large as the ellipses."""
+        """Return the radii (N,) of circles with the areas of the ellipses."""
         return np.asarray(np.sqrt(np.linalg.det(self.shape)))
 
 
 def find_blobs(grey: GreyImage) -> Blobs:
-    """Return the blobs of `grey`, of either sign and any size, each once."""
+    """Return the blobs of `grey`, of both signs and all sizes, without duplicates."""
     level, scale = grey.astype(np.float32), 1.0
     while level.size > BASE_PIXELS:
         level, scale = _halved(level), 2.0 * scale
@@ -84,7 +84,7 @@ def _of_level(level: FloatImage, scale: float) -> Blobs:
     window = (WINDOW_PX, WINDOW_PX)
     mean = cv2.blur(smooth, window)
     off = smooth - mean
-    # Sums of floats may end a little below zero.
+    # Sums of floats may be slightly negative.
     limit = np.float32(DEVIATIONS) * cv2.sqrt(np.maximum(cv2.blur(off * off, window), 0.0))
     parts = []
     for sign, mask in ((1.0, off > limit), (-1.0, off < -limit)):
@@ -93,7 +93,7 @@ def _of_level(level: FloatImage, scale: float) -> Blobs:
         root = np.sqrt(np.maximum(np.linalg.det(covariance), 1e-12))
         filling = area / (4.0 * np.pi * root)
         half_trace = 0.5 * np.trace(covariance, axis1=1, axis2=2)
-        # Axes in the ratio r have half_trace / root = (r + 1 / r) / 2.
+        # Axes with ratio r have half_trace / root = (r + 1 / r) / 2.
         round_enough = half_trace / root < 0.5 * (MAX_ASPECT + 1.0 / MAX_ASPECT)
         good = (filling > FILLING[0]) & (filling < FILLING[1]) & round_enough
         parts.append(
@@ -103,14 +103,14 @@ def _of_level(level: FloatImage, scale: float) -> Blobs:
 
 
 def _moments(mask: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return centroids (N, 2), covariances (N, 2, 2) and areas (N,) of components of fitting area off the border."""
+    """Return centroids (N, 2), covariances (N, 2, 2) and areas (N,) of regions of suitable area off the border."""
     count, labels, stats, centroids = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=4)
     area = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
     left, top, wide, high = (stats[:, k] for k in range(4))
     height, width = mask.shape
     inside = (left > 0) & (top > 0) & (left + wide < width) & (top + high < height)
     inside &= (area >= BLOB_AREAS[0]) & (area <= BLOB_AREAS[1])
-    # Boxes of thin, long or ragged things are far larger than they are.
+    # Bounding boxes of thin, long or ragged regions are far larger than these.
     inside &= area > wide * high * (0.25 * np.pi / MAX_ASPECT)
     inside[0] = False
     wanted = np.flatnonzero(inside)
@@ -123,13 +123,13 @@ def _moments(mask: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     du, dv = u - centroids[wanted, 0][which], v - centroids[wanted, 1][which]
     sums = [np.bincount(which, part, len(wanted)) for part in (du * du, du * dv, dv * dv)]
     uu, uv, vv = (part / np.maximum(area[wanted], 1.0) for part in sums)
-    # A pixel is a square.
+    # The variance of a square pixel is 1/12.
     covariance = np.stack([uu + 1.0 / 12.0, uv, uv, vv + 1.0 / 12.0], axis=-1).reshape(-1, 2, 2)
     return np.asarray(centroids[wanted], np.float64), covariance, area[wanted]
 
 
 def _root(matrix: FloatArray) -> FloatArray:
-    """Return the symmetric square roots of symmetric positive (N, 2, 2)."""
+    """Return the symmetric square roots of symmetric positive definite (N, 2, 2)."""
     # Cayley and Hamilton: root = (A + sqrt(det A) I) / sqrt(trace A + 2 sqrt(det A)).
     det = np.sqrt(np.maximum(np.linalg.det(matrix), 0.0))
     total = np.sqrt(np.maximum(np.trace(matrix, axis1=1, axis2=2) + 2.0 * det, 1e-12))
@@ -137,13 +137,13 @@ def _root(matrix: FloatArray) -> FloatArray:
 
 
 def _once(blobs: Blobs) -> IntArray:
-    """Return which blobs to keep so that none is another's double; finer levels, which come first, win."""
+    """Return the indices of the blobs without duplicates; of two, that of the finer level, the first, is kept."""
     from scipy.spatial import cKDTree
 
     if len(blobs) < 2:
         return np.arange(len(blobs))
     radius = blobs.radius_px()
-    # Of one size: within a factor of exp(0.5).
+    # Similar sizes are within a factor of exp(0.5).
     place = np.column_stack([blobs.pixels, np.zeros(len(blobs))])
     pairs = cKDTree(place).query_pairs(DUPLICATE * float(radius.max()), output_type="ndarray")
     first, second = pairs.min(axis=1), pairs.max(axis=1)

@@ -1,10 +1,9 @@
-"""How certain the centres of a grid's circles are: by the noise of pixels, and by what their shapes say of all else.
+"""The standard deviations of the centres of a grid's circles, from pixel noise and from the scatter of their shapes.
 
-The residuals of a circle's pixels show too little of its error where neighbouring pixels share their noise (a picture
-smoothed after it was taken), or print or light differ along the edge. They show too much where noise changes its sign
-from pixel to pixel (JPEG), and where they are those of another blur (motion), the same on both sides. Whatever it is
-changes how circles are slanted as much as where they lie, each in its sigmas for white noise; and what the slant should
-be is known, for neighbours foretell it.
+The residuals of a circle's pixels underestimate its error if neighbouring pixels share their noise (an image smoothed
+after it was taken), or if print or light vary along the edge. They overestimate it if noise alternates from pixel to
+pixel (JPEG), or if they are due to another blur (motion), which is symmetric. All of these change the slants of circles
+as much as their centres, relative to their standard deviations for white noise, and slants are predicted by neighbours.
 """
 
 from __future__ import annotations
@@ -18,28 +17,28 @@ from rigkit.detection.circles.fit import MODEL_SIGMA_PX, CircleFit
 from rigkit.detection.circles.local_map import MIN_SMOOTH
 
 MAP_ERROR = 1.0
-"""Error of a centre over that of its circle's size times the radius in distances: (n - 1) / 4 for the order n = 5 that
-follows the polynomial's (`local_map`)."""
+"""Error of a centre relative to that of its circle's size times the radius in distances of neighbours: (n - 1) / 4 for
+n = 5, the first order that the polynomial (`local_map`) lacks."""
 ODD_BY_NOISE = 3.8
-"""Noise makes the sum of squares of three changes of shape so many times its usual one once in a hundred circles."""
+"""Ratio of the sum of squares of three changes of shape to its expectation that noise exceeds for 1 % of circles."""
 WAVY_BY_NOISE = 2.5
-"""Likewise the mean square of harmonics 3 to 6 of a circle's edge."""
+"""The same for the mean square of harmonics 3 to 6 of a circle's edge."""
 SMOOTH_TERMS = 6
-"""Of the surface beside which circles are slanted."""
+"""Number of terms of the surface that is subtracted from slants."""
 
 
 def centre_sigmas(fit: CircleFit, label: IntArray, slope_gain: FloatArray | float, radius: float) -> FloatArray:
     """Return standard deviations (N,) of the centres of a grid's circles, px.
 
-    By how much more slants scatter, or less, than white noise makes them, all are less sure, or more. What a single
-    circle is off in size and slant, beyond that and beyond what all are (motion stretches them), shows the error of the
-    map's first derivatives. At the rim, where it is not small, the map is foretold from one side, and what its
-    polynomial leaves of order n in the distance t has second over first derivatives (n - 1) / t. A quarter of that,
-    times the radius, moves the centre. What makes an edge wavy (dirt, a finger, print) moves it as much.
+    All are scaled by the ratio of the scatter of slants to that expected for white noise. The deviations of a single
+    circle's size and slant, beyond this and beyond those common to all (motion stretches all circles), are an error of
+    the map's first derivatives. At the rim, where it is not small, the map is extrapolated: if its polynomial lacks a
+    term of order n in the distance t, the ratio of second to first derivatives is (n - 1) / t. A quarter of that, times
+    the radius, shifts the centre. Irregularities of an edge (dirt, a finger, print) shift it as much.
 
     Parameters
     ----------
-    slope_gain : (N,) of the maps that were given to the fit (`PlaneMap`); 0 where they come from a camera.
+    slope_gain : (N,) of the maps used by the fit (`PlaneMap`); 0 for maps of a camera.
     radius : in distances of neighbours.
     """
     size_px = np.sqrt(np.abs(np.linalg.det(fit.maps)))
@@ -55,8 +54,8 @@ def centre_sigmas(fit: CircleFit, label: IntArray, slope_gain: FloatArray | floa
 
 
 def _variance_over_white(slants: FloatArray) -> float:
-    """Return the variance of the centres over that by white noise, from the squares (N, 2) of how circles are slanted,
-    each over its variance by white noise: 1 as far as chance may have made them differ."""
+    """Return the ratio of the variance of the centres to that for white noise, from the squares (N, 2) of slants over
+    their variances for white noise; as close to 1 as chance allows."""
     free = len(slants) - SMOOTH_TERMS if len(slants) >= MIN_SMOOTH else len(slants) - 1
     # The mean of two squares of normal deviates has the median ln 2; that of N scatters by 1 / (ln 2 sqrt(N)) of it.
     times = float(np.median(slants.mean(axis=1))) / log(2.0) * len(slants) / free
@@ -66,8 +65,8 @@ def _variance_over_white(slants: FloatArray) -> float:
 
 
 def _without_smooth_part(values: FloatArray, label: IntArray) -> FloatArray:
-    """Return what `values` (N, K) are beside a quadratic surface over the places: what all have, and what lens and blur
-    change evenly, is no scatter. Beside their medians where there are few circles."""
+    """Return the residuals of `values` (N, K) from a quadratic surface over the places, or from their medians for few
+    circles: common changes, and smooth ones due to lens and blur, are no scatter."""
     off = values - np.median(values, axis=0)
     if len(values) < MIN_SMOOTH:
         return off

@@ -1,4 +1,4 @@
-"""Every grid of circles in an image: blobs, their lattices, the fit of circles, growth, and what is a grid."""
+"""Detection of all grids of circles in an image: blobs, their lattices, the fit of circles, growth, and evidence."""
 
 from __future__ import annotations
 
@@ -21,40 +21,40 @@ if TYPE_CHECKING:
 
 FIRST_EDGE_BLUR = 0.8
 MIN_CIRCLES, MIN_SIDE = 9, 3
-"""Fewer than 3 x 3 circles are too often none."""
+"""Smallest number of circles and of rows and columns: smaller lattices are too often no grids."""
 FIRST_SIGMA_PX = 0.1
-"""Of the centroids of blobs."""
+"""Standard deviation of the centroids of blobs."""
 MAX_CIRCLE_GROWTH = 0.25
-"""How far a circle's size and slant may differ from what its neighbours say."""
+"""Largest relative difference of a circle's size and slant from the predictions by its neighbours."""
 OFF_PLACE = 0.12
-"""How far a circle may lie from where its neighbours say, in their distance."""
+"""Largest distance of a circle from its prediction by its neighbours, in distances of neighbours."""
 MIN_CIRCLE_CONTRAST, MAX_CIRCLE_CONTRAST = 0.35, 2.5
-"""Contrast of a circle over the grid's typical one, or that of its share of the brightness, which a shadow leaves as it
-is: what is far outside of both is another thing."""
+"""Range of a circle's contrast relative to the typical one of the grid, or of its share of the brightness, which a
+shadow does not change: an object outside of both ranges is no circle of the grid."""
 MAX_CIRCLE_RESIDUAL = 3.0
-"""RMS residual over contrast, over the grid's typical one: more, and something lies across the circle."""
+"""Largest ratio of residual to contrast relative to the typical one: a circle above it is partly covered."""
 MIN_TYPICAL_CIRCLE = 0.03
-"""Residuals over contrast below this are small anyway."""
+"""Lower limit of the typical ratio of residual to contrast."""
 SUPPORT = 5
-"""Neighbours that must foretell a circle which no blob shows."""
+"""Smallest number of neighbours that predict a circle without a blob."""
 MAX_GAIN = 10.0
-"""How much less certain than a circle a place may be that neighbours foretell: a corner of the grid, by its neighbours
-on one side, is five times."""
+"""Largest standard deviation of a place predicted by circles of standard deviation 1: a corner of the grid, predicted
+from one side, has five."""
 SURE_GAIN = 1.5
-"""Of circles in the middle of others: these tell whether a lattice is a smooth image of a plane."""
+"""The same for circles in the middle of others, which show whether a lattice is a smooth image of a plane."""
 BLUR_ROUNDS = 3
-"""The second has the neighbours' centres and sizes from the first, which took away up to 0.1 px (RENDERED, hexagonal,
-blur 3 px); the third, where that changed by how much the blur differs with the direction, has it from what the
-neighbours' light leaves, and circles that this light had hidden."""
+"""Largest number of rounds with the neighbours' light. The second has their centres and sizes from the first, which
+removes errors of up to 0.1 px (RENDERED, hexagonal, blur 3 px). The third, if the anisotropy of the blur changed, has
+it from the residuals of the second, and has circles that the neighbours' light had hidden."""
 MIXED_ROUNDS = 2
-"""The second has the neighbours' sizes, and how much the blur differs with the direction, from the first."""
+"""Number of such rounds for circles always fitted with neighbours' light; each has sizes and anisotropy from the last."""
 FIRST_TOLERANCE = 2.0
-"""Before circles are fitted, maps at the rim of a grid, from the middles of blobs, are not good."""
+"""Factor of the limits in the first fit: maps from the centroids of blobs are inaccurate at the rim of a grid."""
 MIN_UNEVEN, MAX_UNEVEN = 0.1, 0.9
-"""Of the variance of the blur. A change below the first leaves centres where they are (REAL, hexagonal: within
-0.0003 px). The second is a blur four times as wide in one direction as across it."""
+"""Smallest applied change and largest value of the blur's anisotropy, relative to its variance. Smaller changes do not
+move centres (REAL, hexagonal: within 0.0003 px); the largest is a blur four times as wide one way as across."""
 MAX_NEW_RINGS = 40
-"""Rings of circles that a grid may grow by."""
+"""Largest number of rings of circles by which a grid grows."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -63,17 +63,17 @@ class CircleGrid:
 
     Attributes
     ----------
-    label : (N, 2) places in the lattice (`lattices.LabelledBlobs`), from (0, 0) up.
+    label : (N, 2) places in the lattice (`lattices.LabelledBlobs`), from (0, 0).
     pixels, sigma_px : (N, 2) and (N,) images of the centres.
     maps : (N, 2, 2) px per radius.
-    hexagonal : whether the second direction lies at 60 degrees to the first, not at 90.
-    bright : whether the circles are brighter than what they are printed on.
+    hexagonal : whether the second direction is at 60 degrees to the first, not at 90.
+    bright : whether the circles are brighter than the sheet.
     radius : of the circles, in distances of neighbours.
-    blur_px, contrast, share : typical blur of an edge, how far circles differ from their ground in grey levels, and how
-        far in parts of the brighter of both.
-    uneven_px2 : (2,) by how much the blur differs with the direction (`fit_circles`).
-    empty : (K, 2) places beside these circles that the image shows, and no circle there.
-    evidence : what speaks for a grid.
+    blur_px, contrast, share : typical blur of an edge, contrast in grey levels, and contrast relative to the brighter
+        of circle and sheet.
+    uneven_px2 : (2,) anisotropy of the blur (`fit_circles`).
+    empty : (K, 2) places beside these circles that are visible in the image, without a circle.
+    evidence : how well the lattice agrees with a grid.
     """
 
     label: IntArray
@@ -95,14 +95,14 @@ class CircleGrid:
 
 
 def find_grids(grey: GreyImage, min_circles: int = MIN_CIRCLES, *, quick: bool = False) -> list[CircleGrid]:
-    """Return the grids of circles in `grey`, the largest first; `quick`: of blobs alone, each fitted once."""
+    """Return the grids of circles in `grey`, the largest first; `quick`: from blobs only, each fitted once."""
     found = [grid for grid in seen_grids(grey, quick=quick) if len(grid) >= min_circles and grid.evidence.convincing]
     return sorted(found, key=lambda grid: -len(grid))
 
 
 def seen_grids(grey: GreyImage, *, quick: bool = False) -> list[CircleGrid]:
-    """Return all lattices of `grey` that may be grids, with what speaks for them."""
-    # The graphs of scipy: starting rigkit takes a quarter longer with them.
+    """Return all lattices in `grey` that may be grids, with their evidence."""
+    # scipy's graphs are imported here because they slow down the start of rigkit by a quarter.
     from rigkit.detection.circles.lattices import blob_lattices
 
     blobs = find_blobs(grey)
@@ -116,13 +116,13 @@ def seen_grids(grey: GreyImage, *, quick: bool = False) -> list[CircleGrid]:
 
 
 def _wide(label: IntArray) -> bool:
-    """Return whether circles lie in at least MIN_SIDE rows and columns."""
+    """Return whether circles are in at least MIN_SIDE rows and columns."""
     return bool((np.ptp(label, axis=0) >= MIN_SIDE - 1).all())
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _Draft:
-    """A grid in the making."""
+    """A grid that is being extended and fitted."""
 
     label: IntArray
     fit: CircleFit
@@ -135,7 +135,7 @@ class _Draft:
 
     @property
     def corner(self) -> float:
-        """Return how far pixels are a circle's own, over half the way to its neighbours."""
+        """Return the radius of a circle's own pixels, in half distances to its neighbours."""
         return CORNER[self.hexagonal] if self.mixed else 1.0
 
     def chosen(self, which: BoolArray) -> _Draft:
@@ -158,7 +158,7 @@ def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool) 
 
 
 def _first(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, beside: bool = False) -> _Draft:
-    """Return the circles that blobs are; `beside`: fitted with the light of neighbours."""
+    """Return the circles of blobs; `beside`: fitted with the light of neighbours."""
     own, label, hexagonal = blobs.chosen(found.index), found.label, found.hexagonal
     around = local_maps(label, own.pixels, label, hexagonal=hexagonal, sigma_px=FIRST_SIGMA_PX)
     radius = _radius(own.shape, around.first)
@@ -171,7 +171,7 @@ def _first(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, beside: bool 
 
 
 def _mixed(grey: GreyImage, draft: _Draft) -> _Draft:
-    """Return the draft of circles that are not fitted without their neighbours' light: blur or motion mixes it."""
+    """Return the draft of circles that cannot be fitted without their neighbours' light, because of blur or motion."""
     for _ in range(MIXED_ROUNDS):
         if _enough(draft):
             draft = _again(grey, replace(draft, uneven_px2=_uneven(draft)), beside=True)
@@ -179,7 +179,7 @@ def _mixed(grey: GreyImage, draft: _Draft) -> _Draft:
 
 
 def _with_all(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
-    """Return the draft grown by rings of circles that no blob shows; `beside`: with the light of neighbours."""
+    """Return the draft extended by rings of circles without blobs; `beside`: with the light of neighbours."""
     for _ in range(MAX_NEW_RINGS):
         grown = _larger(grey, draft, beside=beside) if _enough(draft) else None
         if grown is None:
@@ -210,7 +210,7 @@ def _fitted(
     beside: IntArray | None = None,
     known: int = 0,
 ) -> CircleFit:
-    """Return the circles of maps, fitted but for the first `known`, which only shine on those beside them."""
+    """Return the fitted circles, except for the first `known`, which are only used as neighbours of the others."""
     maps = radius * around.first
     reach = edge_reach(maps, 0.5 / radius, blur_px, around.surrounded, corner)
     reach[:known] = 0.0
@@ -218,7 +218,7 @@ def _fitted(
 
 
 def like_contrast(fit: CircleFit, contrast: float, share: float) -> BoolArray:
-    """Return which circles (N,) have about the usual `contrast`, or the typical `share` of the brightness."""
+    """Return which circles (N,) have about the typical `contrast`, or the typical `share` of the brightness."""
     parts = np.stack([np.abs(fit.contrast) / contrast, fit.share / share])
     return np.asarray(((parts > MIN_CIRCLE_CONTRAST) & (parts < MAX_CIRCLE_CONTRAST)).any(axis=0))
 
@@ -228,7 +228,7 @@ def _sigma(fit: CircleFit) -> float:
 
 
 def _tested(draft: _Draft, tolerance: float = 1.0) -> _Draft:
-    """Return the draft without what is no circle of it; `tolerance` multiplies the limits of shape and residual."""
+    """Return the draft without what is no circle of it; `tolerance`: factor of the limits of shape and residual."""
     fit = draft.fit
     good = fit.valid & ((fit.contrast > 0.0) == draft.bright)
     good &= (np.abs(_own_growth(fit, good)) < tolerance * MAX_CIRCLE_GROWTH).all(axis=1)
@@ -255,21 +255,21 @@ def _tested(draft: _Draft, tolerance: float = 1.0) -> _Draft:
 
 
 def _own_growth(fit: CircleFit, good: BoolArray) -> FloatArray:
-    """Return the growth (N, 3) of circles without what all `good` ones have of it.
+    """Return the growth (N, 3) of circles minus the median growth of size of the `good` ones.
 
-    Without their neighbours' light they seemed smaller than they are.
+    Fitted without their neighbours' light, all circles seem smaller than they are.
     """
     common = float(np.median(fit.growth[good, 0])) if good.any() else 0.0
     return np.asarray(fit.growth - np.array([common, 0.0, 0.0]))
 
 
 def _spacing(around: PlaneMap) -> FloatArray:
-    """Return the distances (M,) of neighbours, px, in the mean over directions."""
+    """Return the distances (M,) of neighbours, px, averaged over directions."""
     return np.asarray(np.sqrt(np.maximum(np.abs(np.linalg.det(around.first)), 1e-9)))
 
 
 def _again(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
-    """Return the draft fitted with maps through the circles as they are now; `beside`: with the light of neighbours."""
+    """Return the draft fitted with maps through its current circles; `beside`: with the light of neighbours."""
     fit = draft.fit
     around = local_maps(draft.label, fit.pixels, draft.label, hexagonal=draft.hexagonal, sigma_px=_sigma(fit))
     size_px = (grey.shape[1], grey.shape[0])
@@ -281,9 +281,9 @@ def _again(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
 
 
 def _uneven(draft: _Draft) -> FloatArray:
-    """Return by how much the blur of all circles differs with the direction (2,), px^2, from what their residuals say.
+    """Return the anisotropy (2,) of the blur of all circles, px^2, from their residuals.
 
-    One circle cannot tell it from its slant where it is small; that slants are those of a plane, all of them can.
+    A small one cannot be separated from the slant for a single circle, but for all circles of a plane it can.
     """
     first, second, *normal = draft.fit.uneven.sum(axis=0)
     more = np.linalg.solve(
@@ -295,10 +295,10 @@ def _uneven(draft: _Draft) -> FloatArray:
 
 
 def _through_its_blur(grey: GreyImage, draft: _Draft) -> _Draft:
-    """Return the draft fitted with the light that blur brings from neighbours, and with a blur that differs with the
-    direction, where there are such; and circles that are seen only so.
+    """Return the draft fitted with the light of neighbours and the anisotropy of the blur, if they matter; and with
+    circles that are found only so.
 
-    Only what is a grid is: large circles with much blur overlap to what looks like a chessboard.
+    It is used for grids only: large circles with much blur overlap to a pattern like a chessboard.
     """
     grown = False
     for done in range(BLUR_ROUNDS):
@@ -350,7 +350,7 @@ def _tried(grey: GreyImage, draft: _Draft, places: IntArray, around: PlaneMap, *
 
 
 def _beside(draft: _Draft, size_px: tuple[int, int]) -> tuple[IntArray, PlaneMap]:
-    """Return the places next to circles of the draft that would lie in the image whole, and the maps there."""
+    """Return the places next to circles of the draft where a circle would be inside the image, and the maps there."""
     step = steps(draft.hexagonal)
     known = {tuple(label) for label in draft.label.tolist()}
     beside = {tuple(place) for place in (draft.label[:, None] + step).reshape(-1, 2).tolist()}

@@ -1,8 +1,8 @@
-"""The fit of circles to an image: where their centres are, and how certain.
+"""The fit of circles to an image, with the standard deviations of their centres.
 
-A circle's edge is c + M w + H(w, w) / 2 over the unit circle |w| = 1 of its plane, in radii. c is the image of the
-centre. It differs from the middle of the ellipse seen by H, the curvature of the map from the plane to the image, which
-slant and lens bring about: H comes from the circle's neighbours, c, M, the blur and the light from the pixels
+A circle's edge is c + M w + H(w, w) / 2 for the unit circle |w| = 1 in its plane, in radii. c is the image of the
+centre. It differs from the centre of the visible ellipse by H, the second derivatives of the map from the plane to the
+image, due to slant and lens. H comes from the circle's neighbours; c, M, blur and light are fitted to the pixels
 (circles.c).
 """
 
@@ -17,7 +17,7 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.kernels import circles as kernel
 
 NEAR_BESIDE = 3.0
-"""Blur brings light of a neighbour into pixels that lie less than so many sigmas off it: a 700th of it."""
+"""Distance, in sigmas of the blur, up to which light of a neighbour counts in a pixel: beyond, it is below a 700th."""
 RULES = kernel.CircleRules.of(
     near_sigmas=4.0,
     near_px=3.0,
@@ -33,31 +33,31 @@ RULES = kernel.CircleRules.of(
     plain_iterations=5,
     min_pixels=16,
 )
-"""Fits of the model's own edges settle in five steps; those of others (sharpened, moved) take up to thirty, the later
-ones relaxed. They end where steps are as small as MODEL_SIGMA_PX, or a twentieth of what the circle is known to."""
+"""Fits of edges that follow the model converge in five steps; those of others (sharpened, moved) take up to thirty, the
+later ones relaxed. They end when steps are below 0.001 px, or a twentieth of the sigma of the centre."""
 RIM_SIGMAS = 4.0
-"""A circle without a neighbour on some side is fitted to the pixels up to so many sigmas of blur outside of it: with
-2.5 the error there is a quarter over the bound, with 4 a tenth."""
+"""Distance from its edge, in sigmas of the blur, up to which a circle without a neighbour on some side has pixels: with
+2.5 its error is a quarter above the Cramer-Rao bound, with 4 a tenth."""
 MODEL_SIGMA_PX = 5e-4
-"""What a centre is off without noise, by how the edge model departs from rendered circles: 0.0003 to 0.0007 px."""
+"""Error of a centre without noise, as the edge model differs from rendered circles: 0.0003 to 0.0007 px."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class CircleFit:
-    """N circles as fitted.
+    """N fitted circles.
 
     Attributes
     ----------
     pixels : (N, 2) images of the centres.
-    maps : (N, 2, 2) px per radius; a turn of the circle in itself is as it was given.
-    growth : (N, 3) symmetric part of how `maps` differ from those given: size, and stretch along and aslant of x.
+    maps : (N, 2, 2) px per radius; the rotation of the circle in its plane is the initial one.
+    growth : (N, 3) symmetric part of the relative change of `maps`: size, and stretch along x and along the diagonal.
     growth_variance, covariance : (N, 3) and (N, 2, 2) of `growth` and `pixels` for white noise, the second in px^2.
-    blur_px, brightness, contrast, residual : (N,) blur of the edge, level around the circle, what the level inside is
-        more, RMS residual in grey levels.
+    blur_px, brightness, contrast, residual : (N,) blur of the edge, level around the circle, difference of the level
+        inside, RMS residual in grey levels.
     count : (N,) pixels.
     harmonics : (N, 4, 2) cosine and sine of harmonics 3 to 6 of the edge, in radii.
-    uneven : (N, 5) what residuals say of `uneven_px2` beyond what was given: products with its two columns, and its
-        normal equations (xx, xy, yy), both over the variance of the residuals.
+    uneven : (N, 5) normal equations of a correction of `uneven_px2` from the residuals, over their variance: the
+        right-hand side and the matrix (xx, xy, yy).
     valid : (N,)
     """
 
@@ -77,7 +77,7 @@ class CircleFit:
 
     @property
     def share(self) -> FloatArray:
-        """Return the contrasts (N,) in parts of the brighter of circle and ground."""
+        """Return the contrasts (N,) relative to the brighter of circle and sheet."""
         brighter = np.maximum(self.brightness, self.brightness + self.contrast)
         return np.asarray(np.abs(self.contrast) / np.maximum(brighter, 1e-6))
 
@@ -90,10 +90,10 @@ class CircleFit:
 def edge_reach(
     maps: FloatArray, half_way: float, blur_px: FloatArray, surrounded: BoolArray, corner: float = 1.0
 ) -> FloatArray:
-    """Return to how many radii (N,) pixels are a circle's own.
+    """Return the radius (N,) of each circle's own pixels, in its radii.
 
-    That is half the way to the next circle; where there is none, the sheet may end there. Where blur mixes the light of
-    circles the paper is seen at the corner of a cell alone, `corner` times as far.
+    It is half the distance to the next circle; without a next one the sheet may end before. If blur mixes the light of
+    circles, the paper is visible at the corners of a cell only, and the radius is `corner` times as large.
     """
     narrow = np.sqrt(np.maximum(np.linalg.eigvalsh(maps @ np.swapaxes(maps, 1, 2))[:, 0], 1.0))
     return np.where(surrounded, corner * half_way, np.minimum(half_way, 1.0 + RIM_SIGMAS * blur_px / narrow))
@@ -109,18 +109,18 @@ def fit_circles(
     beside: IntArray | None = None,
     uneven_px2: FloatArray | None = None,
 ) -> CircleFit:
-    """Fit circles to their pixels.
+    """Return the fit of circles to their pixels.
 
     Parameters
     ----------
     pixels : (N, 2) centres, known to a few tenths of the radius.
     maps : (N, 2, 2) px per radius.
-    curvatures : (N, 2, 3) second derivatives of the image by the plane, xx, xy and yy, px per radius squared.
-    blur_px : (N,) where to start.
-    reach : (N,) radii to which pixels are the circle's own: half the way to its neighbours.
-    beside : (N, BESIDE) neighbours, whose light blur brings into a circle's pixels; -1 for none.
-    uneven_px2 : (2,) half of what the variance of the blur is more along x than along y, and along the diagonal between
-        them than across it: with motion it is.
+    curvatures : (N, 2, 3) second derivatives of the image with respect to the plane, xx, xy, yy, px per radius squared.
+    blur_px : (N,) initial blur.
+    reach : (N,) radius of the circle's own pixels, in radii: half the distance to its neighbours.
+    beside : (N, BESIDE) neighbours whose light blur brings into a circle's pixels; -1 for none.
+    uneven_px2 : (2,) anisotropy of the blur, as with motion: half its variance along x minus that along y, and likewise
+        along the diagonal minus across it.
     """
     extent = np.sqrt((maps**2).sum(axis=2)).max(axis=1, initial=1.0)
     margin = np.abs(curvatures).sum(axis=(1, 2)) + 1.0
@@ -153,7 +153,7 @@ def fit_circles(
 
 
 def _growth(maps: FloatArray, found: FloatArray) -> FloatArray:
-    """Return the symmetric part (N, 3) of how the maps `found` differ from those given."""
+    """Return the symmetric part (N, 3) of the relative change from the given maps to those `found`."""
     with np.errstate(all="ignore"):
         relative = np.linalg.solve(np.where(np.isfinite(maps), maps, 1.0) + 1e-9 * np.eye(2), found)
     return np.stack(

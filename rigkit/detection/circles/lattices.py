@@ -1,8 +1,8 @@
 """Lattices of blobs: which blobs are neighbours, and the place of each in a square or a hexagonal lattice.
 
-The distance of two blobs is measured in radii, by the mean of their two ellipses. To second order in the distance that
-is free of slant, perspective and lens: over the whole of a grid it is its pitch over its radius, and neither a pitch
-nor a radius in pixels need be known.
+The distance of two blobs is measured in radii of the mean of their two ellipses. To second order in the distance it
+does not depend on slant, perspective and distortion: it is the ratio of pitch and radius everywhere on a grid, so that
+neither pitch nor radius in pixels need be known.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs
 
 NEAREST_BLOBS = 16
-"""Nearest blobs that are looked at: at 75 degrees of slant nine others lie nearer than the next one uphill."""
+"""Number of nearest blobs evaluated: at 75 degrees of slant nine others are nearer than the next one uphill."""
 PITCHES = (2.02, 9.0)
-"""Distances of neighbours, in radii: circles do not touch, and are not lost in their sheet."""
+"""Range of the distance of neighbours, in radii: circles do not touch, and are not tiny."""
 ALIKE_BLOBS = 2.0
-"""Ratio of the areas of neighbours, and of the axes in which they differ most: between circles a seventh of their
-distance from the camera apart the first is 1.5."""
+"""Largest ratio of the areas of neighbours, and of their axes where they differ most: the ratio of areas is 1.5 for
+circles whose distances from the camera differ by a seventh."""
 EQUAL_STEPS = 1.25
-"""Ratio of the distances of one blob to its neighbours; the next ones of a square lattice have 1.41."""
+"""Largest ratio of the distances of one blob to its neighbours; the next ones of a square lattice have 1.41."""
 MIN_LABELLED = 6
 OFF_STEP = 0.3
-"""How far from a whole number of steps a neighbour may lie, in steps."""
+"""Largest distance of a neighbour from a whole number of steps, in steps."""
 TRUST = 0.5
-"""Weight of a basis that comes from the neighbours, in links."""
+"""Weight of a basis taken from neighbours, relative to a link."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -36,8 +36,8 @@ class LabelledBlobs:
 
     Attributes
     ----------
-    index : (N,) which of all blobs.
-    label : (N, 2) whole steps along the two directions of the lattice; the second lies clockwise (from u to v) of the
+    index : (N,) of the blobs.
+    label : (N, 2) whole steps along the two directions of the lattice; the second is clockwise (from u to v) of the
         first, by 90 degrees of the sheet, or by 60.
     hexagonal : whether by 60.
     """
@@ -49,7 +49,7 @@ class LabelledBlobs:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Neighbours:
-    """Directed links between neighbours, each in both directions."""
+    """Links between neighbours, each in both directions."""
 
     source: IntArray
     target: IntArray
@@ -57,7 +57,7 @@ class _Neighbours:
 
 
 def blob_lattices(blobs: Blobs) -> list[LabelledBlobs]:
-    """Return the lattices of `blobs`, in no particular order; a blob is in one at most."""
+    """Return the lattices of `blobs`, in no particular order; a blob is in at most one."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -89,7 +89,7 @@ def _links(blobs: Blobs) -> _Neighbours:
     square = blobs.shape @ blobs.shape
     mean = 0.5 * (square[source] + square[target])
     distance = np.sqrt(np.einsum("ni,nij,nj->n", vector, np.linalg.inv(mean), vector))
-    # The ratio of the axes' squares in which two ellipses differ most, from the trace and the determinant.
+    # Largest and smallest ratio of the squared axes of two ellipses, from the trace and the determinant.
     between = np.linalg.solve(square[source], square[target])
     trace, det = np.trace(between, axis1=1, axis2=2), np.linalg.det(between)
     top = 0.5 * (trace + np.sqrt(np.maximum(trace**2 - 4.0 * det, 0.0)))
@@ -102,7 +102,7 @@ def _links(blobs: Blobs) -> _Neighbours:
     alike &= blobs.sign[source] == blobs.sign[target]
     alike &= (distance > PITCHES[0]) & (distance < PITCHES[1])
     steps = np.where(alike, distance, np.inf).reshape(len(blobs), -1)
-    # The second nearest: a single speck beside a circle must not hide its neighbours.
+    # The second nearest, so that a single speck beside a circle does not hide its neighbours.
     limit = EQUAL_STEPS * np.sort(steps, axis=1)[:, min(1, near - 2)]
     fair = alike & (distance < limit[source]) & (distance < limit[target])
     one = coo_array((np.ones(int(fair.sum())), (source[fair], target[fair])), shape=(len(blobs),) * 2).tocsr()
@@ -111,7 +111,7 @@ def _links(blobs: Blobs) -> _Neighbours:
 
 
 def _labelled(blobs: Blobs, links: _Neighbours) -> LabelledBlobs | None:
-    """Return the blobs of one component with their places, or None where they make no lattice."""
+    """Return the blobs of one component with their places, or None if they form no lattice."""
     index, flat = np.unique(np.concatenate([links.source, links.target]), return_inverse=True)
     source, target = flat.reshape(2, -1)
     count = len(index)
@@ -154,9 +154,9 @@ def _triangular(source: IntArray, target: IntArray, count: int) -> bool:
 def _seed(
     shape: FloatArray, source: IntArray, target: IntArray, vector: FloatArray, count: int, hexagonal: bool
 ) -> tuple[FloatArray | None, int]:
-    """Return the basis (2, 2), steps in its columns, of the blob with the most links, and that blob."""
+    """Return the basis (2, 2), with steps as columns, of the blob with the most links, and that blob's index."""
     degree = np.bincount(source, minlength=count)
-    # Among those, one whose neighbours have many links themselves lies in the middle.
+    # Of several the one whose neighbours have many links themselves, in the middle.
     weight = degree + np.bincount(source, degree[target].astype(np.float64), count) / 100.0
     seed = int(weight.argmax())
     own = vector[source == seed]
@@ -172,7 +172,7 @@ def _seed(
 
 
 def _steps(basis: FloatArray, vector: FloatArray, hexagonal: bool) -> tuple[IntArray, BoolArray]:
-    """Return the steps (N, 2) that vectors are, and whether each is one to a neighbour."""
+    """Return the steps (N, 2) of vectors, and whether each is one to a neighbour."""
     det = np.linalg.det(basis)
     fine = np.abs(det) > 1e-9
     own = np.where(fine[:, None, None], basis, np.eye(2))
@@ -180,7 +180,7 @@ def _steps(basis: FloatArray, vector: FloatArray, hexagonal: bool) -> tuple[IntA
     step = np.rint(parts)
     near = (np.abs(parts - step) < OFF_STEP).all(axis=1)
     total = np.abs(step).sum(axis=1)
-    # Steps of 60 degrees: the third direction is the second less the first.
+    # Steps of 60 degrees: the third direction is the second minus the first.
     neighbour = (total == 1) | (hexagonal & (total == 2) & (step.sum(axis=1) == 0) & (step[:, 0] != 0))
     return step.astype(np.int64), fine & near & neighbour
 
@@ -209,14 +209,14 @@ def _agreed(
     vector: FloatArray,
     hexagonal: bool,
 ) -> BoolArray:
-    """Return which blobs have a place of their own that most of their links agree on."""
+    """Return which blobs have a unique place on which most of their links agree."""
     count = len(label)
     inside = known[source] & known[target]
     step, fits = _steps(basis[source], vector, hexagonal)
     same = inside & fits & (label[source] + step == label[target]).all(axis=1)
     good, all_links = (np.bincount(source[part], minlength=count) for part in (same, inside))
     fine = known & (2 * good > all_links)
-    # Of two in one place the one with more links stays.
+    # Of two blobs in one place the one with more links is kept.
     order = np.lexsort((-good, label[:, 1], label[:, 0], ~fine))
     ranked = label[order]
     again = np.zeros(count, bool)

@@ -1,4 +1,4 @@
-"""How the plane of a lattice maps to the image around each of its circles: a polynomial through their neighbours."""
+"""The map from the plane of a lattice to the image around each of its circles: a polynomial through its neighbours."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ HEXAGONAL_BASIS = np.array([[1.0, 0.5], [0.0, np.sqrt(0.75)]])
 """Steps of a lattice in its plane, in distances of neighbours, as columns."""
 
 MAP_REACH = 3.1
-"""Neighbours up to so many distances away have a say: 36 in a hexagonal lattice, 28 in a square one."""
+"""Distance within which neighbours are used: 36 in a hexagonal lattice, 28 in a square one."""
 NEXT = 1.1
-"""Farther than the nearest, nearer than the next but one."""
+"""A distance between those of the nearest and the second nearest neighbours."""
 MAP_WIDTH = 1.6
-"""Standard deviation of their Gaussian weight, distances."""
+"""Standard deviation of their Gaussian weight, in distances of neighbours."""
 TYPICAL_DERIVATIVES = (np.inf, np.inf, 0.3, 0.1, 0.03)
-"""How large derivatives of order 0 to 4 are taken to be, in distances of neighbours: each is a third of the one before
-where a lens or slant bends the lattice as strongly as its circles can still be linked. What the scatter of few
-neighbours would make of them beyond that is kept out."""
+"""Prior standard deviations of derivatives of order 0 to 4, in distances of neighbours: each is a third of the one
+before if lens or slant bends the lattice as strongly as its circles can still be linked. They limit the effect of the
+scatter of few neighbours."""
 MIN_RIDGE = 1e-9
-"""Keeps the equations solvable where there are fewer neighbours than terms."""
+"""Smallest regularisation, for fewer neighbours than terms."""
 SLIGHT = 1e-4
-"""Pull on the perspective of a homography, as a part of its neighbours' weight: few neighbours leave it open."""
+"""Regularisation of a homography's perspective terms, relative to the weight of its neighbours, which may be few."""
 MIN_SMOOTH, MIXED_STEP = 20, 0.3
-"""Circles that a map of the whole board is told by at least, and half the step of its mixed derivative."""
+"""Smallest number of circles for a map of the whole board, and half the step of its mixed derivative."""
 POWERS = tuple((order - k, k) for order in range(len(TYPICAL_DERIVATIVES)) for k in range(order + 1))
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PlaneMap:
-    """The image as a function of the plane (in distances of neighbours) around M places.
+    """The map from the plane (in distances of neighbours) to the image around M places.
 
     Attributes
     ----------
     pixels : (M, 2) of the places.
-    first : (M, 2, 2) derivatives by the plane's x and y, in columns.
+    first : (M, 2, 2) derivatives with respect to the plane's x and y, as columns.
     second : (M, 2, 3) second derivatives, xx, xy and yy.
-    support : (M,) circles behind the fit, without the one at the place itself.
+    support : (M,) number of circles used, without the one at the place itself.
     surrounded : (M,) whether there is a circle on every side.
     gain, slope_gain : (M,) standard deviation of `pixels`, and of `first` (per distance; the mean over both sides), for
         circles of standard deviation 1.
@@ -59,7 +59,7 @@ class PlaneMap:
 
 
 CORNER = {False: np.sqrt(2.0), True: np.sqrt(4.0 / 3.0)}
-"""How much farther from a circle the corners of its cell are than the sides, in a square and in a hexagonal lattice."""
+"""Ratio of the distances of a cell's corners and sides from its circle, in a square and in a hexagonal lattice."""
 
 
 def plane_basis(hexagonal: bool) -> FloatArray:
@@ -67,7 +67,7 @@ def plane_basis(hexagonal: bool) -> FloatArray:
 
 
 def beside_each(label: IntArray, hexagonal: bool) -> IntArray:
-    """Return which circles (N, BESIDE) are the neighbours of each, -1 where there is none."""
+    """Return the indices (N, BESIDE) of the neighbours of each circle, -1 for none."""
     low = label.min(axis=0) - 1
     table = np.full(np.ptp(label, axis=0) + 3, -1)
     table[tuple((label - low).T)] = np.arange(len(label))
@@ -83,9 +83,9 @@ def steps(hexagonal: bool) -> IntArray:
 def local_maps(
     label: IntArray, pixels: FloatArray, places: IntArray, *, hexagonal: bool, sigma_px: float, leave_out: bool = False
 ) -> PlaneMap:
-    """Return the maps around the `places` (M, 2) of a lattice, from its circles at `label` (N, 2) and `pixels` (N, 2).
+    """Return the maps around `places` (M, 2) of a lattice, from its circles at `label` (N, 2) and `pixels` (N, 2).
 
-    `sigma_px` : standard deviation of the circles. `leave_out` : without the circles at the places themselves.
+    `sigma_px`: standard deviation of the circles. `leave_out`: without the circles at the places themselves.
     """
     step = plane_basis(hexagonal)
     side = int(np.ceil(MAP_REACH * 1.2)) + 1
@@ -105,19 +105,19 @@ def local_maps(
     x, y = plane.T
     terms = np.stack([x**i * y**j / (factorial(i) * factorial(j)) for i, j in POWERS], axis=1)
     weight = np.where(known, np.exp(-0.5 * (x * x + y * y) / MAP_WIDTH**2), 0.0)
-    # Relative to the place's neighbourhood, or the pull on derivatives would act on coordinates of the image.
+    # Relative to the mean of the neighbours, so that the prior of derivatives does not act on image coordinates.
     middle = np.nansum(np.where(known[..., None], around, 0.0), axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
     values = np.where(known[..., None], around - middle[:, None], 0.0)
     pitch = np.sqrt(np.nanmean(np.where(known[..., None], values, np.nan) ** 2) / np.mean(x * x + y * y))
     ridge = np.array([(sigma_px / (pitch * TYPICAL_DERIVATIVES[i + j])) ** 2 for i, j in POWERS]) + MIN_RIDGE
     homography, own = _homographies(plane, values, weight)
     rest = np.where(known[..., None], values - homography, 0.0)
-    # Which neighbours there are is alike in many places, and with it all but the right-hand sides.
+    # Many places have the same pattern of neighbours, and with it the same matrix of the normal equations.
     _, first, kind = np.unique(known @ (1 << np.arange(len(offset))), return_index=True, return_inverse=True)
     inverse = np.linalg.inv(_sums(weight[first], terms, terms) + np.diag(ridge))
     solved = inverse[kind] @ np.swapaxes((weight[..., None] * rest).swapaxes(1, 2) @ terms, 1, 2)
     parts = solved + np.pad(own, ((0, 0), (0, len(POWERS) - own.shape[1]), (0, 0)))
-    # What the first three terms, the place itself and its sides, take from each of the circles.
+    # Weights of each circle in the first three terms, the value and its derivatives.
     gain, *sides = np.linalg.norm(weight[first, None] * (inverse[:, :3] @ terms.T), axis=2)[kind].T
     return PlaneMap(
         pixels=parts[:, 0] + middle,
@@ -135,9 +135,9 @@ def with_smooth_curvatures(
 ) -> PlaneMap:
     """Return the map `around` the circles of a lattice, (N, 2) each, with second derivatives of one map through all.
 
-    Neighbours are on one side only at the rim, and leave the curvature there to their scatter; a smooth map of the
-    board knows it better: a perspective through a lens in the middle of an image of `size_px`, and a polynomial. As it
-    is where there are few circles.
+    At the rim neighbours are on one side only, and curvatures from them are inaccurate. A smooth map of the board is
+    more accurate: a perspective through a lens in the middle of an image of `size_px`, plus a polynomial. The map is
+    returned unchanged if there are few circles.
     """
     if len(label) < MIN_SMOOTH:
         return around
@@ -161,7 +161,7 @@ def _homographies(plane: FloatArray, values: FloatArray, weight: FloatArray) -> 
     """Return M homographies through `values` (M, K, 2) over `plane` (K, 2), at the K places, and their derivatives
     (M, 6, 2) of order 0 to 2 at the origin.
 
-    Slant bends a lattice as polynomials of low degree cannot follow; what the homography leaves, they can.
+    Polynomials of low degree cannot model a strong slant, but they can model the residuals of the homography.
     """
     count = len(values)
     x, y = plane.T
@@ -181,7 +181,7 @@ def _homographies(plane: FloatArray, values: FloatArray, weight: FloatArray) -> 
     found = np.linalg.solve(normal + pull[:, :, None] * np.eye(8), right)[..., 0]
     offset, matrix, bend = found[:, [0, 3]], found[:, [1, 2, 4, 5]].reshape(count, 2, 2), found[:, 6:]
     below = 1.0 + bend @ plane.T
-    # Where a horizon comes near there is nothing to foretell.
+    # Near a horizon nothing can be predicted.
     below = np.where(below > 0.1, below, 0.1)
     at = (offset[:, None] + np.einsum("mij,kj->mki", matrix, plane)) / below[..., None]
     first = matrix - offset[:, :, None] * bend[:, None, :]

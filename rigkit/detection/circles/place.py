@@ -1,8 +1,8 @@
-"""Where in a board the circles of a lattice lie: by the board's size, and by what is seen beside them to be paper.
+"""The place of a lattice of circles on a board, from the board's size and from empty places beside the lattice.
 
-A lattice may be numbered from several ends: four of a square one, six of a hexagonal one. Of all the places that it can
-have in the board those are right that leave no place of the board empty which the image shows. A whole board has one
-such place (or several that look the same), a part as many as its own borders leave open.
+A lattice may be numbered from several ends: a square one from four, a hexagonal one from six. Of all its places on the
+board those are right that leave no visible place of the board empty. A whole board has one such place (or several that
+look the same), a part has as many as its own borders leave open.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from rigkit.core.patterns.circles import Circles
 from rigkit.detection.circles.find import CircleGrid
 
 MAX_EMPTY_DIFFERENCE = 2
-"""A place in a board is preferred to another in it that leaves more than so many more places empty."""
+"""A place on a board is preferred to another one that leaves more than this number of further places empty."""
 MAX_EMPTY = 0.2
-"""Part of a board's circles that may be covered where the others show their place."""
+"""Largest share of a board's circles that may be covered if the others determine their place."""
 EMPTY_LINE = 0.5
-"""A line of the board beside the circles, of which this part is seen to be paper, is not there: it is another board."""
+"""Share of a line of the board beside the circles that is visible and empty, above which it is another board."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Place:
-    """A place of a lattice in a board: cells (N, 2) of the index grid, and how many other cells are seen empty."""
+    """A place of a lattice on a board: cells (N, 2) of the index grid, and the number of other visible, empty cells."""
 
     grid: IntArray
     empty: int
 
 
 def boards_meant(found: CircleGrid, boards: Sequence[Board]) -> list[tuple[Board, BoardDetection]]:
-    """Return which of the boards the lattice can be, the likeliest first, each with the circles on its grid, unnamed.
+    """Return the boards that fit the lattice, the likeliest first, each with the circles on its grid, unnamed.
 
-    They are those that leave fewest places empty which the image shows: where the image's border cuts off the corner of
-    a board, the paper beside it is seen, where a larger board would have circles. A lattice that is a whole board comes
-    first, and after it larger boards that it may be a part of, in whatever place, where the image's border cuts these.
+    They are those with the fewest visible places that are empty: if the image's border cuts off the corner of a board,
+    the paper beside it is visible where a larger board would have circles. If the lattice is a whole board, that comes
+    first, followed by larger boards of which it may be a part, in any place, cut off by the image's border.
     """
     fits = [(board, place) for board in boards if (place := _place_on(found, board)) is not None]
     least = min((place.empty for _, place in fits), default=0)
@@ -54,19 +54,18 @@ def boards_meant(found: CircleGrid, boards: Sequence[Board]) -> list[tuple[Board
 
 
 def may_be_part(found: CircleGrid, board: Board) -> bool:
-    """Return whether the lattice can be a part of the board, of which the image's border cuts off the rest."""
+    """Return whether the lattice can be a part of the board, the rest being cut off by the image's border."""
     return _open_place(found, board, MAX_EMPTY_DIFFERENCE) is not None
 
 
 def _open_place(found: CircleGrid, board: Board, max_empty: int) -> _Place | None:
-    """Return a place in the board that leaves at most `max_empty` places empty that the image shows; None where there
-    is none."""
+    """Return a place on the board that leaves at most `max_empty` visible places empty; None if there is none."""
     fullest = min(_places_on(found, board), key=lambda place: place.empty, default=None)
     return None if fullest is None or fullest.empty > max_empty else fullest
 
 
 def placed_on(found: CircleGrid, board: Board) -> BoardDetection | None:
-    """Return the circles on the board's grid, unnamed, or None where the image does not tell their place."""
+    """Return the circles on the board's grid, unnamed, or None if their place is ambiguous."""
     place = _place_on(found, board)
     return None if place is None else _detection(found, place.grid, board.size)
 
@@ -85,7 +84,7 @@ def _place_on(found: CircleGrid, board: Board) -> _Place | None:
 
 
 def _places_on(found: CircleGrid, board: Board) -> list[_Place]:
-    """Return all places in the board that the lattice can have."""
+    """Return all possible places of the lattice on the board."""
     pattern = board.pattern
     if not isinstance(pattern, Circles) or pattern.inverted != found.bright:
         return []
@@ -93,7 +92,7 @@ def _places_on(found: CircleGrid, board: Board) -> list[_Place]:
 
 
 def lone_part(found: CircleGrid, board: Board) -> BoardDetection | None:
-    """Return the circles on a grid of their own where they can be a part of the board, else None."""
+    """Return the circles on a grid of their own if they can be a part of the board, else None."""
     pattern = board.pattern
     if not isinstance(pattern, Circles) or pattern.inverted != found.bright:
         return None
@@ -109,9 +108,9 @@ def lone_part(found: CircleGrid, board: Board) -> BoardDetection | None:
 
 
 def _counted(found: CircleGrid, layout: str) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield the circles and the empty places as (column, row), or, staggered, as (half column, row), in all turns.
+    """Yield circles and empty places as (column, row), or, if staggered, as (half column, row), in all rotations.
 
-    Right-handed like the labels; not from zero. A lattice of the other kind has none.
+    They are right-handed like the labels, and do not begin at zero. A lattice of the other kind has none.
     """
     if found.hexagonal != (layout == "hexagonal"):
         return
@@ -119,7 +118,7 @@ def _counted(found: CircleGrid, layout: str) -> Iterator[tuple[IntArray, IntArra
     for _ in range(6 if found.hexagonal else 4):
         if found.hexagonal:
             yield tuple(np.stack([2 * p + q, q], axis=-1) for p, q in (label.T, empty.T))  # type: ignore[misc]
-            # 60 degrees on: a becomes b, b becomes b - a.
+            # Rotated by 60 degrees: a becomes b, b becomes b - a.
             label, empty = (np.stack([p + q, -p], axis=-1) for p, q in (label.T, empty.T))
         else:
             if layout == "asymmetric":
@@ -130,7 +129,7 @@ def _counted(found: CircleGrid, layout: str) -> Iterator[tuple[IntArray, IntArra
 
 
 def _cells(circles: IntArray, pattern: Circles) -> IntArray:
-    """Return (column, row) of circles given as (half column, row) from zero, or just so in a regular layout."""
+    """Return (column, row) of circles given as (half column, row) from zero, or as (column, row) if regular."""
     if not pattern.staggered:
         return circles
     half, row = circles.T
@@ -140,7 +139,7 @@ def _cells(circles: IntArray, pattern: Circles) -> IntArray:
 
 
 def _places(circles: IntArray, empty: IntArray, board: Board) -> Iterator[_Place]:
-    """Yield the places in the board that circles of one numbering can have."""
+    """Yield the possible places on the board of circles in one numbering."""
     pattern = board.pattern
     staggered = isinstance(pattern, Circles) and pattern.staggered
     columns, rows = board.size
@@ -167,7 +166,7 @@ def _places(circles: IntArray, empty: IntArray, board: Board) -> Iterator[_Place
 
 
 def _empty_line(at: IntArray, empty: IntArray, there: BoolArray) -> bool:
-    """Return whether the line of the board before or after all circles `at` is seen, and is empty."""
+    """Return whether the line of the board before or after all circles `at` is visible and empty."""
     for axis, points in enumerate((there.sum(axis=0), there.sum(axis=1))):
         for line in (at[:, axis].min() - 1, at[:, axis].max() + 1):
             if 0 <= line < len(points) and (empty[:, axis] == line).sum() > EMPTY_LINE * points[line]:
@@ -176,13 +175,13 @@ def _empty_line(at: IntArray, empty: IntArray, there: BoolArray) -> bool:
 
 
 def _key(grid: IntArray, board: Board) -> tuple[int, ...]:
-    """Return what is the same for all places that look the same when the board is turned: which cells are taken."""
+    """Return a key, the occupied cells, that is the same for all places that look the same when the board is turned."""
     turned = (grid_turned(grid, board.size, turns) for turns in (0, *board.turns))
     return min(tuple(np.sort(cells @ [1, board.columns]).tolist()) for cells in turned)
 
 
 def _upright(grid: IntArray, pixels: FloatArray) -> float:
-    """Return how nearly columns run to the right and rows down."""
+    """Return how closely columns are directed to the right and rows downwards, at most 2."""
     centred = grid - grid.mean(axis=0)
     slope = np.linalg.lstsq(centred.astype(np.float64), pixels - pixels.mean(axis=0), rcond=None)[0]
     slope = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)

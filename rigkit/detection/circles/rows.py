@@ -1,4 +1,4 @@
-"""Some rows, and all rows together, of classes whose members are arrays of one row for each circle."""
+"""Selection and concatenation of the rows of classes whose members are arrays with one row per circle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Rows = TypeVar("Rows", CircleFit, PlaneMap)
 
 
 def rows_of(table: Rows, which: BoolArray) -> Rows:
-    """Return some rows of a class of arrays."""
+    """Return the rows `which` of a class of arrays."""
     return type(table)(**{name: getattr(table, name)[which] for name in _names(table)})
 
 

@@ -1,7 +1,7 @@
-"""A second look at a board of circles through its calibrated camera: exact maps, and the circles that were missed.
+"""A second fit of a circle grid with a calibrated camera: with exact maps, and with missed circles added.
 
-The pose of the board says how the lens shows the plane around every circle, at the rim of a grid as well as in its
-middle, where neighbours on one side alone tell it less well (`local_map`).
+The pose of the board gives the map of the plane around every circle, at the rim of a grid as accurately as in its
+middle; a map from neighbours (`local_map`) is less accurate where these are on one side only.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.circles import BESIDE
 
 MIN_POSE_CIRCLES = 12
-"""Circles found that tell the pose of a board."""
+"""Smallest number of circles from which the pose of a board is estimated."""
 MISSED_DISTANCES = 0.1
-"""A camera whose pose of the board misses circles by more (median, in distances of neighbours) did not see it."""
+"""Largest median residual of the board's pose for the camera that took the image, in distances of neighbours."""
 
 
 def seen_through(
     grey: GreyImage, found: CircleGrid, placed: BoardDetection, board: Board, camera: Camera
 ) -> BoardDetection:
-    """Return `placed`, the grid `found` on the board, fitted with the maps of the camera, and circles that it missed.
+    """Return `placed`, the grid `found` on the board, fitted with the camera's maps, and with missed circles added.
 
-    As it is where the camera cannot have taken the image.
+    It is returned unchanged if the camera cannot have taken the image.
     """
     pattern = board.pattern
     pose = _pose(placed, board, camera)
@@ -94,7 +94,7 @@ def _pose(placed: BoardDetection, board: Board, camera: Camera) -> Rigid3 | None
 def _maps(
     camera: Camera, pose: Rigid3, points: FloatArray, radius_mm: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Return pixels (N, 2), first (N, 2, 2) and second (N, 2, 3) differences over a radius, px, and what is valid."""
+    """Return pixels (N, 2), first (N, 2, 2) and second (N, 2, 3) differences over a radius, px, and validity (N,)."""
     step = radius_mm * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]])
     around = points[:, None] + np.pad(step, ((0, 0), (0, 1)))
     seen, valid = camera.project(pose.apply(around.reshape(-1, 3)))

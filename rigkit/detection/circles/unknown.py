@@ -1,4 +1,4 @@
-"""Circle grids that nobody has described: layout, counts, polarity and the size of circles from what is seen."""
+"""Unknown circle grids: layout, size, polarity and size of the circles, from the grids found in images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rigkit.detection.circles.place import may_be_part, placed_on
 from rigkit.detection.saddles.response import GreyImage
 
 MIN_SIDE_CIRCLES = 3
-"""Rows and columns of the smallest grid that is told."""
+"""Number of rows and columns of the smallest grid that is recognised."""
 
 
 @dataclass(eq=False, slots=True)
@@ -24,10 +24,10 @@ class CircleObservations:
 
     Attributes
     ----------
-    boards : how many images show each board whole; of distance 1 mm, without the circles' size.
-    bounded : how many of these show that it does not go on beyond the image's border.
+    boards : number of images with each whole board, of distance 1 mm, without the circles' size.
+    bounded : number of these in which the board cannot extend beyond the image's border.
     diameters : of the circles, in distances of neighbours.
-    shown : for each image that shows a whole grid its index and the boards that this can be.
+    shown : index of each image with a whole grid, and the boards that this can be.
     """
 
     boards: Counter[tuple[str, int, int, str, bool]] = field(default_factory=Counter)
@@ -36,7 +36,7 @@ class CircleObservations:
     shown: list[tuple[int, set[tuple[str, int, int, str, bool]]]] = field(default_factory=list)
 
     def look(self, index: int, image: GreyImage) -> bool:
-        """Look for grids in an image; say whether it shows one."""
+        """Search an image for grids; return whether it has a whole one."""
         grids = find_grids(image)
         if not grids:
             return False
@@ -50,7 +50,7 @@ class CircleObservations:
 
 
 def _kinds(grid: CircleGrid) -> Iterator[tuple[str, int, int, str, bool]]:
-    """Yield layout, columns, rows, stagger and polarity of the boards that have as many circles."""
+    """Yield layout, columns, rows, stagger and polarity of the boards with as many circles."""
     count = len(grid)
     for rows in range(MIN_SIDE_CIRCLES, count // MIN_SIDE_CIRCLES + 1):
         if count % rows:
@@ -59,7 +59,7 @@ def _kinds(grid: CircleGrid) -> Iterator[tuple[str, int, int, str, bool]]:
         if grid.hexagonal:
             yield from (("hexagonal", columns, rows, stagger, grid.bright) for stagger in STAGGERS)
             continue
-        # Seen from the side, a regular grid is the same with columns for rows.
+        # Rotated by 90 degrees, a regular grid is the same with rows and columns exchanged.
         if columns >= rows:
             yield "regular", columns, rows, STAGGERS[0], grid.bright
         yield from (("asymmetric", columns, rows, stagger, grid.bright) for stagger in STAGGERS)
@@ -76,7 +76,7 @@ def _whole(grid: CircleGrid, kind: tuple[str, int, int, str, bool]) -> bool:
 
 
 def _goes_on(grid: CircleGrid, kind: tuple[str, int, int, str, bool]) -> bool:
-    """Return whether the image's border may cut off a row or column more."""
+    """Return whether the image's border may cut off another row or column."""
     layout, columns, rows, _, bright = kind
     staggers = STAGGERS if layout != "regular" else STAGGERS[:1]
     larger = ((columns + 1, rows), (columns, rows + 1))
@@ -84,11 +84,11 @@ def _goes_on(grid: CircleGrid, kind: tuple[str, int, int, str, bool]) -> bool:
 
 
 def guessed_circles(seen: CircleObservations) -> tuple[Board, tuple[int, ...]] | None:
-    """Return the grid that most images show whole, with circles 1 mm apart in a row, and which images; None for none.
+    """Return the grid that most images show whole, with circles 1 mm apart in a row, and their indices; None for none.
 
-    Images that show paper all around count first: what the border of an image cuts looks like a whole grid of fewer
-    rows. Where none does, or as many do, the larger grid is the whole one. A grid that looks the same from its other
-    end is told staggered to the right.
+    Images with paper all around it have priority: a grid cut by the border of an image looks like a whole one with
+    fewer rows. If there are none, or as many, the larger grid is the whole one. A grid that looks the same from its
+    other end is reported as staggered to the right.
     """
     if not seen.boards:
         return None
