@@ -6,7 +6,7 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, IntArray, Points
+from rigkit.core.arrays import IntArray, Points
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.core.patterns.base import Ink, Pattern
@@ -75,7 +75,7 @@ class Board:
 
     @property
     def corner_count(self) -> int:
-        """Number of places of the index grid, of which a pattern may leave some empty."""
+        """Number of points."""
         return self.columns * self.rows
 
     @property
@@ -94,13 +94,9 @@ class Board:
         return 2 in self.turns
 
     def grid(self) -> IntArray:
-        """Return (column, row) of all places of the index grid, (columns * rows, 2), row by row."""
+        """Return (column, row) of all points, (columns * rows, 2), row by row."""
         row, column = np.divmod(np.arange(self.corner_count), self.columns)
         return np.stack([column, row], axis=-1)
-
-    def exists(self) -> BoolArray:
-        """Return which places of `grid()` have a point, (columns * rows,)."""
-        return self.pattern.exists(self.columns, self.rows).ravel()
 
     def index(self, grid: IntArray) -> IntArray:
         """Return the indices (N,) of points `grid` (N, 2) in `grid()` and `points()`."""

@@ -140,7 +140,7 @@ def _placed(
     towards = np.stack([x, np.cross(rays, x), rays], axis=-1)
     rotation = towards @ facing
     translation = rays * distance[:, None] - rotation @ middle
-    held = HeldBoards(board.points(), rotation, translation, np.tile(board.exists(), (len(rays), 1)))
+    held = HeldBoards(board.points(), rotation, translation, np.ones((len(rays), board.corner_count), bool))
     return held, np.asarray(seen & np.isfinite(distance))
 
 

@@ -111,10 +111,6 @@ class Pattern(ABC):
         first."""
         return np.asarray(grid, dtype=np.float64)
 
-    def exists(self, columns: int, rows: int) -> BoolArray:
-        """Return which places of the index grid (rows, columns) have a point."""
-        return np.ones((rows, columns), dtype=bool)
-
     def turns(self, columns: int, rows: int, even: bool) -> tuple[int, ...]:
         """Return the rotational symmetries as quarter turns of 1, 2 and 3; `even`: both sides of a square are equal."""
         return ()

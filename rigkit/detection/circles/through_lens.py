@@ -50,7 +50,7 @@ def seen_through(
         return placed
     nearest_mm = pattern.nearest_mm(board.squares_mm)
     radius_mm = found.radius * nearest_mm if pattern.diameter_mm is None else 0.5 * pattern.diameter_mm
-    grid = board.grid()[board.exists()]
+    grid = board.grid()
     points = board.points(grid)
     expected, maps, curvatures, valid = _maps(camera, pose, points, radius_mm)
     spacing = np.sqrt(np.abs(np.linalg.det(maps))) * nearest_mm / radius_mm

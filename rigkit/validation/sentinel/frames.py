@@ -68,7 +68,7 @@ class Frames:
             axis=1,
         )
         seen[:, c] = True
-        corners = [own[:, None] & board.exists() for own in seen.T]
+        corners = [np.tile(own[:, None], board.corner_count) for own in seen.T]
         count = np.ones(len(held), dtype=np.int64)
         gained = board_information(monitored, board, in_rig.rotation, in_rig.translation_mm, corners)
         return cls(in_rig.rotation, in_rig.translation_mm, number * count, seen, c * count, gained)
