@@ -209,7 +209,7 @@ def test_the_causes_add_up_and_the_worst_is_named_first(rng: np.random.Generator
     assert sum(certificate.shares().values()) == pytest.approx(1.0)
     assert max(certificate.shares(), key=lambda cause: certificate.shares()[cause]) == "board scale"
     advice = certificate.findings[-1]
-    assert "to halve the worst error: board scale make" in advice.message
+    assert "to halve the worst error: board scale makes" in advice.message
     assert 0.0 < certificate.share_within(certificate.median) < certificate.share_within(certificate.worst) == 1.0
 
 

@@ -144,7 +144,8 @@ def _how_to_halve(shares: Mapping[str, float], certificate: Certificate) -> str:
 
 
 def _remedy(cause: str, factor: float, share: float, scale_percent: float) -> str:
-    part = f"{cause} make {100.0 * share:.0f} % of the variance"
+    verb = "makes" if cause in (OF_SCALE, OF_DISTANCE) else "make"
+    part = f"{cause} {verb} {100.0 * share:.0f} % of the variance"
     times = f"{int(np.ceil(factor)):d} times"
     root = f"{np.sqrt(factor):.1f} times"
     remedies: dict[str, str] = {
