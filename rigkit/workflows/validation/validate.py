@@ -104,8 +104,7 @@ class DatasetValidation:
     @property
     def passed(self) -> bool:
         """Whether every pair was validated and passes all checks."""
-        checked = all(r.passed for r in self.reports) and all(r.passed for r in self.crosschecks)
-        return checked and not self.failures
+        return bool(self.page.passed)
 
 
 def validate_dataset(
@@ -124,16 +123,15 @@ def validate_dataset(
         _validate, known, options, what="reconstructing and validating pairs", progress=progress
     )
     compared = [pair.crosscheck for pair in pairs if pair.crosscheck is not None]
-    passed = not failures and all(r.passed for pair in pairs for r in pair.reports) and all(r.passed for r in compared)
     causes = [cause for pair in pairs for cause in pair.causes]
     causes += diagnose([pair.best for pair in pairs])
     causes += [f"pair '{report.pair_id}': {words}" for report in compared for words in report.diagnosis]
-    severity = Severity.LOOK if passed else Severity.BAD
     seconds = time.monotonic() - started
     page, files = validation_files(
         known, cameras, pairs, failures, paper, causes=causes, options=options, seconds=seconds
     )
     write_for(known, options, files)
+    severity = Severity.LOOK if page.passed else Severity.BAD
     return DatasetValidation(
         pairs=tuple(pairs),
         failures=failures,
