@@ -12,11 +12,10 @@ import numpy as np
 
 from rigkit.calibration.rig.solving.solver import rig_normal
 from rigkit.calibration.rig.solving.state import RigObservations, RigState
+from rigkit.calibration.solving.evidence import chance_limit
 from rigkit.calibration.solving.shape import SHAPES
 from rigkit.core.arrays import FloatArray
 
-CHANCE_SIGMAS = 3.0
-"""A richer shape is significant if it lowers the cost by this many standard deviations more than expected by chance."""
 STEP_DAMPING = 1e-12
 """Damping of the step: undetermined unknowns are not changed."""
 
@@ -39,7 +38,7 @@ def shape_error(observations: RigObservations, state: RigState, sigma_px: float)
         normal = rig_normal(replace(observations, shape=shape), replace(state, unknowns=unknowns), sigma_px)
         step = normal.step(STEP_DAMPING)
         more = shape.count - observations.shape.count
-        if step is None or step.predicted < sigma_px**2 * (more + CHANCE_SIGMAS * np.sqrt(2.0 * more)):
+        if step is None or step.predicted < sigma_px**2 * chance_limit(more):
             break
         found = step.globals[:count]
     return found

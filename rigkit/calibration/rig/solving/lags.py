@@ -20,13 +20,14 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.rig.certainty.frame_covariance import frame_covariance, residual_sigma
-from rigkit.calibration.rig.solving.flatness import CHANCE_SIGMAS, STEP_DAMPING
+from rigkit.calibration.rig.solving.flatness import STEP_DAMPING
 from rigkit.calibration.rig.solving.moments import Lag, Moments, ways_through
 from rigkit.calibration.rig.solving.pose_jacobians import at_own_moment
 from rigkit.calibration.rig.solving.shutters import read_on, readout_steps
 from rigkit.calibration.rig.solving.solver import rig_normal, solve_rig
 from rigkit.calibration.rig.solving.state import Key, RigObservations, RigState
 from rigkit.calibration.solving.clustered import LARGE_FREEDOM
+from rigkit.calibration.solving.evidence import chance_limit
 from rigkit.calibration.solving.linearise import normal_equations
 from rigkit.calibration.solving.solver import FROM_OPTIMUM, Solution
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
@@ -149,7 +150,7 @@ def _asked(observations: RigObservations, state: RigState, start: Moments, sigma
     state = replace(state, moments=start)
     normal, more = rig_normal(observations, state, sigma_px), len(state.cameras) - 1
     step, before = normal.step(STEP_DAMPING), normal.cost / max(2 * observations.corner_count, 1)
-    limit = max(before, sigma_px**2) * (more + CHANCE_SIGMAS * np.sqrt(2.0 * more))
+    limit = max(before, sigma_px**2) * chance_limit(more)
     return step is not None and step.predicted > limit
 
 
