@@ -133,10 +133,10 @@ def tracked(paths: Sequence[Path], board: Board, calibration: Path, body: Path, 
     ]
     moments = [float(Path(view.image).stem) for view in views]
     fitted = hand_eye(camera, views, [hand.at(t).inverse() @ stand.at(t) for t in moments])
-    angles = np.degrees(fitted.apart_rad)
+    off_mm, angles = fitted.translation_residuals_mm, np.degrees(fitted.rotation_residuals_rad)
     print(
-        f"{len(moments)} images: median {np.median(fitted.apart_mm):.2f} mm, {np.median(angles):.3f} deg; "
-        f"largest {fitted.apart_mm.max():.2f} mm, {angles.max():.3f} deg"
+        f"{len(moments)} images: median {np.median(off_mm):.2f} mm, {np.median(angles):.3f} deg; "
+        f"largest {off_mm.max():.2f} mm, {angles.max():.3f} deg"
     )
 
 

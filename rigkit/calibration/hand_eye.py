@@ -55,8 +55,8 @@ class HandEye:
     freedom : its degrees of freedom; quoted standard deviations account for them (`widening`).
     rms_px : 2-D RMS of all corners.
     image_rms_px : the same of each image.
-    apart_mm, apart_rad : (N,) for the images used, in their order: distance of the board's centre, and rotation angle,
-        between the board's pose seen by the camera and that predicted from the robot.
+    translation_residuals_mm, rotation_residuals_rad : (N,) for the images used, in their order: distance of the board's
+        centre, and rotation angle, between the board's pose seen by the camera and that predicted from the robot.
     left_out : for each image left out, by how much (rad) its rotations differ from the robot's.
     """
 
@@ -66,8 +66,8 @@ class HandEye:
     freedom: float
     rms_px: float
     image_rms_px: dict[str, float]
-    apart_mm: FloatArray
-    apart_rad: FloatArray
+    translation_residuals_mm: FloatArray
+    rotation_residuals_rad: FloatArray
     left_out: dict[str, float]
 
     __repr__ = brief
@@ -113,7 +113,7 @@ def hand_eye(camera: Camera, views: Sequence[BoardView], mount_from_stand: Seque
         problem.views[i].image: float(np.sqrt(squared[problem.image == i].sum(axis=1).mean()))
         for i in range(len(problem.views))
     }
-    apart_mm, apart_rad = _residuals(*found.state, problem, [seen[i] for i in use])
+    off_mm, turned_rad = _residuals(*found.state, problem, [seen[i] for i in use])
     return HandEye(
         cam_from_mount=found.state[0],
         stand_from_board=found.state[1],
@@ -122,8 +122,8 @@ def hand_eye(camera: Camera, views: Sequence[BoardView], mount_from_stand: Seque
         freedom=effective_freedom(min(known.freedom, len(use) - UNKNOWNS / 6), known.overdispersion, UNKNOWNS),
         rms_px=float(np.sqrt(squared.sum(axis=1).mean())),
         image_rms_px=by_image,
-        apart_mm=apart_mm,
-        apart_rad=apart_rad,
+        translation_residuals_mm=off_mm,
+        rotation_residuals_rad=turned_rad,
         left_out={views[i].image: float(mismatch[i]) for i in range(len(views)) if i not in use},
     )
 

@@ -43,8 +43,8 @@ def run(args: argparse.Namespace) -> int:
     print(pose_in_words(second, result.stand_from_board, turns[1], moves[1]))
     print(
         f"{len(result.image_rms_px)} images, RMS {result.rms_px:.3f} px; boards as seen are "
-        f"{np.median(result.apart_mm):.2f} mm and {np.degrees(np.median(result.apart_rad)):.3f} deg (medians) from "
-        "where the poses have them"
+        f"{np.median(result.translation_residuals_mm):.2f} mm and "
+        f"{np.degrees(np.median(result.rotation_residuals_rad)):.3f} deg (medians) from where the poses have them"
     )
     for image, mismatch in result.left_out.items():
         print(f"left out: '{image}' turned otherwise than the robot, by {np.degrees(mismatch):.1f} degrees")

@@ -221,8 +221,8 @@ def hand_eye_text(result: HandEye, options: HandEyeOptions) -> str:
         "freedom": result.freedom,
         "rms_px": result.rms_px,
         "image_rms_px": result.image_rms_px,
-        "median_apart_mm": float(np.median(result.apart_mm)),
-        "median_apart_deg": float(np.degrees(np.median(result.apart_rad))),
+        "median_apart_mm": float(np.median(result.translation_residuals_mm)),
+        "median_apart_deg": float(np.degrees(np.median(result.rotation_residuals_rad))),
         "left_out_deg": {name: float(np.degrees(value)) for name, value in result.left_out.items()},
     }
     return json_text(data)

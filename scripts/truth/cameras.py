@@ -240,6 +240,7 @@ def _pose_rows(
 ) -> Iterator[Row]:
     fitted = hand_eye(camera, views, stands)
     how = f"median of {len(views)} images after one hand-eye fit"
-    off_mm, turned = float(np.median(fitted.apart_mm)), float(np.degrees(np.median(fitted.apart_rad)))
+    off_mm = float(np.median(fitted.translation_residuals_mm))
+    turned = float(np.degrees(np.median(fitted.rotation_residuals_rad)))
     yield bench.row("board against motion capture", tool, off_mm, "mm", variant=variant, how=how)
     yield bench.row("board's turn, likewise", tool, turned, "deg", variant=variant, how=how)
