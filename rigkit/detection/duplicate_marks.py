@@ -1,4 +1,4 @@
-"""Boards alike in one image: nothing tells whose marks are whose."""
+"""Identical boards in one image, whose marks cannot be told from each other."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from rigkit.detection.tags.markers import MIN_MARKER_LIKENESS
 from rigkit.detection.tags.quads import quadrilaterals
 
 DUPLICATES_REMEDY = "print one with other numbers (first_marker, first_tag), or show one at a time"
-"""What is to be done about boards that nothing tells apart."""
+"""What to do about identical boards."""
 
 MIN_DUPLICATES, MIN_SHARE_OF_DUPLICATES = 3, 0.05
-"""Marks that are seen twice, and of all that are seen: some may be misread, of hundreds in REAL images up to three."""
+"""Smallest number and share of marks at two places: some may be misread, of hundreds in REAL images up to three."""
 
 MIN_SEPARATION_SIDES = 1.5
-"""The same mark is not seen in two places so far apart, in sides of it: at its outer and inner border it is."""
+"""Smallest distance of two places of a mark, in its sides: one mark is found at its outer and its inner border."""
 
 
 def duplicate_boards(image: NDArray[np.generic], boards: Sequence[Board]) -> str | None:
-    """Return what is said of the first of `boards` whose marks are seen twice in an image, of which one is taken; None
-    without one."""
+    """Return a message on the first of `boards` whose marks are at two places in an image, of which one is used; None
+    if there is none."""
     grey = without_mosaic(grey_image(image))
     for board in boards:
         if board.identified and _have_duplicates(*_marks(grey, board)):
@@ -42,7 +42,7 @@ def duplicate_boards(image: NDArray[np.generic], boards: Sequence[Board]) -> str
 
 
 def _marks(grey: GreyImage, board: Board) -> tuple[FloatArray, IntArray]:
-    """Return the corners (N, 4, 2) of the marks of a board that are seen, and their numbers (N,)."""
+    """Return the corners (N, 4, 2) of the visible marks of a board, and their numbers (N,)."""
     pattern = board.pattern
     if isinstance(pattern, AprilGrid):
         codes, least = Codes.of(pattern, pattern.numbers(*board.size).ravel()), MIN_LIKENESS
@@ -56,7 +56,7 @@ def _marks(grey: GreyImage, board: Board) -> tuple[FloatArray, IntArray]:
 
 
 def _have_duplicates(quads: FloatArray, numbers: IntArray) -> bool:
-    """Return whether so many marks are seen in two places that they are of two boards."""
+    """Return whether so many marks are at two places that they are of two boards."""
     middle, side = quads.mean(axis=1), np.linalg.norm(quads[:, 1] - quads[:, 0], axis=1)
     away = np.linalg.norm(middle[:, None] - middle, axis=2) > MIN_SEPARATION_SIDES * np.maximum(side[:, None], side)
     twins = len(np.unique(numbers[((numbers[:, None] == numbers) & away).any(axis=1)]))

@@ -1,5 +1,5 @@
-"""What a ChArUco board is beyond the markers that were read: of the pattern of today or the one before, and with rows
-whose markers blur or the frame hides. The corners of the board say where its markers must be."""
+"""The pattern (today's or the former one) and the number of rows of a ChArUco board that the markers that were read
+leave open. The corners of the board determine the places of all its markers, also of blurred or hidden ones."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.in_squares import brightness_at, likeness_at
 
 IMAGES_OF_PATTERN = 8
-"""Images that are asked which of two patterns a board has, where the places of its markers do not tell."""
+"""Number of images from which the pattern is determined."""
 
 SURE_OF_PATTERN = 3.0
-"""They tell where this many standard deviations speak for one of the two."""
+"""Smallest difference of both patterns, in standard deviations, that determines the pattern."""
 
 IMAGES_OF_ROWS = 4
-"""Images that are asked whether a board has more rows than were read."""
+"""Number of images in which the next row is searched for."""
 
 LIKE_LAST = 0.4
-"""The places beyond the last row that was read are like markers by so much of what that row is like its own, two
-standard deviations more or less, or nothing is told. REAL boards, as they are, blurred by up to 4 px or with squares
-that run over: 0.6 to 1.0 where there is one more row, -0.4 to 0.2 where there is none."""
+"""Limit of the likeness of the places beyond the last row read to markers, relative to that row's, undecided within two
+standard deviations. REAL boards, original, blurred by up to 4 px or with squares that spread: 0.6 to 1.0 if there is
+one more row, -0.4 to 0.2 if there is none."""
 
 PERCENT_INK_PAPER = (10.0, 90.0)
 """Percentiles of the brightness of the modules of markers: at least a fifth of them are paper, more than half ink."""
 
 LIKE_PAPER, MAX_UNEVEN, AS_UNEVEN = 0.7, 0.2, 0.5
-"""Bare paper is brighter than this, 0 for the ink and 1 for the paper of the markers beside it, and scatters by less
-than this part of their scatter. Beyond the last rows of 3 boards in 26 REAL images: 0.8 to 1.7; below 0.15, but for
-squares in which a shadow, a fold or the end of the paper lies, 0.15 to 0.36; markers 0.95 and more. What is too uneven
-is asked how like markers it is; where some is half as uneven as markers, paper beside it may be a cover."""
+"""Bare paper is brighter than LIKE_PAPER, 0 for the ink and 1 for the paper of adjacent markers, and scatters by less
+than MAX_UNEVEN of their scatter. Beyond the last rows of 3 boards in 26 REAL images: 0.8 to 1.7; below 0.15, except for
+squares with a shadow, a fold or the end of the paper, 0.15 to 0.36; markers 0.95 and more. Less even squares are
+compared with markers; if one scatters by more than AS_UNEVEN, the paper beside it may be a cover."""
 
 
 def of_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> tuple[Board, bool]:
-    """Return the board of the pattern of today or of the one before it, and whether the images tell which.
+    """Return the board with today's or the former pattern, and whether the images determine which.
 
-    Where a row has an odd number of squares, the two are numbered alike but for one marker in every second row, which
-    has its place at one end or at the other: there that marker is like what is seen, or it is not.
+    If a row has an odd number of squares, only one marker in every second row differs: it is at one end of the row or
+    at the other, where its likeness decides.
     """
-    # With an even number of rows of corners both are one board.
+    # With an even number of rows of corners both patterns are the same board.
     if len({_squares_of(board).tobytes() for board in boards}) == 1:
         return boards[0], True
     some = images[:: -(-len(images) // IMAGES_OF_PATTERN)]
@@ -56,11 +56,11 @@ def of_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> tuple[Bo
 
 
 def next_row(board: Board, images: Sequence[GreyImage]) -> bool | None:
-    """Say whether images show one more row of squares than a board has; None where they do not tell: none shows its
-    place, or its markers could not be recognised."""
+    """Return whether images show one more row of squares than a board has; None if they do not determine it, because
+    its place is not visible, or its markers could not be recognised."""
     pattern = board.pattern
     assert isinstance(pattern, Charuco)
-    # Two more, so that its first square has the same colour.
+    # Two rows more, so that its first square has the same colour.
     dictionary = largest_dictionary(pattern.dictionary)
     taller = replace(board, rows=board.rows + 2, pattern=replace(pattern, dictionary=dictionary))
     squares = pattern.places(*taller.size)
@@ -78,7 +78,7 @@ def next_row(board: Board, images: Sequence[GreyImage]) -> bool | None:
         pixels = found.lattice()[: board.rows + 1]
         likeness = likeness_at(image, pixels, squares, numbers, taller)
         bright = brightness_at(image, pixels, squares, taller)
-        # What is even may also be a cover, or outside of the picture that a corrected image holds.
+        # An even place may also be covered, or outside of the valid part of a corrected image.
         likeness[likeness == 0.0] = np.nan
         likeness[~last & _blank(bright, squares[:, 0], last & np.isfinite(likeness))] = 0.0
         return likeness
@@ -89,8 +89,8 @@ def next_row(board: Board, images: Sequence[GreyImage]) -> bool | None:
 
 
 def _blank(bright: FloatArray, columns: IntArray, marked: BoolArray) -> BoolArray:
-    """Say which squares, by the brightness (N, K) of their modules, are bare paper beside those with markers; none
-    where others are as uneven as markers: the edge of a cover may cross these.
+    """Return which squares (N,) are bare paper beside those with markers, from the brightness (N, K) of their modules;
+    none if others are about as uneven as markers, as the edge of a cover may cross them.
 
     columns : (N,) of the squares.
     marked : (N,) those that have markers, in one row.
@@ -110,10 +110,10 @@ def _blank(bright: FloatArray, columns: IntArray, marked: BoolArray) -> BoolArra
 
 
 def _like_the_last(beyond: FloatArray, last: FloatArray) -> bool | None:
-    """Say whether squares beyond a row are like their markers as those of the row itself are; None: not told.
+    """Return whether squares beyond a row resemble their markers as much as those of the row itself; None if unknown.
 
-    Blank paper, of likeness 0, speaks against them, but not where other squares beyond rather are like their markers:
-    something white covers it there.
+    Blank paper, with likeness 0, is evidence against markers, unless other squares beyond the row resemble theirs: then
+    something white covers it.
     """
     if not len(last) or not len(beyond):
         return None
@@ -132,13 +132,13 @@ def _squares_of(board: Board) -> IntArray:
 
 
 def _for_the_second(boards: Sequence[Board], image: GreyImage) -> tuple[float, int]:
-    """Return by how much more the markers that two boards have in different places are like what is seen where the
-    second has them, in standard deviations of one, and at how many places."""
+    """Return by how much the likeness of the markers at different places on two boards is larger for the second, in
+    standard deviations of one marker, and the number of places."""
     found = next((item for item in detect_boards(image, boards[:1]) if item.board_id is not None), None)
     pattern = boards[0].pattern
     if found is None or not isinstance(pattern, Charuco):
         return 0.0, 0
-    # Where both have them in this board's grid: the second's may be moved by a column.
+    # The places of both on this board's grid: those of the second may be shifted by a column.
     own, others = (_squares_of(board) for board in boards)
     steps, counts = np.unique(own - others, axis=0, return_counts=True)
     others = others + steps[counts.argmax()]
