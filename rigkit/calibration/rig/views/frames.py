@@ -37,6 +37,8 @@ RIVAL = 3.0
 OTHER_RAD = 0.5
 """... by this angle: the wrong orientation of a board rotates the mount by 180 degrees, or by twice the board's
 tilt."""
+ROUNDING_OF_TARGETS = 1e-9
+"""Part of the distance by which exact targets differ: rounding."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -157,13 +159,13 @@ def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | 
     angle = rotation_angle(rotation[tried])
     # Of those that fit equally well, the one with the smaller rotation between the cameras is more likely.
     best = int(np.argmin(typical))
-    alike = np.flatnonzero(typical <= RIVAL * typical[best] + 1e-9)
+    alike = np.flatnonzero(typical <= RIVAL * typical[best] + ROUNDING_OF_TARGETS)
     turned = rotation_angle(rotation[tried[alike]] @ rotation[tried[best]].T)
     rivals = alike[turned > OTHER_RAD]
     ambiguous = len(rivals) > 0 and any(len(b.orientations) > 1 for _, b in pairs)
     if ambiguous:
         best = int(min([best, *rivals.tolist()], key=lambda m: angle[m]))
-    near = offs[best] <= AGREE * typical[best] + 1e-12
+    near = offs[best] <= AGREE * typical[best] + ROUNDING_OF_TARGETS
     middle = Rigid3(nearest_rotation(np.median(rotation[near], axis=0)), np.median(shift[near], axis=0))
     if not ambiguous:
         return middle, None
