@@ -93,7 +93,12 @@ def sigma_factors(corners: NoiseOfCorners, boards: int, rules: FactorRules) -> F
 
 
 def uneven_factors(corners: NoiseOfCorners, typical: FloatArray, rules: FactorRules) -> FloatArray:
-    """See `detection.subpixel.correlation.uneven_factors`."""
+    """Return the additional factor (N,) of each corner's sigma: 1, and more for corners whose windows show more than
+    noise.
+
+    A shadow edge, glare or a finger in the window causes residuals that are correlated over many pixels; the part of
+    them that looks like a shift of the corner is not in the residuals. `typical` (P,) are the boards' `sigma_factors`.
+    """
     return np.asarray(kernels().uneven_factors(*corners, typical, rules))
 
 

@@ -26,7 +26,7 @@ from rigkit.detection.guided.corner_fit import RADIUS_PX, fit_corners
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, grey_image
-from rigkit.detection.subpixel.correlation import shared_noise, with_uneven
+from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
@@ -200,8 +200,7 @@ def _settled(image: GreyImage, board: Board, state: BoardState, cells: BoolArray
 
 
 def _with_uneven(fit: EdgeFit, sides: FloatArray, board: Board) -> EdgeFit:
-    typical = shared_noise(fit, sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))
-    return with_uneven(fit, sides, RADIUS_PX, typical)
+    return with_uneven(fit, sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))[0]
 
 
 def _known_factor(found: BoardDetection, state: BoardState) -> float:

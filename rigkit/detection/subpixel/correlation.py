@@ -59,23 +59,10 @@ def sigma_factors(
     return edges.sigma_factors(_noise_of(fit, good, sides, owner), boards, factor_rules(radius_px))
 
 
-def uneven_factors(
-    fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray, typical: FloatArray, radius_px: float
-) -> FloatArray:
-    """Return the additional factor (N,) of each corner's sigma: 1, and more for corners whose windows show more than
-    noise.
-
-    A shadow edge, glare or a finger in the window causes residuals that are correlated over many pixels; the part of
-    them that looks like a shift of the corner is not in the residuals. `typical` (P,) are the factors of the boards,
-    the other arguments as in `sigma_factors`.
-    """
-    return edges.uneven_factors(_noise_of(fit, good, sides, owner), typical, factor_rules(radius_px))
-
-
 def board_factors(
     fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray, boards: int, radius_px: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return `sigma_factors` (P,) and `uneven_factors` (N,)."""
+    """Return `sigma_factors` (P,) and `edges.uneven_factors` (N,)."""
     noise, rules = _noise_of(fit, good, sides, owner), factor_rules(radius_px)
     factors = edges.sigma_factors(noise, boards, rules)
     return factors, edges.uneven_factors(noise, factors, rules)
@@ -90,20 +77,16 @@ def _noise_of(fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray)
     )
 
 
-def shared_noise(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bool) -> float:
-    """Return the `sigma_factors` of one board from the `fit` of its N corners, whose cells have `sides` (N, 2, 2).
+def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bool) -> tuple[EdgeFit, float]:
+    """Return the `fit` of a board's N corners, whose cells have `sides` (N, 2, 2), with sigmas multiplied by
+    `edges.uneven_factors`, and the board's `sigma_factors`, by which they are not.
 
-    The factor of a `marked` board, with markers in its squares, is 1: all its residuals count as noise.
+    That of a `marked` board, with markers in its squares, is 1: all its residuals count as noise.
     """
-    good, owner = fit.valid & (fit.contrast > 0.0), np.zeros(len(sides), np.int64)
-    return 1.0 if marked else float(sigma_factors(fit, good, sides, owner, 1, radius_px)[0])
-
-
-def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, typical: float) -> EdgeFit:
-    """Return the `fit` of a board's N corners with sigmas multiplied by `uneven_factors`; `typical` is the board's
-    factor, `sides` (N, 2, 2) are those of the cells."""
-    good, owner = fit.valid & (fit.contrast > 0.0), np.zeros(len(sides), np.int64)
-    return fit.less_sure(uneven_factors(fit, good, sides, owner, np.array([typical]), radius_px))
+    noise = _noise_of(fit, fit.valid & (fit.contrast > 0.0), sides, np.zeros(len(sides), np.int64))
+    rules = factor_rules(radius_px)
+    typical = np.ones(1) if marked else edges.sigma_factors(noise, 1, rules)
+    return fit.less_sure(edges.uneven_factors(noise, typical, rules)), float(typical[0])
 
 
 @functools.cache

@@ -26,7 +26,7 @@ from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage, pyramid
-from rigkit.detection.subpixel.correlation import shared_noise, with_uneven
+from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS
 from rigkit.detection.subpixel.refined import RefinedLattice
@@ -348,8 +348,7 @@ def _fitted(image: GreyImage, refined: RefinedLattice, board: Board, blur: float
     # A corner in a shadow or beside a finger has a large sigma, so that it does not bend its lines.
     curvatures = line_curvatures_to_fit(lattice.pixels, refined.sigma_px, known, shape.sides, RADIUS_PX)
     fit = fit_corners(image, board, known, shape, lattice.pixels[known], lattice.signs()[known], blur, curvatures)
-    shared = shared_noise(fit, shape.sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))
-    fit = with_uneven(fit, shape.sides, RADIUS_PX, shared)
+    fit, shared = with_uneven(fit, shape.sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))
 
     def spread(values: FloatArray) -> FloatArray:
         out = np.full((*known.shape, *values.shape[1:]), np.nan)
