@@ -54,7 +54,7 @@ class Goal:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Requirement:
-    """The `wanted` error of a goal, in its unit, and the camera it belongs to: "" where there is but one."""
+    """The `wanted` error of a goal, in its unit, and its name `whose` in messages: "" where there is but one."""
 
     goal: Goal
     wanted: float

@@ -220,7 +220,7 @@ def observations_of(seen: BoolArray, boards: tuple[Board, ...] = ()) -> Observat
 
 def lens_prior(camera: Camera) -> FloatArray:
     """Return the prior information (P, P) on any lens: square pixels, a roughly central axis, and a projection known to
-    a tenth of half the image's diagonal. It is negligible beside the views of a session."""
+    a tenth of half the image's diagonal. It is negligible compared with the views of a session."""
     rays, valid = camera.unproject(grid_pixels(camera.size_px, PRIOR_GRID).reshape(-1, 2))
     p = camera.parameters.size
     design = projection_design(camera, rays[valid])[:, :p]

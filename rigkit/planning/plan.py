@@ -56,7 +56,7 @@ class Plan:
 
 def covariance_of(information: FloatArray) -> FloatArray:
     """Return the inverses of information matrices (..., P, P), each scaled to a unit diagonal first: parameters differ
-    by many orders of magnitude. Singular directions get the variance that rounding errors allow."""
+    by many orders of magnitude. Eigenvalues of singular matrices are raised to the rounding error."""
     scale = 1.0 / np.sqrt(np.einsum("...pp->...p", information))
     unit = information * scale[..., :, None] * scale[..., None, :]
     try:

@@ -1,11 +1,11 @@
 """Changes since a calibration was trusted: images of that time correct it, and fresh ones are tested against it.
 
 theta are the parameters, C their covariance, and e the error of the calibration. The earlier images have the whitened
-score w = L^T e + noise (`whitened`). The estimate is e = G w with the gain G = C L (I + L^T C L)^-1; theta is corrected
-by it and keeps the covariance P = G G^T + (I - G L^T) C (I - G L^T)^T. A calibration from a file may have larger errors
-than C states, so C is inflated by w^T (I + L^T C L)^-1 w - R, the excess of chi-squared over its R degrees of freedom.
-Frames of one camera may also disagree by more than their points predict, because all points of a frame share errors of
-lens and scene. The variance is inflated by the disagreement within the earlier and within the fresh frames.
+score w = L^T e + noise (`whitened`). theta is corrected by e = G w, G = C L (I + L^T C L)^-1, and keeps the
+covariance G G^T + (I - G L^T) C (I - G L^T)^T. A calibration file may have larger errors than C states, so C is first
+multiplied by w^T (I + L^T C L)^-1 w - R, at least 1, with R scores: it then covers the error in every direction. Points
+of one frame share errors of lens and scene, so frames may disagree by more than their points predict: the variance is
+inflated by the disagreement among the earlier and among the fresh frames.
 
 Reference: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001),
 section 5.2.3 (the gain, and the Joseph form of the covariance, which stays positive semidefinite).

@@ -40,7 +40,7 @@ from rigkit.validation.sentinel.whitened import MIN_FREE_VARIANCE, disagreement
 
 FEATURES = 2500
 MIN_FRAME_MATCHES = 40
-"""Fewer matches of a frame may all lie on one surface, or be wrong."""
+"""Fewer matches of a frame may all lie on one surface, or be outliers."""
 PARTS = 4
 """Columns and rows of the parts of an image whose errors are treated as independent."""
 WELSCH_SIGMAS = 2.985
