@@ -278,6 +278,9 @@ def test_solutions_that_left_out_other_images_are_compared_on_those_of_both(
     assert module._better([before], [better]) and not module._better([before], [worse])
     assert module._better([before, before], [better, better]) and not module._better([before] * 2, [worse] * 2)
     assert not module._better([before], [found(every[:1], ripple)])
+    # Without folds nothing was held out.
+    before, again = (replace(one, chosen=replace(one.chosen, heldout=None)) for one in (before, better))
+    assert not module._better([before] * 2, [again] * 2)
 
 
 def test_a_rival_gone_astray_is_no_number_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
