@@ -13,7 +13,10 @@ from measure_covers import Score, cover, laid_over, scored
 from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
+from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.subpixel.consistent import checked
+from rigkit.detection.subpixel.refined import RefinedLattice
 
 BOARD = Board("b", 8, 6, 30.0, 30.0)
 MARKED = Board("b", 7, 7, 30.0, 30.0, pattern=Charuco("DICT_4X4_100", 22.5))
@@ -64,3 +67,15 @@ def test_outer_ends_of_squares_are_no_corners_of_a_row_that_is_not_there(seed: i
     assert found.board_id == "b"
     assert found.grid[:, 1].max() == 6
     assert len(found.grid) == 49
+
+
+def test_a_corner_that_has_no_other_beside_it_is_dropped() -> None:
+    pixels = 20.0 * np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), axis=-1)
+    known = np.arange(9) < 6 * np.ones((6, 1))
+    known[4:, 8] = True
+    lone = known.copy()
+    lone[0, 8] = True
+    pixels[~lone] = np.nan
+    ones = np.where(lone, 1.0, np.nan)
+    item = RefinedLattice(Lattice(pixels, 100.0 * ones, True), 0.02 * ones, 0.8 * ones, 2.0 * ones, 2.0 * ones)
+    assert np.array_equal(checked(item, [(slice(6), slice(9))]).lattice.known, known)
