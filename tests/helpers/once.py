@@ -35,7 +35,7 @@ def once_a_run(factory: pytest.TempPathFactory, name: str, make: Callable[[], Ma
 
 @contextmanager
 def _alone(lock: Path) -> Iterator[None]:
-    """Hold a lock that one process has at a time; without fcntl, on Windows, there is none and each process makes it."""
+    """Hold a lock that one process has at a time; on Windows, without fcntl, there is none: each makes its own."""
     with lock.open("w") as file:
         with suppress(ImportError):
             fcntl = importlib.import_module("fcntl")
