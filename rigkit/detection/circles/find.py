@@ -47,7 +47,7 @@ BLUR_ROUNDS = 3
 removes errors of up to 0.1 px (RENDERED, hexagonal, blur 3 px). The third, if the anisotropy of the blur changed, has
 it from the residuals of the second, and has circles that the neighbours' light had hidden."""
 MIXED_ROUNDS = 2
-"""Number of such rounds for circles always fitted with neighbours' light; each has sizes and anisotropy from the last."""
+"""Rounds for circles always fitted with neighbours' light; each has sizes and anisotropy from the last one."""
 FIRST_TOLERANCE = 2.0
 """Factor of the limits in the first fit: maps from the centroids of blobs are inaccurate at the rim of a grid."""
 MIN_UNEVEN, MAX_UNEVEN = 0.1, 0.9
