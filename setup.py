@@ -41,6 +41,8 @@ class build_kernels(build_ext):
             compiler = "ziglang"
         else:
             ext.extra_objects, ext.sources = self._objects(ext), []
+            # A library older than these is linked again.
+            ext.depends = ext.extra_objects
             super().build_extension(ext)
             compiler = " ".join(self.compiler.compiler_so[:1])
         BUILDING["write_record"](library, FOLDER, compiler)
