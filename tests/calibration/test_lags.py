@@ -12,6 +12,7 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.lags import times_of
 from rigkit.core.detections import BoardView
@@ -110,6 +111,16 @@ def test_images_are_read_row_by_row(tmp_path: Path) -> None:
     cameras = json.loads((tmp_path / "rig.json").read_text())["cameras"]
     assert [camera["readout"]["frames"] for camera in cameras] == [own.frames for own in rig.readouts.values()]
     assert list(load_saved_rig(tmp_path / "rig.json").cameras) == ["left", "right"]
+
+
+def test_rolling_shutters_that_predict_worse_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    def worse_with_readouts(joint: JointRig, folds: int) -> tuple[float, tuple[float, ...]]:
+        return (0.3 if joint.has_readouts else 0.2), (0.1, 0.1)
+
+    monkeypatch.setattr("rigkit.calibration.rig.calibrate.heldout_rms", worse_with_readouts)
+    rig = rig_of(0.05, 0, readout=0.05, time=lambda k: 0.5 * k)
+    assert rig.lags and not rig.readouts
+    assert rig.heldout_rms_px == 0.2
 
 
 def test_cameras_of_one_moment_have_no_lag() -> None:

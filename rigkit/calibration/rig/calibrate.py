@@ -19,7 +19,7 @@ from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig
 from rigkit.calibration.rig.heldout import heldout_rms
-from rigkit.calibration.rig.joint import BAD, solve_jointly
+from rigkit.calibration.rig.joint import BAD, JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.known import KnownCameras
 from rigkit.calibration.rig.verdicts import diagnose_rig
@@ -91,10 +91,25 @@ def calibrate_rig(
     if rigid_boards:
         every, notes = _on_rigid_boards(every, views, rigid_boards, options, progress)
     with _mistakes_named(every):
-        joint = solve_jointly(every, progress, known)
-    rig, far = assemble_rig(joint, heldout_rms(joint, folds))
+        joint, heldout = _predicting(every, options, progress)
+    rig, far = assemble_rig(joint, heldout)
     notes = (*same, *_mispaired(rig, every, joint.cost_sigmas), *notes, *joint.notes)
     return replace(rig, verdicts=diagnose_rig(rig, far, notes, in_force=options.in_force))
+
+
+def _predicting(
+    every: RigViews, options: _Options, progress: Progress
+) -> tuple[JointRig, tuple[float | None, tuple[float | None, ...]]]:
+    """Return the joint solution and its held-out errors, as `heldout_rms`. Rolling shutters are a part of it unless
+    held-out frames are predicted better without them."""
+    joint = solve_jointly(every, progress, options.known)
+    heldout = heldout_rms(joint, options.folds)
+    if joint.has_readouts and heldout[0] is not None:
+        global_shutter = solve_jointly(every, progress, options.known, readouts=False)
+        rms, each = heldout_rms(global_shutter, options.folds)
+        if rms is not None and rms < heldout[0]:
+            return global_shutter, (rms, each)
+    return joint, heldout
 
 
 def _on_rigid_boards(

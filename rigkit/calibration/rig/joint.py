@@ -95,6 +95,12 @@ class JointRig:
         return folds_of(pixels, frame, count)[self.frames]
 
     @property
+    def has_readouts(self) -> bool:
+        """Whether rolling shutters were estimated."""
+        moments = self.solution.state.moments
+        return moments is not None and bool(moments.readouts.any())
+
+    @property
     def shared_count(self) -> int:
         """Number of targets, counted in every frame, that several views share."""
         return len(shared_keys(self.views.seen))
@@ -115,8 +121,11 @@ def frame_numbers(views: RigViews, observations: RigObservations) -> IntArray:
     return np.array([number[name] for name in names], dtype=np.int64)
 
 
-def solve_jointly(views: RigViews, progress: Progress, known: KnownCameras | None = None) -> JointRig:
-    """Return the joint solution, without targets on which the cameras (or the target's boards) disagree.
+def solve_jointly(
+    views: RigViews, progress: Progress, known: KnownCameras | None = None, *, readouts: bool = True
+) -> JointRig:
+    """Return the joint solution, without targets on which the cameras (or the target's boards) disagree; with
+    `readouts` of rolling shutters if these are significant.
 
     Raises InputError where a camera shares no target with the others, DegenerateError where too few are left.
     """
@@ -132,7 +141,7 @@ def solve_jointly(views: RigViews, progress: Progress, known: KnownCameras | Non
         progress("rig", i, MAX_ROUNDS)
         _require_agreement(views, len(left_out), shared)
         observations, solution = _solved(views, mounts, sigma, known)
-        observations, solution = _with_lags(views, observations, solution, sigma)
+        observations, solution = _with_lags(views, observations, solution, sigma, readouts)
         cost = cost_of_sharing(observations, solution, seen)
         typical = typical_cost(cost, sigma)
         worse = bad_ones(cost, typical)
@@ -195,11 +204,11 @@ def _solved(
 
 
 def _with_lags(
-    views: RigViews, observations: RigObservations, solution: Solution[RigState], sigma: float
+    views: RigViews, observations: RigObservations, solution: Solution[RigState], sigma: float, readouts: bool
 ) -> tuple[RigObservations, Solution[RigState]]:
     """Return the observations and the solution, with the lags of cameras if they are significant."""
     times = times_of(observations.keys, {entry.key: entry.frame for own in views.seen for entry in own.values()})
-    return with_lags(observations, solution, sigma, times, frame_numbers(views, observations))
+    return with_lags(observations, solution, sigma, times, frame_numbers(views, observations), readouts=readouts)
 
 
 def _boards_px(seen: Sequence[FrameObservations]) -> float:

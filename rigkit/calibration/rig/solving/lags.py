@@ -60,12 +60,19 @@ def times_of(keys: Sequence[Key], frames: Mapping[Key, str]) -> FloatArray:
 
 
 def with_lags(
-    observations: RigObservations, solution: Solution[RigState], sigma_px: float, times: FloatArray, frames: IntArray
+    observations: RigObservations,
+    solution: Solution[RigState],
+    sigma_px: float,
+    times: FloatArray,
+    frames: IntArray,
+    *,
+    readouts: bool,
 ) -> tuple[RigObservations, Solution[RigState]]:
     """Return the observations corrected for rolling shutters, and the solution with lags and times of images; or both
     unchanged where the lags are not significant.
 
-    `times` (F,) of the keys, `sigma_px` as for `solve_rig`, `frames` as for `frame_covariance`.
+    `times` (F,) of the keys, `sigma_px` as for `solve_rig`, `frames` as for `frame_covariance`, `readouts`: whether
+    rolling shutters are looked for.
     """
     cameras, keys = len(observations.cameras), len(observations.keys)
     none = np.zeros((cameras, keys))
@@ -84,7 +91,7 @@ def with_lags(
             sigma = residual_sigma(observations, solution, sigma_px)
             if _chance_of_scatter(solution.state, observations, start, sigma) > CHANCE:
                 return observations, solution
-    return _with_readouts(observations, lagging, sigma_px, times)
+    return _with_readouts(observations, lagging, sigma_px, times) if readouts else (observations, lagging)
 
 
 def _solved_again(
