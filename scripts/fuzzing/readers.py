@@ -29,6 +29,12 @@ SMALL = Board("small", 5, 4, 30.0, 30.0)
 GUIDE = GuideOptions(boards=(SMALL,))
 
 
+def _replace(path: Path, name: str) -> None:
+    """Put the case in the place of a good file, which other cases share by a link: it may not be written into."""
+    Path(name).unlink(missing_ok=True)
+    shutil.copy(path, name)
+
+
 def read_vnl(path: Path) -> None:
     """Read corners of mrgingham, which are about one board."""
     read_corners(path, [SMALL])
@@ -53,7 +59,7 @@ def read_cache(path: Path) -> None:
 
 def calibrate_kept(path: Path) -> None:
     """Calibrate from corners that were kept beside a session whose images are gone."""
-    shutil.copy(path, "corners.json")
+    _replace(path, "corners.json")
     session = load_session(Path("gone.toml"))
     with contextlib.suppress(RigkitError):
         # The message is about the session: what was kept is no input of a person's.
@@ -62,7 +68,7 @@ def calibrate_kept(path: Path) -> None:
 
 def fetch_listed(path: Path) -> None:
     """List a catalogue with a damaged entry, and fetch it."""
-    shutil.copy(path, "catalogue/small.toml")
+    _replace(path, "catalogue/small.toml")
     for words in (["fetch"], ["fetch", "small", "-o", "out/set"]):
         assert main([*words, "--catalogue", "catalogue"]) in (0, 1, 2, 3), words
 
