@@ -11,11 +11,11 @@ from rigkit.io.manifests.rig_session import frames_of_images
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.folder_session import cameras_in
 
-Moments = list[list[Path]]
+ImagesByMoment = list[list[Path]]
 """The images of every moment, one per camera."""
 
 
-def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[Moments, list[Path]]:
+def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[ImagesByMoment, list[Path]]:
     """Return the moments of the cameras `names`, and the images without a partner.
 
     Sources are one folder per camera, named like the cameras or in their order; one folder, as for `cameras_in`; or the
@@ -43,7 +43,7 @@ def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[Moments, 
     return together([found[name] for name in names] if set(found) == set(names) else list(found.values()))
 
 
-def together(columns: Sequence[Sequence[Path]]) -> tuple[Moments, list[Path]]:
+def together(columns: Sequence[Sequence[Path]]) -> tuple[ImagesByMoment, list[Path]]:
     """Return the moments of which every camera has an image of the same name or number, and the images without a
     partner; images are paired in order where names give no pairs.
 
@@ -63,7 +63,7 @@ def together(columns: Sequence[Sequence[Path]]) -> tuple[Moments, list[Path]]:
     return [[own[frame] for own in frames] for frame in shared], single
 
 
-def _by_names(names: Sequence[str], images: Sequence[Path]) -> Moments:
+def _by_names(names: Sequence[str], images: Sequence[Path]) -> ImagesByMoment:
     """Return the moments of images whose names, or whose folders' names, are equal but for the camera's name; [] where
     some are not."""
     found: dict[tuple[str, str], dict[str, Path]] = {}
@@ -91,7 +91,7 @@ def _sides(names: Sequence[str], text: str, beside: str) -> dict[str, tuple[str,
     return out
 
 
-def _in_order(names: Sequence[str], images: Sequence[Path]) -> Moments:
+def _in_order(names: Sequence[str], images: Sequence[Path]) -> ImagesByMoment:
     if len(images) % len(names):
         raise InputError(
             f"{len(images)} different images, which are not moments of {len(names)} cameras each "
