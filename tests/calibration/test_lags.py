@@ -107,6 +107,7 @@ def test_images_are_read_row_by_row(tmp_path: Path) -> None:
     off, sigma = off_mm(rig)
     assert abs(off) < 3.0 * sigma < 0.2
     assert any("row by row" in printed.message for printed in rig.verdicts)
+    assert not any("not quite of one moment" in printed.message for printed in rig.verdicts)
     (tmp_path / "rig.json").write_text(rig_text(rig))
     cameras = json.loads((tmp_path / "rig.json").read_text())["cameras"]
     assert [camera["readout"]["frames"] for camera in cameras] == [own.frames for own in rig.readouts.values()]

@@ -128,6 +128,13 @@ def _uncertain(rig: RigCalibration, far: Sequence[FarProjection]) -> list[Findin
     return out
 
 
+def _timing(rig: RigCalibration) -> str:
+    """Return what may be wrong with the moments of the images, in words."""
+    if rig.lags:
+        return "the cameras' lags do not explain all of it"
+    return "the cameras were not quite of one moment"
+
+
 def _overdispersed(rig: RigCalibration, in_force: Collection[str]) -> list[Finding]:
     if rig.overdispersion <= OVERDISPERSED:
         return []
@@ -135,7 +142,7 @@ def _overdispersed(rig: RigCalibration, in_force: Collection[str]) -> list[Findi
     return [
         Finding.look(
             f"the frames disagree by {rig.overdispersion:.1f} times what the corners' scatter explains; all sigmas "
-            "count it in. Boards or lenses are not quite as the models say, or cameras not quite of one moment",
+            f"count it in. Boards or lenses are not quite as the models say, or {_timing(rig)}",
             (f"try {automatic}, or " if automatic else "take ") + "a flatter board",
         )
     ]
@@ -154,7 +161,7 @@ def _worse(rig: RigCalibration) -> list[Finding]:
         Finding.look(
             f"frames that took no part are off by {together / typical:.1f} times as much as for the cameras alone: "
             + (
-                "the cameras were not quite of one moment, or a mount gives way"
+                f"{_timing(rig)}, or a mount gives way"
                 if len(rig.cameras) > 1
                 else "the boards give way against each other"
             )
