@@ -191,9 +191,9 @@ def _preview(frame: NDArray[Any]) -> bytes:
     return bytes(cv2.imencode(".jpg", bgr)[1])
 
 
-def run_coach(options: CoachOptions, told: Callable[[str], None], progress: Progress = silent) -> None:
-    """Serve the coach's page on this machine until it is stopped; `told` is given its address, `progress` how much of
-    a recording has been looked at.
+def run_coach(options: CoachOptions, announce: Callable[[str], None], progress: Progress = silent) -> None:
+    """Serve the coach's page on this machine until it is stopped; `announce` is given its address, `progress` how much
+    of a recording has been looked at.
 
     Raises InputError for a folder or source that cannot be used, InstallationError without the extra `coach`.
     """
@@ -203,11 +203,15 @@ def run_coach(options: CoachOptions, told: Callable[[str], None], progress: Prog
     frames = _frames(options)
     # Files wait while those before them are calibrated; a person does not.
     with nullcontext() if options.watch or options.video else worker_pool(1) as pool:
-        _run(options, open_coach(options, told, pool), frames, told, progress)
+        _run(options, open_coach(options, announce, pool), frames, announce, progress)
 
 
 def _run(
-    options: CoachOptions, coach: Coach, frames: Iterator[Frame] | None, told: Callable[[str], None], progress: Progress
+    options: CoachOptions,
+    coach: Coach,
+    frames: Iterator[Frame] | None,
+    announce: Callable[[str], None],
+    progress: Progress,
 ) -> None:
     token = new_token()
     host = own_address() if options.lan else LOCALHOST
@@ -229,7 +233,7 @@ def _run(
                 coach.finish(missing)
         except RigkitError as error:
             coach.say(str(error))
-            told(str(error))
+            announce(str(error))
 
     if options.watch:
         coach.say(f"Waiting for pictures in {' and '.join(map(str, options.watch))}")
@@ -240,7 +244,7 @@ def _run(
 
     def ready(port: int) -> None:
         _log.info("open this page in a browser; Ctrl-C ends, and the same command goes on from there")
-        told(f"http://{host}:{port}/{token}/")
+        announce(f"http://{host}:{port}/{token}/")
 
     serve(app, EVERYWHERE if options.lan else LOCALHOST, options.port, ready)
 

@@ -167,9 +167,9 @@ def _register(
     register: Path, source: Path, check: SentinelCheck, before: Sequence[Sequence[Path]], temperature_c: float | None
 ) -> None:
     # Only the digest, without the words on how it was computed.
-    told = (digest_of_images([image for frame in before for image in frame]) or "").rpartition(": ")[2]
+    since = (digest_of_images([image for frame in before for image in frame]) or "").rpartition(": ")[2]
     place = as_seen_from(register, source)
-    entry = HistoryEntry.of_check(check, place, digest=digest_of(source), baseline=told, temperature_c=temperature_c)
+    entry = HistoryEntry.of_check(check, place, digest=digest_of(source), baseline=since, temperature_c=temperature_c)
     add_entry(register, entry)
 
 

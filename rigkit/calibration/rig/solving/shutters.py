@@ -47,7 +47,7 @@ def readout_steps(observations: RigObservations, state: RigState) -> tuple[Float
     """Return the corrections of the readouts of the n cameras, their standard deviations, clustered by view, with all
     but the views' poses held, and the degrees of freedom of these, (n,) each; zeros where hardly more than one view has
     information."""
-    found = [_step(*_told(observations, state, c)) for c in range(len(state.cameras))]
+    found = [_step(*_readout_information(observations, state, c)) for c in range(len(state.cameras))]
     step, sigma, freedom = np.array(found).T
     return step, sigma, freedom
 
@@ -71,7 +71,7 @@ def _step(score: FloatArray, information: FloatArray) -> tuple[float, float, flo
     return step, float(np.linalg.norm((score - step * information) / (1.0 - share))) / total, freedom
 
 
-def _told(observations: RigObservations, state: RigState, c: int) -> tuple[FloatArray, FloatArray]:
+def _readout_information(observations: RigObservations, state: RigState, c: int) -> tuple[FloatArray, FloatArray]:
     """Return score and information (V,) of every view of camera `c` on its readout, the view's pose eliminated."""
     motion, by_pose, residuals = _while_read(observations, state, c)
     weight = observations.weights[c][:, :, None]
