@@ -57,5 +57,14 @@ def test_frames_that_took_no_part_against_the_cameras_alone(
 ) -> None:
     """What a camera alone comes to is not known where its images were too few to hold some out."""
     single = [SimpleNamespace(heldout_rms_px=value) for value in alone]
-    rig = SimpleNamespace(single=single, cameras=single, heldout_rms_px=together)
+    rig = SimpleNamespace(single=single, cameras=single, heldout_rms_px=together, lags={})
     assert bool(_worse(cast(RigCalibration, rig))) == printed
+
+
+@pytest.mark.parametrize(("lags", "cause"), [({}, "not quite of one moment"), ({"wide": None}, "lags do not explain")])
+def test_solved_lags_are_not_named_as_a_cause_again(lags: dict[str, None], cause: str) -> None:
+    """Frames worse than the cameras alone are explained by moments only as far as those were not solved for."""
+    single = [SimpleNamespace(heldout_rms_px=value) for value in (0.1, 0.2)]
+    rig = SimpleNamespace(single=single, cameras=single, heldout_rms_px=0.3, lags=lags)
+    (finding,) = _worse(cast(RigCalibration, rig))
+    assert cause in finding.message
