@@ -1,6 +1,6 @@
 """rigkit: calibrate cameras and rigs, reconstruct oriented point clouds, and validate both.
 
-Layers, each of which imports only lower rows (tests/test_architecture.py checks this)::
+Layers, each of which imports only lower rows (tests/architecture/test_architecture.py checks this)::
 
     12  cli              one module for each verb: parse, call a workflow, print
     11  workflows        one function for each verb: typed options and results, no printing

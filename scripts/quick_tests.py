@@ -41,9 +41,9 @@ KEPT = (
     # Branches of C are not counted.
     "tests/kernels/",
     # These look at the code, they do not run it.
-    "tests/test_",
+    "tests/architecture/",
 )
-MAY_BE_MISSING = ("tests/real/", "test_own_readers.py", "_in_browser.py", "test_accessible.py")
+MAY_BE_MISSING = ("tests/real/", "_own_readers.py", "_in_browser.py", "_accessible.py")
 """Tests that are skipped where captures, a browser or another program are missing: others have to reach their lines."""
 WHOLE = ("tests/contracts/test_round_trips.py",)
 """Files left out as a whole, which the quick run need not even import: before its first test Hypothesis reads the

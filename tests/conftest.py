@@ -7,9 +7,13 @@ import gc
 import importlib
 import zlib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+
+if TYPE_CHECKING:
+    from rigkit import Calibration
 
 ROOT = Path(__file__).resolve().parents[1]
 THOROUGH = Path(__file__).with_name("thorough.txt")
@@ -69,6 +73,14 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("pictures")
     write_pictures(folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def calibration() -> Calibration:
+    """The calibration of the lens "reg" from 14 views of boards (SIMULATED)."""
+    from helpers.sentinel_scenes import calibrated_lens
+
+    return calibrated_lens()
 
 
 @pytest.fixture(autouse=True)

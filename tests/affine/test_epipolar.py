@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.affine_scenes import FISHEYE, REGULAR, Corners, angles_deg, see, special_boards, turned
-from tolerances import EXACT_REL
+from helpers.tolerances import EXACT_REL
 
 from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.normal import normals_from_affines

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.affine_scenes import REGULAR, Corners, see
 from helpers.differences import central_difference
-from tolerances import EXACT_REL
+from helpers.tolerances import EXACT_REL
 
 from rigkit.affine.homography import (
     affines_from_homography,

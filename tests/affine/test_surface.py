@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.affine_scenes import FISHEYE, REGULAR, Corners, see
-from tolerances import EXACT_REL, ROUNDING
+from helpers.tolerances import EXACT_REL, ROUNDING
 
 from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.surface import affines_from_normals, linear_gauge

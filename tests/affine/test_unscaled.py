@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.affine_scenes import Corners, angles_deg, general_pairs, turned
+from helpers.tolerances import EXACT_REL
 from scipy.optimize import minimize
-from tolerances import EXACT_REL
 
 from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import affines_from_directions

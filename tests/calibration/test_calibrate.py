@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.test_clustered import disturbed
+from calibration.solving.test_clustered import disturbed
 from helpers.calibration_scenes import (
     BOARD,
     REACH_DEG,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.affine_scenes import FISHEYE, REGULAR, Corners, see, turned
-from tolerances import EXACT_REL
+from helpers.tolerances import EXACT_REL
 
 from rigkit.affine.affinities import DirectionNoise, EpipolarNormals
 from rigkit.affine.registry import AFFINE_METHODS, affines_from_directions, needs_epipolar

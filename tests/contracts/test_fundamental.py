@@ -13,7 +13,7 @@ from helpers.epipolar_scenes import (
     same_up_to_sign,
 )
 from helpers.epipolar_scenes import pair as pair_of_type
-from tolerances import EXACT_REL
+from helpers.tolerances import EXACT_REL
 
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches

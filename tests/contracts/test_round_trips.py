@@ -19,9 +19,9 @@ import pycolmap
 import pytest
 import yaml
 from helpers.cameras import PARAMETERS, image_pixels, rays_within
+from helpers.tolerances import ROUND_TRIP_PX
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tolerances import ROUND_TRIP_PX
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.cameras.base import Camera

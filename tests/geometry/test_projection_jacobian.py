@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.cameras import image_pixels, sample_cameras
 from helpers.differences import central_difference
-from tolerances import JACOBIAN_REL
+from helpers.tolerances import JACOBIAN_REL
 
 from rigkit.cameras.base import Camera
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians, projection_jacobian

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.tolerances import ROUNDING
 from scipy.spatial.transform import Rotation
-from tolerances import ROUNDING
 
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3, cam_from_world_look_at

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 
 from helpers.calibration_scenes import BOARD, lens, noisy_view
+from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
@@ -74,3 +75,10 @@ def changed_lens(what: Callable[[np.ndarray], np.ndarray]) -> Camera:
     step = what(camera.parameters.copy()) - camera.parameters
     size = np.sqrt(step @ projection_goal(camera).weight @ step)
     return camera.with_parameters(camera.parameters + step * CHANGED_PX / size)
+
+
+def calibrated_lens() -> Calibration:
+    """Return the calibration of the lens "reg" from 14 views of boards held in front of it."""
+    camera, rng = lens("reg"), np.random.default_rng(2)
+    views = [noisy_view(camera, pose, f"{k}", rng, NOISE_PX) for k, pose in enumerate(poses_held("reg", 14))]
+    return calibrate(views, camera.size_px, model="brown", degree=5, board="flat")

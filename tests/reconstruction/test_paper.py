@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from tolerances import EXACT_REL
+from helpers.tolerances import EXACT_REL
 
 from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.cameras.pinhole import Pinhole

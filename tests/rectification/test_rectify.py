@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.cameras import image_pixels, rays_within, sample_cameras
 from helpers.differences import central_difference
-from tolerances import JACOBIAN_REL, ROUND_TRIP_PX
+from helpers.tolerances import JACOBIAN_REL, ROUND_TRIP_PX
 
 from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.pinhole import Pinhole

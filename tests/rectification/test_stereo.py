@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.cameras import sample_cameras
-from tolerances import ROUND_TRIP_PX
+from helpers.tolerances import ROUND_TRIP_PX
 
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[1] / "rigkit"
+PACKAGE = Path(__file__).resolve().parents[2] / "rigkit"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 KERNELS = sorted([*PACKAGE.rglob("*.c"), *PACKAGE.rglob("*.h")])
 

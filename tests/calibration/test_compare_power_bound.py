@@ -12,7 +12,7 @@ import itertools
 
 import numpy as np
 import pytest
-from calibration.test_clustered import CORNERS_PX, FAIR_PX, GOOD_PX, longer, sessions
+from calibration.solving.test_clustered import CORNERS_PX, FAIR_PX, GOOD_PX, longer, sessions
 from helpers.focal_bounds import LENSES, best_powers
 
 from rigkit.calibration.compare import CameraVerdict, compare_calibrations

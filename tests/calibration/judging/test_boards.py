@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.test_wrong_sessions import poses, seen
+from calibration.judging.test_verdicts_wrong_sessions import poses, seen
 from helpers.calibration_scenes import SIZE, lens, random_views
 
 from rigkit.calibration.board_shape import BoardShape

@@ -20,7 +20,7 @@ from helpers.browser import loaded
 from helpers.calibration_scenes import lens
 from helpers.data import REPOSITORY
 from helpers.rig_scenes import rig_views
-from report.test_first_screen import page_of, reported
+from report.pages.test_page_first_screen import page_of, reported
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration

@@ -13,7 +13,7 @@ from rigkit.io.manifests.study_file import load_study
 from rigkit.synthetic.noise import NoisyImages
 from rigkit.workflows.study import run_study, study_key
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 MINIMAL = """
 schema = "rigkit.study/1"
 name = "small"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.epipolar_scenes import REGULAR, pair, pixel_fundamental
-from tolerances import EXACT_REL
+from helpers.tolerances import EXACT_REL
 
 from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches

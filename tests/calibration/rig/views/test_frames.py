@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.test_rig import SIGMAS
+from calibration.rig.test_calibrate import SIGMAS
 from helpers.rig_scenes import NOISE_PX, Views, mounts, rig_views, sizes
 
 from rigkit.calibration.rig.calibrate import calibrate_rig

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.browser import probed
 from helpers.calibration_scenes import BOARD, lens, random_views, with_outliers
-from report.test_page_in_browser import MIN_FONT_PX, measured_at_widths
+from report.pages.test_page_in_browser import MIN_FONT_PX, measured_at_widths
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty

@@ -15,7 +15,7 @@ from rigkit.core.errors import ExitCode
 from rigkit.workflows.validation.paper import PaperOptions, validate_as_paper
 from rigkit.workflows.validation.validate import ValidateOptions, validate_dataset
 
-LAB = Path(__file__).parents[2] / "datasets" / "lab-a"
+LAB = Path(__file__).parents[3] / "datasets" / "lab-a"
 PAIRS = ("regular-standard", "regular-forward")
 METHODS = ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.epipolar_scenes import FISHEYE, REGULAR, affinities, pair
-from tolerances import EXACT_REL
+from helpers.tolerances import EXACT_REL
 
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew

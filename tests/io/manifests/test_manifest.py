@@ -11,7 +11,7 @@ from rigkit.core.posetype import PoseType
 from rigkit.core.truth import Feature
 from rigkit.io.manifests.manifest import load_dataset
 
-REPO = Path(__file__).parents[2]
+REPO = Path(__file__).parents[3]
 TEXT = """
 schema = "rigkit.dataset/1"
 name = "small"

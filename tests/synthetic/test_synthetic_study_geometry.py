@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tolerances import EXACT_REL
+from helpers.tolerances import EXACT_REL
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError

@@ -11,7 +11,7 @@ from helpers.pages import assert_all_is_in
 from helpers.reconstructions import make_reconstruction
 from helpers.schemas import faults
 from helpers.stereo_pictures import of_one_camera
-from report.test_first_screen import reported
+from report.pages.test_page_first_screen import reported
 
 from rigkit.cli.main import main
 from rigkit.report.pages.page import build_page, validation_facts
