@@ -34,6 +34,9 @@ UNPRINTABLE_MM = 6.0
 RULER_STRIP_MM = 14.0
 """Space below and to the right of the board for a ruler and its text."""
 
+BLACK_MARGIN = 0.5
+"""Width, in squares or tags, of the black around inverted squares and tags: outer squares have two sides then."""
+
 RULER_STEP_MM = 10.0
 TEXT_MM = 3.0
 POINTS_PER_MM = 72.0 / 25.4
@@ -41,15 +44,15 @@ POINTS_PER_MM = 72.0 / 25.4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrintedSheet:
-    """Shapes in mm: black rectangles (x, y, width, height), circles (x, y, radius), black or `white_circles`, lines
-    (x1, y1, x2, y2) and texts (x, y, degrees, text)."""
+    """Shapes in mm: rectangles (x, y, width, height) and circles (x, y, radius), white on the black rectangle `ground`
+    if there is one, else black; lines (x1, y1, x2, y2) and texts (x, y, degrees, text)."""
 
     width_mm: float
     height_mm: float
     title: str
     rectangles: tuple[tuple[float, float, float, float], ...]
     circles: tuple[tuple[float, float, float], ...]
-    white_circles: bool
+    ground: tuple[float, float, float, float] | None
     lines: tuple[tuple[float, float, float, float], ...]
     texts: tuple[tuple[float, float, float, str], ...]
     ruler_x_mm: float
@@ -64,19 +67,13 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
     Raises InputError for an unknown paper, or one that is too small; the message names a paper that fits.
     """
     size = _sheet_size(board, paper.lower())
-    if board.ink().inverted and not len(board.ink().circles):
-        raise InputError(
-            f"board '{board.board_id}': {board.pattern.type} boards are printed black on white; leave 'inverted' out"
-        )
-    low, high = (edge * board.squares_mm for edge in board.pattern.outline(*board.size))
+    low, high = _printed_mm(board)
     w, h = high - low
     x0 = (size[0] - RULER_STRIP_MM - w) / 2.0
     y0 = (size[1] - RULER_STRIP_MM - h) / 2.0
     # Rows and columns of each marker's modules overlap, so that no hairline shows between adjacent ones.
     inks = [board.ink(upright=upright) for upright in (False, True)]
-    white_circles = inks[0].inverted and len(inks[0].circles) > 0
-    ground = np.array([[*low, w, h]]) if white_circles else np.zeros((0, 4))
-    shapes = np.concatenate([ground, black_squares(board, inks[0]), *(ink.rectangles for ink in inks)])
+    shapes = np.concatenate([black_squares(board, inks[0]), *(ink.rectangles for ink in inks)])
     shapes[:, :2] += np.array([x0, y0]) - low
     circles = inks[0].circles + np.array([x0 - low[0], y0 - low[1], 0.0])
     rectangles = [(x, y, width, height) for x, y, width, height in shapes.tolist()]
@@ -100,7 +97,7 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
         title=name,
         rectangles=tuple(rectangles),
         circles=tuple((x, y, radius) for x, y, radius in circles.tolist()),
-        white_circles=white_circles,
+        ground=(float(x0), float(y0), float(w), float(h)) if inks[0].inverted else None,
         lines=tuple(lines),
         texts=texts,
         ruler_x_mm=float(ruler_x),
@@ -126,11 +123,12 @@ def svg_text(sheet: PrintedSheet) -> str:
         f'<rect width="{sheet.width_mm:g}" height="{sheet.height_mm:g}" fill="white"/>',
     ]
     # Squares that touch at a corner must not overlap: no stroke, crisp edges.
+    colour = "white" if sheet.ground else "black"
+    grounds = [(sheet.ground, "black")] if sheet.ground else []
     out += [
-        f'<rect x="{x:.6g}" y="{y:.6g}" width="{w:.6g}" height="{h:.6g}" fill="black"/>'
-        for x, y, w, h in sheet.rectangles
+        f'<rect x="{x:.6g}" y="{y:.6g}" width="{w:.6g}" height="{h:.6g}" fill="{fill}"/>'
+        for (x, y, w, h), fill in [*grounds, *((rectangle, colour) for rectangle in sheet.rectangles)]
     ]
-    colour = "white" if sheet.white_circles else "black"
     out += [f'<circle cx="{x:.6g}" cy="{y:.6g}" r="{r:.6g}" fill="{colour}"/>' for x, y, r in sheet.circles]
     out += [
         f'<line x1="{a:.6g}" y1="{b:.6g}" x2="{c:.6g}" y2="{d:.6g}" stroke="black" stroke-width="0.15"/>'
@@ -154,8 +152,12 @@ def pdf_bytes(sheet: PrintedSheet) -> bytes:
         return f"{w * POINTS_PER_MM:.5f} {h * POINTS_PER_MM:.5f}"
 
     drawing = ["0 g"]
-    drawing += [f"{at(x, y + h)} {extent(w, h)} re f" for x, y, w, h in sheet.rectangles]
-    drawing += ["1 g"] if sheet.white_circles else []
+
+    def filled(x: float, y: float, w: float, h: float) -> str:
+        return f"{at(x, y + h)} {extent(w, h)} re f"
+
+    drawing += [filled(*sheet.ground), "1 g"] if sheet.ground else []
+    drawing += [filled(*rectangle) for rectangle in sheet.rectangles]
     drawing += [f"{_pdf_circle(x, sheet.height_mm - y, r)} f" for x, y, r in sheet.circles]
     drawing += ["0 g", f"{0.15 * POINTS_PER_MM:.4f} w"]
     drawing += [f"{at(a, b)} m {at(c, d)} l S" for a, b, c, d in sheet.lines]
@@ -202,8 +204,8 @@ def _pdf_circle(x: float, y: float, radius: float) -> str:
 def _sheet_size(board: Board, paper: str) -> tuple[float, float]:
     if paper not in PAPERS:
         raise InputError(f"paper '{paper}' is unknown; known: {', '.join(PAPERS)}")
-    low, high = board.pattern.outline(*board.size)
-    width, height = (high - low) * board.squares_mm + 2.0 * UNPRINTABLE_MM + RULER_STRIP_MM
+    low, high = _printed_mm(board)
+    width, height = high - low + 2.0 * UNPRINTABLE_MM + RULER_STRIP_MM
     landscape = width > height
 
     def fits(size: tuple[float, float]) -> tuple[float, float] | None:
@@ -227,6 +229,14 @@ def _sheet_size(board: Board, paper: str) -> tuple[float, float]:
             f"{advice} {smaller}"
         )
     return size
+
+
+def _printed_mm(board: Board) -> tuple[FloatArray, FloatArray]:
+    """Return the printed area's lower and upper (x, y): of inverted boards with the black margin that detectors need,
+    which paper is for others, and which the outline of circles has."""
+    outline, ink = board.pattern.outline(*board.size), board.ink()
+    margin = BLACK_MARGIN if ink.inverted and not len(ink.circles) else 0.0
+    return (outline[0] - margin) * board.squares_mm, (outline[1] + margin) * board.squares_mm
 
 
 def _tick(at_mm: float) -> float:

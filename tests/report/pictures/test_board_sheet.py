@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ElementTree
 import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,7 +13,9 @@ from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.circles import Circles
+from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.report.pages.plan_page import printed_outlines
 from rigkit.report.pictures.board_sheet import board_sheet, pdf_bytes, svg_text
@@ -104,3 +107,31 @@ def test_what_is_written_below_a_board_ends_before_the_page_does(rows: int) -> N
     assert any("measure it" in text for _, text in level)
     # Letters of 3 mm are half of that wide on average.
     assert all(x + 1.6 * len(text) <= sheet.width_mm for x, text in level)
+
+
+@pytest.mark.parametrize(
+    "board",
+    [
+        Board("c", 5, 4, 20.0, 20.0, pattern=Charuco("DICT_4X4_50", 15.0, inverted=True)),
+        Board("g", 6, 4, 20.0, 20.0, pattern=AprilGrid(0.3, inverted=True)),
+        Board("d", 5, 4, 20.0, 20.0, pattern=Circles(inverted=True)),
+    ],
+    ids=lambda board: board.pattern.type,
+)
+def test_an_inverted_board_is_printed_white_on_black(board: Board) -> None:
+    sheet = board_sheet(board, "a4")
+    assert sheet.ground is not None
+    scale = 4.0
+    page = np.full((round(scale * sheet.height_mm), round(scale * sheet.width_mm)), 220.0)
+    y, x = (np.mgrid[: page.shape[0], : page.shape[1]] + 0.5) / scale
+    for (left, top, width, height), level in [(sheet.ground, 20.0), *((part, 220.0) for part in sheet.rectangles)]:
+        page[(x >= left) & (x < left + width) & (y >= top) & (y < top + height)] = level
+    for a, b, radius in sheet.circles:
+        page[np.hypot(x - a, y - b) < radius] = 220.0
+    (found,) = detect_boards(cv2.GaussianBlur(page, (0, 0), 1.0).astype(np.uint8), [board])
+    assert found.board_id == board.board_id and found.complete
+    # The same shapes are in both files, white ones after the ground.
+    fills = re.findall(r'fill="(black|white)"', svg_text(sheet))
+    assert fills[:2] == ["white", "black"] and fills.count("black") == 1
+    stream = re.search(rb"stream\n(.*)\nendstream", pdf_bytes(sheet), re.DOTALL)
+    assert stream is not None and zlib.decompress(stream[1]).splitlines()[2] == b"1 g"
