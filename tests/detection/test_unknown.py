@@ -327,6 +327,14 @@ def test_two_aprilgrids_beside_each_other_are_two() -> None:
     assert found == {0: (8, 6), 20: (6, 8)}
 
 
+def test_aprilgrids_with_the_same_tags_in_rows_of_other_lengths_are_two() -> None:
+    boards = [Board("b", columns, 6, 60.0, 60.0, pattern=AprilGrid(0.3)) for columns in (8, 10)]
+    guess = guess_board([shown(board) for board in boards])
+    assert guess is not None
+    assert {board.size for board in (guess.board, *guess.beside)} == {(8, 6), (10, 6)}
+    assert guess.board.size == (10, 6) and guess.images == (1,)
+
+
 def test_what_is_wrong_with_a_board_is_said() -> None:
     def board(columns: int, rows: int, pattern: Pattern) -> Board:
         return Board("b", columns, rows, 30.0, 30.0, pattern=pattern)

@@ -324,11 +324,12 @@ def _of_other_border(board: Board) -> Board:
 
 
 def _of_one_board(groups: Sequence[Counted]) -> list[list[Counted]]:
-    """Return the groups of tags by boards: groups whose ranges of numbers overlap are of one board."""
+    """Return the groups of tags by boards: groups that count alike and whose ranges of numbers overlap are of one
+    board."""
     clusters: list[tuple[int, list[Counted]]] = []
-    for group in sorted(groups, key=lambda group: int(group[0].numbers[group[3]].min())):
+    for group in sorted(groups, key=lambda group: (*group[1:3], int(group[0].numbers[group[3]].min()))):
         numbers = group[0].numbers[group[3]]
-        if clusters and int(numbers.min()) <= clusters[-1][0]:
+        if clusters and clusters[-1][1][0][1:3] == group[1:3] and int(numbers.min()) <= clusters[-1][0]:
             last, members = clusters.pop()
             clusters.append((max(last, int(numbers.max())), [*members, group]))
         else:
@@ -340,9 +341,8 @@ def _board_of(cluster: Sequence[Counted], kind: Kind, steps: FloatArray, inverte
     """Return the board, with tags of 1 mm, of a cluster of groups with `steps` (K,) from tag to tag; None if there is
     no valid one."""
     family, border, alone = kind
-    (step, line), _ = Counter((step, line) for _, step, line, _ in cluster).most_common(1)[0]
-    columns = line
-    own = [(item.numbers[which], item.places[which]) for item, a, b, which in cluster if (a, b) == (step, line)]
+    step, columns = cluster[0][1:3]
+    own = [(item.numbers[which], item.places[which]) for item, _, _, which in cluster]
     # The number of the first column, modulo the columns, is known from groups as wide as the board.
     wide = [(n, p) for n, p in own if np.ptp(p[:, 0]) + 1 == columns]
     firsts = Counter(int((n - (step * p[:, 0] - (step * p[:, 0]).min()))[0]) % columns for n, p in wide)
