@@ -15,7 +15,7 @@ def identify(args: argparse.Namespace) -> int:
     from rigkit.detection.duplicate_marks import DUPLICATES_REMEDY
     from rigkit.io.boards.board_file import board_text
     from rigkit.io.disk.writing import ensure_writable, write_atomic
-    from rigkit.io.media.video import is_video
+    from rigkit.io.media.video import is_video, videos_inside
     from rigkit.workflows.detect import images_in
     from rigkit.workflows.inputs.identify_board import identify_board
 
@@ -24,7 +24,8 @@ def identify(args: argparse.Namespace) -> int:
     path = None if args.output is None else Path(args.output).with_suffix(".toml")
     if path is not None and args.square_mm is None:
         raise InputError("board identify: images cannot tell the scale; give --square-mm, the side of a square or tag")
-    images = [one for path in map(Path, args.images) for one in ([path] if is_video(path) else images_in([path]))]
+    places = [place for path in args.images for place in videos_inside(Path(path))]
+    images = [one for place in places for one in ([place] if is_video(place) else images_in([place]))]
     ensure_writable(path, force=args.force, inputs=images)
     found = identify_board(images, progress=progress_on_stderr())
     board = found.board

@@ -27,7 +27,7 @@ from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.corners.corners_file import write_corners
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.io.media.images import Image, images_of_folder, name_unread, no_images, read_image, read_image_of
-from rigkit.io.media.video import is_video
+from rigkit.io.media.video import is_video, videos_inside
 from rigkit.report.pictures.overlay import draw_boards
 from rigkit.workflows.inputs.camera_files import import_camera
 from rigkit.workflows.inputs.frames import VideoFrames, frames_folder, frames_of_videos
@@ -87,7 +87,7 @@ class _DetectJob:
 def detect_in_images(
     paths: Sequence[str | Path], options: DetectOptions | None = None, *, progress: Progress = silent
 ) -> DetectionResult:
-    """Detect the boards of images, folders of images, and videos, and write what `options` ask for.
+    """Detect the boards of images, videos, and folders of either, and write what `options` ask for.
 
     Of a video, the frames that `rigkit.workflows.inputs.frames` keeps are searched. An image that cannot be read goes
     into `failures`; its error is raised only if no image can be read.
@@ -102,7 +102,7 @@ def detect_in_images(
         )
     process_count(options.jobs)  # complaints before the work
     boards = tuple(board_of_words(str(board)) for board in options.boards)
-    given = [Path(path) for path in paths]
+    given = [one for path in paths for one in videos_inside(Path(path))]
     videos, bad = _frames_of(list(filter(is_video, given)), boards, progress)
     if bad and len(given) == len(bad) == 1:
         raise next(iter(bad.values()))

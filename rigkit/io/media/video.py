@@ -18,7 +18,7 @@ import numpy as np
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import last_number
 from rigkit.io.disk.reading import csv_table
-from rigkit.io.media.images import Image, quiet_opencv, require_pixels
+from rigkit.io.media.images import IMAGE_ENDINGS, Image, quiet_opencv, require_pixels
 
 _log = logging.getLogger(__name__)
 
@@ -38,6 +38,16 @@ def is_video(source: str | Path) -> bool:
         or LIVE_CAMERA.fullmatch(name) is not None
         or SEQUENCE.search(name) is not None
     )
+
+
+def videos_inside(place: Path) -> list[Path]:
+    """Return the videos of a folder that has videos but no images, else `place` itself."""
+    if is_video(place) or not place.is_dir():
+        return [place]
+    inside = sorted(path for path in place.iterdir() if path.is_file())
+    if any(path.suffix.lower() in IMAGE_ENDINGS for path in inside):
+        return [place]
+    return [path for path in inside if path.suffix.lower() in VIDEO_ENDINGS] or [place]
 
 
 class Video:

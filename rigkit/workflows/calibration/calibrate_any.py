@@ -17,7 +17,7 @@ from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.manifests.rig_session import RigSession, is_rig_session, load_rig_session
 from rigkit.io.manifests.session import SESSION_NAME, Session, load_session
 from rigkit.io.media.images import IMAGE_ENDINGS
-from rigkit.io.media.video import VIDEO_ENDINGS, is_video
+from rigkit.io.media.video import is_video, videos_inside
 from rigkit.workflows.calibration.calibrate import (
     CalibrateOptions,
     SessionCalibration,
@@ -121,7 +121,7 @@ def calibrate_folders(
     Raises InputError: no board given, no images, a file that cannot be written, and as `calibrate_session_file`;
     DegenerateError: the views do not determine a camera.
     """
-    given = [inside for folder in folders for inside in _videos_inside(Path(folder))]
+    given = [inside for folder in folders for inside in videos_inside(Path(folder))]
     boards = _boards(given, folder_options, progress)
     places = _folders_of(given, boards, folder_options.timestamps, options, progress)
     wanted = session_of_folders(
@@ -210,16 +210,6 @@ def _folders_of(
     times = None if len(videos) == 1 else timestamps or timestamps_next_to(videos)
     frames_of_videos(cameras, folder, seen, timestamps=times, progress=progress)
     return [folder / name for name in cameras]
-
-
-def _videos_inside(place: Path) -> list[Path]:
-    """Return the videos of a folder that has videos but no images, else `place` itself."""
-    if is_video(place) or not place.is_dir():
-        return [place]
-    inside = sorted(path for path in place.iterdir() if path.is_file())
-    if any(path.suffix.lower() in IMAGE_ENDINGS for path in inside):
-        return [place]
-    return [path for path in inside if path.suffix.lower() in VIDEO_ENDINGS] or [place]
 
 
 def _has_content(path: Path, text: str) -> bool:

@@ -81,7 +81,7 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
             images[name] = image
     if not images:
         raise unreadable[0]
-    progress("reading", ENOUGH_IMAGES, ENOUGH_IMAGES)
+    progress("reading", len(images), len(images))
     guess = guess_board(list(images.values()), progress)
     names = tuple(Path(name).name for name in images)
     mirrored = _mirrored_unless(guess, list(images.items()))

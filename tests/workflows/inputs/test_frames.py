@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from rigkit.cameras.pinhole import Pinhole
+from rigkit.cli.main import main
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
@@ -94,10 +95,11 @@ def test_videos_of_two_cameras_give_frames_of_one_moment(tmp_path: Path, caplog:
     assert "per second" not in caplog.text
 
 
-def test_detect_takes_a_video(tmp_path: Path) -> None:
-    path = video(tmp_path / "clip.avi", [picture((0.2 * k, 0.0, 0.0), 0.0) for k in range(3)])
-    done = detect_in_images([path])
+def test_detect_and_identify_take_a_folder_with_a_video(tmp_path: Path) -> None:
+    video(tmp_path / "clip.avi", [picture((0.2 * k, 0.0, 0.0), 0.0) for k in range(3)])
+    done = detect_in_images([tmp_path])
     assert [len(found) for found in done.found.values()] == [1, 1, 1]
+    assert main(["board", "identify", str(tmp_path)]) == 0
     assert all(Path(name).parent == tmp_path / "clip-frames" for name in done.found)
 
 
