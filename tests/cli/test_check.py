@@ -6,15 +6,14 @@ import json
 import os
 import re
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import cv2
 import numpy as np
 import pytest
 from helpers.calibration_scenes import noisy_view
-from helpers.sentinel_scenes import best_held
+from helpers.sentinel_scenes import best_held, known_rig
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.cameras.base import Camera
@@ -34,7 +33,8 @@ from rigkit.report.pages.check_page import _could_have_found
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.validation.sentinel.judge import SentinelCheck
+from rigkit.validation.sentinel.hypotheses import hypotheses_of
+from rigkit.validation.sentinel.judge import Change, SentinelCheck
 from rigkit.validation.sentinel.power import Power
 from rigkit.workflows.checks.check import CheckOptions, _as_known, _require_right_order, check_pictures
 
@@ -127,11 +127,31 @@ def test_images_are_exchanged_where_the_other_order_holds_or_explains_more(monke
     def refused(*_: object) -> SentinelCheck:
         raise DegenerateError("no camera sees enough")
 
-    def found(*, holds: bool, unexplained: bool) -> SentinelCheck:
-        names = SimpleNamespace(names=("left", "right"))
-        return cast(SentinelCheck, SimpleNamespace(monitored=names, holds=holds, unexplained=unexplained, flipped=""))
-
-    odd, moved, holding = (found(holds=h, unexplained=u) for h, u in ((False, True), (False, False), (True, False)))
+    rig = known_rig(Rigid3(np.eye(3), [-120.0, 0.0, 0.0]), [1.0] * 8, 1e-3, 100.0)
+    turn = Change(
+        hypothesis=next(h for h in hypotheses_of(rig) if h.kind == "rotation"),
+        amounts=np.zeros(3),
+        covariance=np.eye(3),
+        chance=0.0,
+        size_px=5.0,
+        max_px=5.0,
+        gain=9.0,
+    )
+    moved = SentinelCheck(
+        chance=0.0,
+        change=turn,
+        monitored=rig,
+        fixed=rig,
+        step=np.zeros(len(rig.covariance)),
+        covariance=rig.covariance,
+        rms_px=0.1,
+        rms_fixed_px=0.1,
+        expected_px=0.1,
+        frames=3,
+        corners=100,
+    )
+    holding, odd = replace(moved, chance=1.0), replace(moved, rms_fixed_px=50.0)
+    assert holding.holds and not moved.holds and not moved.unexplained and odd.unexplained
     for given, other, wrong in ((odd, odd, False), (moved, moved, False), (odd, moved, True), (moved, holding, True)):
         monkeypatch.setattr("rigkit.workflows.checks.check.check_views", lambda *_, other=other: other)
         with pytest.raises(InputError, match="'left' and 'right' are exchanged") if wrong else nullcontext():

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import inspect
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.calibration_scenes import lens, random_views
+from helpers.rig_scenes import calibrated_rig
 
 import rigkit
 from rigkit.calibration.calibrate import calibrate
@@ -61,12 +61,9 @@ def with_words_of_its_own(name: str) -> Any:
         views = random_views(camera, 8, np.random.default_rng(1), reach_deg=24.0, noise_px=0.1)[0]
         return calibrate(views, camera.size_px, model="brown")
     if name == "RigCalibration":
-        rig = filled(rigkit.RigCalibration, 0, (0.25,))
-        cameras = [SimpleNamespace(name=f"camera{k}") for k in range(6)]
-        parts = {"cameras": cameras, "left_out": (), "verdicts": (Finding(severity=Severity.GOOD, message="well"),)}
-        for key, value in parts.items():
-            object.__setattr__(rig, key, value)
-        return rig
+        rig = calibrated_rig()
+        renamed = [dataclasses.replace(camera, name=f"camera with number {k}") for k, camera in enumerate(rig.cameras)]
+        return dataclasses.replace(rig, cameras=tuple(renamed))
     made = {
         "Board": lambda: rigkit.Board("plane1", 8, 6, 50.0, 50.0),
         "Camera": lambda: camera,

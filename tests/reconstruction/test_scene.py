@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
@@ -20,7 +18,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between
 from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
 from rigkit.reconstruction.scene import _notes, reconstruct_scene
-from rigkit.reconstruction.scene_pose import KnownPose, ScenePose
+from rigkit.reconstruction.scene_pose import KnownPose, known_scene_pose
 from rigkit.relative_pose.refinement.refine import refine_pose
 
 NOISE_PX, NOISE_A = 0.5, 0.05
@@ -242,8 +240,9 @@ def test_the_calibrations_share_is_what_drawn_calibrations_show(rng, pose_is_kno
 
 
 @pytest.mark.parametrize(("agree", "printed"), [(29, True), (31, False)])
-def test_a_pose_that_few_correspondences_agree_with_is_doubted(agree: int, printed: bool) -> None:
-    fit = cast(ScenePose, SimpleNamespace(notes=("first",), inliers=np.arange(100) < agree))
+def test_a_pose_that_few_correspondences_agree_with_is_doubted(agree: int, printed: bool, rng) -> None:
+    m, pose, _ = pair(rng, 100, noise_px=NOISE_PX, sigma_A=NOISE_A)
+    fit = replace(known_scene_pose(m, KnownPose(pose)), notes=("first",), inliers=np.arange(100) < agree)
     notes = _notes(fit, np.ones(100, dtype=bool), 100.0)
     assert notes[0] == "first"
     assert any(f"only {agree} of 100 correspondences agree" in note for note in notes) == printed

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from statistics import NormalDist
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
@@ -81,7 +79,7 @@ def test_a_type_whose_pose_sees_nothing_in_front_is_not_checked(rng: np.random.G
     assert [words.split(":")[0] for words in unchecked] == ["pose type forward", "level"]
 
 
-def test_a_chance_is_told_as_that_many_standard_deviations() -> None:
+def test_a_chance_is_told_as_that_many_standard_deviations(rng: np.random.Generator) -> None:
     """Half a level off, a chance of 0.3, holds; 40 degrees off, one in 10^30, fails by as many sigmas."""
     level = np.deg2rad(0.2)
     types = tuple(
@@ -89,10 +87,12 @@ def test_a_chance_is_told_as_that_many_standard_deviations() -> None:
         for name, log, off, chance in ((PoseType.PLANAR, 0.0, 0.1, 0.3173), (PoseType.STANDARD, -60.0, 40.0, 1e-30))
     )
     decision = PoseTypeDecision(PoseType.STANDARD, PoseType.STANDARD, level, PoseTypeEvidence(types, level), ())
-    found = SimpleNamespace(geometry=SimpleNamespace(decision=decision), cloud=range(144))
-    (standard, planar), unchecked = declaration_checks(cast(Reconstruction, found))
+    found = declared(PoseType.STANDARD, PoseType.STANDARD, rng)
+    assert found.geometry is not None
+    found = replace(found, geometry=replace(found.geometry, decision=decision))
+    (standard, planar), unchecked = declaration_checks(found)
     assert not unchecked and (standard.name, planar.name) == ("pose type standard", "level")
-    assert planar.passed and planar.ours == pytest.approx(0.1) and planar.count == 144
+    assert planar.passed and planar.ours == pytest.approx(0.1) and planar.count == len(found.cloud)
     # One standard deviation has a chance of 0.3173 to be exceeded: that of the level itself, not less.
     assert planar.k == pytest.approx(1.0, abs=1e-3) and planar.measured_sigma == pytest.approx(0.2)
     assert not standard.passed and standard.ours == pytest.approx(40.0)

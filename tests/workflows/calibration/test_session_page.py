@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.calibration_scenes import SIZE, lens, random_views
+from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.io.manifests.session import Session
 from rigkit.workflows.calibration import session_page
 
 
@@ -20,9 +20,15 @@ def test_of_many_images_the_worst_are_shown(rng: np.random.Generator, monkeypatc
     found = calibrate([*views[:5], wild, *views[6:]], SIZE, model="brown", board="flat", folds=0)
     found = replace(found, dropped=(("unread.png", "no board"),))
     paths = {name: Path(name) for name in (*(view.image for view in views), "unread.png")}
-    session = SimpleNamespace(images=list(paths.values()))
-    monkeypatch.setattr(session_page, "named_images", lambda _: paths)
+    session = Session(
+        path=Path("session.toml"),
+        images=tuple(paths.values()),
+        boards=(BOARD,),
+        model="brown",
+        degree=None,
+        board_shape="flat",
+    )
     monkeypatch.setattr(session_page, "read_image", lambda _: np.zeros((31, 41), np.uint8))
-    assert set(session_page._thumbnails(session, found)) == set(paths)  # type: ignore[arg-type]
+    assert set(session_page._thumbnails(session, found)) == set(paths)
     monkeypatch.setattr(session_page, "MAX_PICTURES", 2)
-    assert set(session_page._thumbnails(session, found)) == {wild.image, "unread.png"}  # type: ignore[arg-type]
+    assert set(session_page._thumbnails(session, found)) == {wild.image, "unread.png"}

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import cv2
 import numpy as np
+from helpers.reconstructions import make_reconstruction
 
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
-from rigkit.core.truth import PairTruth
+from rigkit.core.truth import MeasuredAngle, PairTruth
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.manifests.manifest import CameraEntry, Pair
@@ -20,7 +20,7 @@ from rigkit.synthetic.pairs import trihedral_pair
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import Panel
-from rigkit.validation.checks import ValidationReport
+from rigkit.validation.checks import validate
 from rigkit.workflows.reconstruction.pairs import find_boards
 from rigkit.workflows.validation.validation_files import PairValidation
 
@@ -73,6 +73,7 @@ def test_boards_behind_a_pole_are_found_as_the_camera_sees_them(tmp_path: Path) 
 
 
 def test_a_validated_pair_is_called_as_its_best_report() -> None:
-    best = cast(ValidationReport, SimpleNamespace(pair_id="left-right"))
+    angle = MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set square")
+    best = validate(replace(make_reconstruction(), pair_id="left-right"), PairTruth(None, (angle,)))
     done = PairValidation(reports=(best,), best=best, crosscheck=None, causes=(), files={}, section=None)
     assert done.pair_id == "left-right"

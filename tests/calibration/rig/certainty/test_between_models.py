@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
-from helpers.rig_scenes import MODELS, rig_views, sizes
+from helpers.rig_scenes import MODELS, calibrated_rig, rig_views, sizes
 
 from rigkit.calibration.result import Rival
 from rigkit.calibration.rig import assemble
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.certainty.between_models import between_rig_models
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.solving.moments import Lag
 from rigkit.calibration.rig.verdicts import _worse
 
 LIKELY = 0.25
@@ -49,6 +48,13 @@ def test_a_rival_widens_the_baseline_by_its_own_difference(
     assert not between_rig_models(joint, sigmas).any()  # type: ignore[arg-type]
 
 
+def with_heldout_errors(alone: tuple[float | None, ...], together: float) -> RigCalibration:
+    """Return a rig with these held-out errors (px) of its cameras alone and of its frames."""
+    rig = calibrated_rig()
+    single = [replace(one, heldout_rms_px=error) for one, error in zip(rig.single, alone, strict=False)]
+    return replace(rig, single=tuple(single), heldout_rms_px=together)
+
+
 @pytest.mark.parametrize(
     ("alone", "together", "printed"), [((0.1, 0.2), 0.3, True), ((0.1, 0.2), 0.16, False), ((0.1, None), 0.3, False)]
 )
@@ -56,15 +62,13 @@ def test_frames_that_took_no_part_against_the_cameras_alone(
     alone: tuple[float | None, ...], together: float, printed: bool
 ) -> None:
     """What a camera alone comes to is not known where its images were too few to hold some out."""
-    single = [SimpleNamespace(heldout_rms_px=value) for value in alone]
-    rig = SimpleNamespace(single=single, cameras=single, heldout_rms_px=together, lags={})
-    assert bool(_worse(cast(RigCalibration, rig))) == printed
+    assert bool(_worse(with_heldout_errors(alone, together))) == printed
 
 
-@pytest.mark.parametrize(("lags", "cause"), [({}, "not quite of one moment"), ({"wide": None}, "lags do not explain")])
-def test_solved_lags_are_not_named_as_a_cause_again(lags: dict[str, None], cause: str) -> None:
+@pytest.mark.parametrize(
+    ("lags", "cause"), [({}, "not quite of one moment"), ({"wide": Lag(0.1, 0.01, 0.0)}, "lags do not explain")]
+)
+def test_solved_lags_are_not_named_as_a_cause_again(lags: dict[str, Lag], cause: str) -> None:
     """Frames worse than the cameras alone are explained by moments only as far as those were not solved for."""
-    single = [SimpleNamespace(heldout_rms_px=value) for value in (0.1, 0.2)]
-    rig = SimpleNamespace(single=single, cameras=single, heldout_rms_px=0.3, lags=lags)
-    (finding,) = _worse(cast(RigCalibration, rig))
+    (finding,) = _worse(replace(with_heldout_errors((0.1, 0.2), 0.3), lags=lags))
     assert cause in finding.message
