@@ -26,7 +26,14 @@ from rigkit.detection.lattices import MIN_BOARD_CORNERS
 from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.corners.corners_file import write_corners
 from rigkit.io.disk.writing import ensure_writable, write_atomic
-from rigkit.io.media.images import Image, images_of_folder, name_unread, no_images, read_image, read_image_of
+from rigkit.io.media.images import (
+    Image,
+    folder_of_images,
+    images_of_folder,
+    name_unread,
+    read_image,
+    read_image_of,
+)
 from rigkit.io.media.video import is_video, videos_inside
 from rigkit.report.pictures.overlay import draw_boards
 from rigkit.workflows.inputs.camera_files import import_camera
@@ -158,7 +165,7 @@ def _frames_of(
 
 
 def images_in(paths: Sequence[Path]) -> Iterator[Path]:
-    """Yield images, and those of folders sorted by name, each once.
+    """Yield images, and those of folders (`folder_of_images`) sorted by name, each once.
 
     Raises InputError for a path that does not exist or a folder without images.
     """
@@ -166,10 +173,8 @@ def images_in(paths: Sequence[Path]) -> Iterator[Path]:
     for path in paths:
         inside = [path]
         if path.is_dir():
-            inside = images_of_folder(path)
-            if not inside:
-                raise InputError(no_images(path))
-            name_unread(path)
+            inside = images_of_folder(folder := folder_of_images(path))
+            name_unread(folder)
         elif not path.exists():
             raise InputError(f"image '{path}' does not exist; check the path")
         for image in inside:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from rigkit.core.errors import InputError
+from rigkit.workflows.inputs.folder_session import cameras_in
 from rigkit.workflows.moments import moments_of
 
 NAMES = ("left", "right")
@@ -100,3 +101,46 @@ def test_other_names_leave_images_moment_by_moment(names: tuple[str, ...], tmp_p
     assert moments_of(NAMES, images)[0] == [images[:2], images[2:]]
     with pytest.raises(InputError, match="3 different images, which are not moments of 2 cameras"):
         moments_of(NAMES, images[:3])
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "cameras"),
+    [
+        ("mav0/cam0/data/{}", "mav0/cam1/data/{}", ["cam0", "cam1"]),
+        ("image_00/data/{}", "image_01/data/{}", ["image_00", "image_01"]),
+        ("infra1/{}", "infra2/{}", ["infra1", "infra2"]),
+        ("img_L_{}", "img_R_{}", ["l", "r"]),
+        ("L{}", "R{}", ["l", "r"]),
+        ("{}_L", "{}_R", ["l", "r"]),
+        ("room [1]_left_{}", "room [1]_right_{}", ["left", "right"]),
+        ("mon/left/{}", "tue/left/{}", []),
+    ],
+)
+def test_layouts_of_well_known_datasets(first: str, second: str, cameras: list[str], tmp_path: Path) -> None:
+    own = [[tmp_path / f"{form.format(k)}.png" for k in ("001", "002")] for form in (first, second)]
+    for path in (*own[0], *own[1]):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    # Copies in a folder farther down are none of the cameras.
+    _images(tmp_path / "old" / "backup" / "left", "001")
+    if not cameras:
+        with pytest.raises(InputError, match="give one folder a camera"):
+            cameras_in([tmp_path])
+        return
+    found = cameras_in([tmp_path])
+    assert list(found) == cameras
+    assert [sorted(p for folder, one in found[name] for p in folder.glob(one)) for name in cameras] == own
+
+
+def test_one_letter_is_a_side_only_where_both_sides_have_the_same_images(tmp_path: Path) -> None:
+    _images(tmp_path, "L1", "L2", "R3", "R4", "R5")
+    assert list(cameras_in([tmp_path])) == [""]
+
+
+def test_the_only_folder_with_images_is_meant(tmp_path: Path) -> None:
+    for name in ("cam0", "cam1"):
+        _images(tmp_path / name / "data", "001", "002")
+    assert cameras_in([tmp_path / "cam0"]) == {"": [(tmp_path / "cam0" / "data", "*.png")]}
+    folders = [tmp_path / "cam0", tmp_path / "cam1"]
+    assert {name: own[0][0] for name, own in cameras_in(folders).items()} == {f.name: f / "data" for f in folders}
+    assert len(moments_of(("cam0", "cam1"), folders)[0]) == 2

@@ -25,14 +25,18 @@
 has `images`.
 
 Images of one moment have the same file name without its ending in every camera's folder (frames = "name"), the same
-number at the end of that name ("number": left07 and right07), or the same place in the sorted list ("order"). By
-default it is the first of name and number that two cameras share.
+number at the end of that name ("number": left07 and right07), or the same place in the sorted list ("order"), or names
+that are times, and nearly the same ("time"). By default it is the time where all names are times (10 digits or more),
+else the first of name and number that two cameras share.
 """
 
 from __future__ import annotations
 
+import re
+from bisect import bisect, insort
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path, PurePath
 
@@ -83,7 +87,7 @@ class RigSession:
     ----------
     path : session file.
     cameras : session of each camera by name, in the order of the file; the first defines the rig's frame.
-    frames : "name", "number" or "order"; None: chosen automatically.
+    frames : "name", "number", "time" or "order"; None: chosen automatically.
     baselines : measured distances between cameras.
     rigid_boards : groups of boards on one mount.
     lenses : files of fixed lenses by camera.
@@ -185,14 +189,18 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
     Parameters
     ----------
     images : camera -> names of its images, in their order.
-    how : "name", "number" or "order" (see above); by default the first of name and number that two cameras share.
+    how : "name", "number", "time" or "order" (see above); None: chosen automatically.
     """
+    if how is None and all(TIME.fullmatch(PurePath(image).stem) for own in images.values() for image in own):
+        how = "time"
     if how == "order":
         counts = {name: len(own) for name, own in images.items()}
         if len(set(counts.values())) > 1:
             words = ", ".join(f"{n} of '{name}'" for name, n in counts.items())
             raise InputError(f'frames = "order" needs as many images of every camera, there are {words}')
         return {name: {image: f"{k:04d}" for k, image in enumerate(own)} for name, own in images.items()}
+    if how == "time":
+        return _frames_by_time(images)
     alike = None
     for key in (how,) if how else ("name", "number"):
         frames = {name: {image: FRAME_KEYS[key](image) for image in own} for name, own in images.items()}
@@ -213,6 +221,47 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
         'rename the images, or write frames = "order" if the sorted lists belong together one by one'
     )
 
+
+def _frames_by_time(images: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]:
+    """Return the frames of images whose names are times: each is of the nearest moment of the cameras before, if near.
+
+    Raises InputError for a name that is no time, or if no two cameras share a moment.
+    """
+    for name, own in images.items():
+        for image in own:
+            if not TIME.fullmatch(PurePath(image).stem):
+                raise InputError(f"frames = \"time\": '{image}' of camera '{name}' is not named by a time; rename it")
+    times = {name: {image: Decimal(PurePath(image).stem) for image in own} for name, own in images.items()}
+    gaps = [b - a for own in times.values() for a, b in pairwise(sorted(own.values()))]
+    near = MAX_PART_OF_GAP * min(gaps, default=Decimal(0))
+    moments: list[Decimal] = []
+    frames: dict[str, dict[str, str]] = {}
+    for name, own in times.items():
+        frames[name] = {}
+        known = list(moments)
+        for image, time in own.items():
+            place = bisect(known, time)
+            moment = min(known[max(place - 1, 0) : place + 1], key=lambda one, time=time: abs(one - time), default=None)
+            if moment is None or abs(moment - time) > near:
+                moment = time
+                insort(moments, time)
+            frames[name][image] = str(moment)
+    if twice := _duplicate_frame(frames):
+        raise InputError(f"{twice} are of one time by their names; rename one")
+    if sum(map(len, frames.values())) == len(moments):
+        raise InputError(
+            "no two cameras have images that were taken at the same moment, by the times in their names; "
+            'write frames = "order" if the sorted lists belong together one by one'
+        )
+    return frames
+
+
+TIME = re.compile(r"\d{10,}(\.\d+)?")
+"""A name that is a time since 1970: seconds have 10 digits, nanoseconds 19."""
+MAX_PART_OF_GAP = Decimal("0.25")
+"""How far apart times of one moment may be, as part of the shortest gap between two images of a camera. Below a half no
+two images of a camera are of one moment; cameras without a trigger are up to half a frame apart, but images that are
+kept for a calibration are many frames apart."""
 
 FRAME_KEYS: dict[str, Callable[[str], str]] = {
     "name": lambda image: PurePath(image).stem,

@@ -81,9 +81,9 @@ SESSION_FILE = file(
             choice("auto", *SHAPES), "flat, warp (print scale and bow), released (every corner), or auto"
         ),
         "frames?": described(
-            choice("name", "number", "order"),
+            choice("name", "number", "time", "order"),
             "of several cameras, which images were taken together: those of one name, one number at the end of the "
-            "name, or one place in the sorted list",
+            "name, nearly one time as name, or one place in the sorted list",
         ),
         "rig?": described(
             TEXT, "file of a rig whose cameras stay as they are, lens and mount: others are added to it", "rig.json"

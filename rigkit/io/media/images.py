@@ -148,6 +148,19 @@ def images_below(folder: Path) -> list[Path]:
     return sorted(p for p in files if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
 
 
+def folder_of_images(folder: Path) -> Path:
+    """Return the folder if it has images, else the only one below it that has: cam0/data of EuRoC for cam0.
+
+    Raises InputError if none or several have.
+    """
+    if images_of_folder(folder):
+        return folder
+    below = list(dict.fromkeys(path.parent for path in images_below(folder)))
+    if len(below) != 1 or _unread(folder):
+        raise InputError(no_images(folder))
+    return below[0]
+
+
 def no_images(folder: Path) -> str:
     """Return the message that a folder has no images, with the unsupported images or subfolders that it has instead."""
     words = f"folder '{folder}' has no images ({' '.join(IMAGE_ENDINGS)})"
@@ -160,8 +173,6 @@ def no_images(folder: Path) -> str:
     if not inside:
         return f"{words}; give another"
     first, others = inside[0].parent, len({path.parent for path in inside}) - 1
-    if others == 0:
-        return f"{words}, but '{first}' has some; give that"
     every = f'images = "{folder}/**/*{inside[0].suffix}"'
     return f"{words}, but '{first}' and {others} more below it have; give one folder a camera, or a session: {every}"
 

@@ -16,18 +16,24 @@ from rigkit.io.boards.board_file import board_text
 from rigkit.io.boards.board_words import WORDS_HELP, board_in_words, board_of_words, with_length
 from rigkit.io.disk.toml_reader import relative_path, toml_text
 from rigkit.io.manifests.session import SESSION_NAME, SESSION_SCHEMA
-from rigkit.io.media.images import images_of_folder, name_unread, no_images
+from rigkit.io.media.images import folder_of_images, images_below, images_of_folder, name_unread, no_images
 from rigkit.io.media.video import is_video
 from rigkit.workflows.inputs.identify_board import Suggestion, suggestion
 
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
 """Common names of a rig's cameras."""
 NAMED_FIRST = re.compile(rf"(?P<side>{SIDE})(?P<gap>[_-]?)(?P<rest>\d+|(?<=[_-]).*\d)", re.IGNORECASE)
-NAMED_LAST = re.compile(r"(?P<rest>.*\d)(?P<gap>[_-]?)(?P<side>left|right)", re.IGNORECASE)
+NAMED_LAST = re.compile(r"(?P<rest>.*\d)(?P<gap>[_-]?)(?P<side>left|right|(?<=[_-])[lr])", re.IGNORECASE)
+NAMED_WITHIN = re.compile(
+    r"(?P<before>|.*[_-])(?P<side>left|right|[lr])(?P<gap>[_-]?)(?P<rest>(?<=[lr_-])\d+|(?<=[_-]).*\d)", re.IGNORECASE
+)
+"""A side behind what all images begin with, or of one letter: img_left_01, img_L_01, L01."""
+NAMES = (NAMED_FIRST, NAMED_LAST, NAMED_WITHIN)
 MIN_IN_COMMON = 0.5
 """Fraction of the image names that another camera must have too, apart from the side. Names such as "left_tilted_1" and
 "right_far_1" describe board positions before one camera."""
-SIDE_FOLDER = re.compile(rf"(.*[ _-])?({SIDE})", re.IGNORECASE)
+SIDE_FOLDER = re.compile(rf"(.*[ _-])?({SIDE}|image[_-]?\d\d|infra(?:red)?[_-]?\d|[lr])", re.IGNORECASE)
+"""A camera's folder: also KITTI's image_00 and RealSense's infra1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +204,8 @@ def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
     """Return the images of every camera as (folder, pattern), by camera name; a single camera is named "".
 
     Several folders are one camera each. One folder holds several cameras if all its images are named left01, right01
-    (or cam0_01, 01_left, left_pose_1), or if it has no images but folders left and right (or cam0, cam1).
+    (or cam0_01, 01_left, left_pose_1, img_L_01), or if it has no images but folders left and right (or cam0, cam1),
+    or mav0/cam0/data and mav0/cam1/data below it.
 
     Raises InputError for a folder without images, or two folders of the same name.
     """
@@ -208,10 +215,30 @@ def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
     images = _images(folder)
     if images:
         return _by_names(folder, images)
-    inside = [p for p in folder.iterdir() if p.is_dir() and SIDE_FOLDER.fullmatch(p.name) and _images(p)]
-    if len(inside) < 2:
+    return _cameras_below(folder)
+
+
+def _cameras_below(folder: Path) -> dict[str, list[tuple[Path, str]]]:
+    """Return the cameras of the folders below that have images, and whose paths differ in the name of a camera only.
+
+    The group nearest to `folder` counts. Without one, a single folder with images is one camera. Raises InputError if
+    there are several folders, or two such groups at one depth.
+    """
+    groups: dict[tuple[tuple[str, ...], tuple[str, ...]], dict[str, Path]] = {}
+    for place in dict.fromkeys(image.parent for image in images_below(folder)):
+        parts = place.relative_to(folder).parts
+        for k, name in enumerate(parts):
+            if SIDE_FOLDER.fullmatch(name) and _images(place):
+                groups.setdefault((parts[:k], parts[k + 1 :]), {})[name] = place
+    depths = {key: len(key[0] + key[1]) for key, own in groups.items() if len(own) > 1}
+    nearest = [key for key, depth in depths.items() if depth == min(depths.values())]
+    if not nearest:
+        only = folder_of_images(folder)
+        return _by_names(only, images_of_folder(only))
+    if len(nearest) > 1:
         raise InputError(no_images(folder))
-    return _one_each(sorted(inside, key=lambda p: natural_key(p.name)))
+    rig = groups[nearest[0]]
+    return _by_folder({name: rig[name] for name in sorted(rig, key=natural_key)})
 
 
 def _images(folder: Path) -> list[Path]:
@@ -221,31 +248,36 @@ def _images(folder: Path) -> list[Path]:
 
 
 def _one_each(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
-    out: dict[str, list[tuple[Path, str]]] = {}
+    named: dict[str, Path] = {}
     for folder in folders:
-        name = check_identifier(folder.resolve().name, f"folder '{folder}', the name of a camera,")
-        if name in out:
+        name = folder.resolve().name
+        if name in named:
             raise InputError(f"two folders are called '{name}', which names a camera; rename one")
-        images = _images(folder)
-        if not images:
-            raise InputError(no_images(folder))
-        out[name] = [(folder, f"*{suffix}") for suffix in _suffixes(images)]
-    return out
+        named[name] = folder if _images(folder) else folder_of_images(folder)
+    return _by_folder(named)
+
+
+def _by_folder(named: Mapping[str, Path]) -> dict[str, list[tuple[Path, str]]]:
+    """Return the images of cameras, each with a folder of its own."""
+    for name, folder in named.items():
+        check_identifier(name, f"folder '{folder}', the name of a camera,")
+    return {name: [(named[name], f"*{suffix}") for suffix in _suffixes(_images(named[name]))] for name in named}
 
 
 def _by_names(folder: Path, images: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
     """Return the cameras by the images' names: several only if every name has a side."""
     sides: dict[str, dict[str, None]] = {}
-    found = [NAMED_FIRST.fullmatch(image.stem) or NAMED_LAST.fullmatch(image.stem) for image in images]
-    named = [name for name in found if name is not None]
-    rests = Counter(name["rest"] for name in named)
-    numbered = all(rest.isdigit() for rest in rests)
+    found = [next((m for form in NAMES if (m := form.fullmatch(image.stem))), None) for image in images]
+    named = [name.groupdict("") for name in found if name is not None]
+    rests = Counter((name.get("before", ""), name["rest"]) for name in named)
+    numbered = all(rest.isdigit() for _, rest in rests)
+    sure = numbered and all(len(name["side"]) > 1 for name in named)
     shared = sum(count for count in rests.values() if count > 1)
-    if len(named) == len(images) and (numbered or shared >= MIN_IN_COMMON * len(images)):
+    if len(named) == len(images) and (sure or shared >= MIN_IN_COMMON * len(images)):
         for image, name in zip(images, named, strict=True):
-            side, gap = name["side"], name["gap"]
-            before = f"{side}{gap}{'[0-9]*' if numbered else '*[0-9]'}"
-            pattern = before if image.stem.startswith(side) else f"*[0-9]{gap}{side}"
+            side, gap, start = name["side"], name["gap"], name.get("before", "")
+            begin = f"{glob.escape(start)}{side}{gap}{'[0-9]*' if numbered else '*[0-9]'}"
+            pattern = begin if image.stem.startswith(start + side) else f"*[0-9]{gap}{side}"
             sides.setdefault(side.lower(), {})[pattern + image.suffix] = None
     if len(sides) < 2:
         return {"": [(folder, f"*{suffix}") for suffix in _suffixes(images)]}

@@ -68,7 +68,7 @@ def test_reads_boards_on_one_mount(tmp_path: Path) -> None:
         (HEAD + LEFT, "at least two"),
         (HEAD + LEFT + LEFT, "its own"),
         (HEAD + 'images = "*.jpg"\n' + LEFT + RIGHT, "together with"),
-        (HEAD + 'frames = "clock"\n' + LEFT + RIGHT, "known: name, number, order"),
+        (HEAD + 'frames = "clock"\n' + LEFT + RIGHT, "known: name, number, time, order"),
         (HEAD + LEFT + RIGHT + BASELINE.replace('b = "right"', 'b = "rihgt"'), "known: left, right"),
         (HEAD + LEFT + RIGHT + BASELINE.replace('b = "right"', 'b = "left"'), "name two cameras"),
         (HEAD + LEFT + RIGHT + BASELINE.replace("sigma_mm = 1.0\n", ""), "sigma_mm"),
@@ -98,6 +98,23 @@ def test_frames() -> None:
     assert by_number["r"]["right10.jpg"] not in by_number["l"].values()
     by_order = frames_of_images({"l": ["x", "y"], "r": ["p", "q"]}, "order")
     assert by_order["l"]["y"] == by_order["r"]["q"] != by_order["r"]["p"]
+
+
+def test_times_nearly_the_same_are_of_one_moment() -> None:
+    """Drivers stamp each image when it arrives: 137 ns apart here, with one frame that the second camera lost."""
+    first = [f"{1403636579763555584 + 50_000_000 * k}.png" for k in range(4)]
+    second = [f"{1403636579763555584 + 50_000_000 * k + 137}.png" for k in (0, 1, 3)]
+    frames = frames_of_images({"cam0": first, "cam1": second})
+    assert [frames["cam1"][image] for image in second] == [frames["cam0"][first[k]] for k in (0, 1, 3)]
+    assert len(set(frames["cam0"].values())) == 4
+    seconds = frames_of_images({"a": ["1700000000.25.png", "1700000001.5.png"], "b": ["1700000000.4.png"]})
+    assert seconds["a"]["1700000000.25.png"] == seconds["b"]["1700000000.4.png"]
+    with pytest.raises(InputError, match="by the times in their names"):
+        frames_of_images({"a": ["1700000000.0.png", "1700000001.0.png"], "b": ["1700000000.5.png"]})
+    with pytest.raises(InputError, match="are of one time"):
+        frames_of_images({"a": ["mon/1700000000.png", "tue/1700000000.png"], "b": ["1700000000.png"]})
+    with pytest.raises(InputError, match=r"'left1\.png' of camera 'a' is not named by a time"):
+        frames_of_images({"a": ["left1.png"], "b": ["1700000000.png"]}, "time")
 
 
 def test_images_of_one_name_in_many_folders_are_named() -> None:

@@ -11,7 +11,7 @@ import PIL.Image
 import pytest
 
 from rigkit.core.errors import InputError
-from rigkit.io.media.images import no_images, quiet_opencv, read_image, to_grey
+from rigkit.io.media.images import folder_of_images, no_images, quiet_opencv, read_image, to_grey
 from rigkit.workflows.detect import images_in
 
 
@@ -208,12 +208,15 @@ def test_a_folder_without_images_says_what_it_holds_instead(tmp_path: Path) -> N
         (tmp_path / day).mkdir()
         (tmp_path / day / "a.PNG").touch()
         if day == "monday":
-            assert no_images(tmp_path).endswith(f"but '{tmp_path / 'monday'}' has some; give that")
+            assert folder_of_images(tmp_path) == tmp_path / "monday"
     words = no_images(tmp_path)
     assert f"but '{tmp_path / 'monday'}' and 1 more below it have" in words
     assert f'images = "{tmp_path}/**/*.PNG"' in words
     (tmp_path / "a.jp2").touch()
     assert "formats that are not read, 'a.jp2' the first" in no_images(tmp_path)
+    (tmp_path / "tuesday" / "a.PNG").unlink()
+    with pytest.raises(InputError, match="formats that are not read"):
+        folder_of_images(tmp_path)
 
 
 def test_an_unreadable_subfolder_does_not_end_the_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,4 +232,4 @@ def test_an_unreadable_subfolder_does_not_end_the_search(tmp_path: Path, monkeyp
         return scandir(path)
 
     monkeypatch.setattr(os, "scandir", refuse)
-    assert "images' has some; give that" in no_images(tmp_path)
+    assert folder_of_images(tmp_path) == tmp_path / "images"
