@@ -137,9 +137,12 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     if len(words) < len(determined) or not words:
         return None
     what, count = guess.board.describe().split(", ")[0], len(guess.images)
+    # The keys of another type differ, too.
+    same_type = any(board.pattern.type == guess.board.pattern.type for board in boards)
+    whole = "" if same_type else f", as in --board {words_of_board(guess.board)}"
     if what in words[0]:
-        return f"in {counted(count, 'image')} {words[0]}"
-    return f"{what} seen in {counted(count, 'image')}; {words[0]}"
+        return f"in {counted(count, 'image')} {words[0]}{whole}"
+    return f"{what} seen in {counted(count, 'image')}; {words[0]}{whole}"
 
 
 def misread(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:

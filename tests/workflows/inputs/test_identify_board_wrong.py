@@ -65,6 +65,9 @@ def test_a_board_that_is_as_declared_needs_no_words_and_another_kind_some(folder
     plain, larger = Board("plain", 7, 7, 30.0, 30.0), Board("c", 8, 8, 30.0, 30.0, pattern=BOARD.pattern)
     printed = explained([folder / "0.png"], [plain, larger])
     assert printed is not None and 'set type = "charuco"' in printed
+    printed = explained([folder / "0.png"], [plain])
+    assert printed is not None
+    assert 'set type = "charuco", as in --board charuco:7x7xMM,dictionary=DICT_4X4_50,marker_mm=(0.7' in printed
     printed = explained([folder / "0.png"], [larger])
     assert printed is not None and "8 x 8 are declared" in printed
 
