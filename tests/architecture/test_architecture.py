@@ -172,7 +172,7 @@ def test_a_verb_is_a_page() -> None:
     assert not {verb: n for verb, n in lines.items() if n > MAX_VERB_LINES}
 
 
-def test_every_room_says_what_is_in_it() -> None:
+def test_every_folder_has_a_docstring() -> None:
     """And calibration lists modules that there are, in the order of the work."""
     rooms = [path for path in MODULES if path.name == "__init__.py"]
     assert not [path for path in rooms if not ast.get_docstring(tree_of(path))]

@@ -29,7 +29,7 @@ def calibrations() -> list[Calibration]:
     return out
 
 
-def test_calibrations_of_one_camera_are_the_same(calibrations: list[Calibration]) -> None:
+def test_calibrations_of_one_camera_do_not_differ(calibrations: list[Calibration]) -> None:
     results = [compare_calibrations(a, b) for a, b in itertools.pairwise(calibrations)]
     assert all(result.same for result in results)
     ratio = float(np.median([result.ratio for result in results]))
@@ -37,7 +37,7 @@ def test_calibrations_of_one_camera_are_the_same(calibrations: list[Calibration]
     assert np.median([result.chance for result in results]) > 0.1
 
 
-def test_a_moved_lens_is_another_camera(calibrations: list[Calibration]) -> None:
+def test_a_moved_lens_differs(calibrations: list[Calibration]) -> None:
     a, b = calibrations[0], calibrations[1]
     shift = np.zeros(b.camera.parameters.size)
     shift[:2] = MOVED_PX
@@ -63,7 +63,7 @@ def in_other_models() -> dict[str, list[Calibration]]:
     return out
 
 
-def test_one_camera_in_two_models_is_one_camera(in_other_models: dict[str, list[Calibration]]) -> None:
+def test_one_camera_in_two_models_does_not_differ(in_other_models: dict[str, list[Calibration]]) -> None:
     """The polynomials are off this lens by several times what chance does to them."""
     ratios = []
     for a, b in itertools.combinations(in_other_models, 2):
@@ -74,7 +74,7 @@ def test_one_camera_in_two_models_is_one_camera(in_other_models: dict[str, list[
     assert 0.4 < np.median(ratios) < 1.6
 
 
-def test_what_models_make_of_one_lens_is_allowed_for(
+def test_differences_between_models_of_one_lens_are_allowed_for(
     in_other_models: dict[str, list[Calibration]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Surer than the models are alike.
@@ -89,7 +89,7 @@ def test_what_models_make_of_one_lens_is_allowed_for(
     assert compare_calibrations(*pair).predicted_px < 0.8 * allowed.predicted_px
 
 
-def test_a_moved_lens_is_another_camera_in_another_model_too(in_other_models: dict[str, list[Calibration]]) -> None:
+def test_a_moved_lens_differs_in_another_model_too(in_other_models: dict[str, list[Calibration]]) -> None:
     for name in ("scaramuzza 5", "scaramuzza 6"):
         for first, second in zip(in_other_models["kannala_brandt"], in_other_models[name], strict=True):
             grown = np.array(first.camera.parameters)
@@ -107,7 +107,7 @@ def test_a_moved_principal_point_is_found_in_either_model(in_other_models: dict[
         assert result.difference.rms_px < 0.5 * MOVED_PX and not result.same, (name, result.ratio, result.chance)
 
 
-def test_more_than_usual_is_a_chance_of_less_than_one_in_ten() -> None:
+def test_a_significant_difference_has_a_p_value_below_one_tenth() -> None:
     """Of several answers the chance takes the one that says most: what lay just beyond nineteen of twenty sizes stood
     beyond "nine of ten cases" beside a chance of .15."""
     sigma = np.array([2.0, 1.0, 0.8, 0.6])
@@ -125,7 +125,7 @@ def test_more_than_usual_is_a_chance_of_less_than_one_in_ten() -> None:
     assert 0.08 < chance <= 0.1 + 1e-3
 
 
-def test_nine_of_ten_differences_are_usual(calibrations: list[Calibration]) -> None:
+def test_nine_of_ten_differences_are_not_significant(calibrations: list[Calibration]) -> None:
     a, b = calibrations[:2]
     # Errors as one camera's two calibrations have them, each as if it were found.
     step = drawn_errors(a.covariance, a.freedom, np.random.default_rng(1)).T

@@ -9,7 +9,7 @@ CAMERAS = sample_cameras()
 
 
 @pytest.mark.parametrize("label", CAMERAS)
-def test_a_camera_says_its_numbers_by_name(label: str) -> None:
+def test_repr_names_every_parameter(label: str) -> None:
     camera = CAMERAS[label]
     head, _, values = repr(camera).removesuffix(")").partition(": ")
     assert head == f"{type(camera).__name__}({camera.size_px[0]}x{camera.size_px[1]} px"

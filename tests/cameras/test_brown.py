@@ -55,7 +55,7 @@ def test_field_of_view_ends_where_the_denominator_vanishes() -> None:
     assert np.tan(camera.max_angle_rad) <= np.sqrt(2.0)
 
 
-def test_a_pole_at_the_edge_leaves_the_middle_alone() -> None:
+def test_a_pole_at_the_edge_does_not_change_the_middle() -> None:
     """Found by a calibration: rounding puts the last tangent tried just beyond the pole of the denominator, where the
     radius is minus infinity."""
     distortion = (-0.21704038890666294, -0.04974512324895835, 0.0004146353136183291, -0.00023144410004960334)

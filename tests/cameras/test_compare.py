@@ -85,7 +85,7 @@ def test_mask_and_weights() -> None:
     assert weighted.map_px[mask].max() == pytest.approx(inside.max_px, rel=1e-3)
 
 
-def test_what_cannot_be_compared() -> None:
+def test_cameras_of_different_sizes_or_fields_of_view_are_not_compared() -> None:
     a = CAMERAS["kannala_brandt"]
     with pytest.raises(InputError, match="one image size"):
         compare_cameras(a, KannalaBrandt((640, 480), a.parameters))
@@ -101,6 +101,6 @@ def test_what_cannot_be_compared() -> None:
 @pytest.mark.parametrize(
     "grid", [(20.5, 15), (0, 15), (-1, -1), (20,), (np.nan, 15), ("a", "b"), (True, True), (10**9, 2), 20]
 )
-def test_a_grid_that_is_none(grid: object) -> None:
+def test_an_empty_grid_is_refused(grid: object) -> None:
     with pytest.raises(InputError, match="grid"):
         compare_cameras(CAMERAS["pinhole"], CAMERAS["pinhole"], grid=grid)  # type: ignore[arg-type]

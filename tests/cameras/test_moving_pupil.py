@@ -68,14 +68,14 @@ def test_far_away_it_is_the_lens(rng: np.random.Generator) -> None:
     assert far_camera(near) is lens and far_camera(lens) is lens
 
 
-def test_what_several_rays_meet_is_not_seen() -> None:
+def test_a_point_on_several_rays_is_invalid() -> None:
     near = NearCamera.of(sample_cameras()["kannala_brandt"], PUPIL)
     points = np.array([[2.0, 0.0, 3.0], [np.nan, 0.0, 1.0], [40.0, 0.0, 40.0]])
     assert near.project(points)[1].tolist() == [False, False, True]
     assert not np.isfinite(near.seen(points)[0]).any()
 
 
-def test_a_board_is_where_it_is_and_not_where_a_central_camera_has_it() -> None:
+def test_the_board_pose_accounts_for_the_moving_pupil() -> None:
     near = NearCamera.of(sample_cameras()["kannala_brandt"], PUPIL)
     board = Board("near", 7, 5, 15.0, 15.0)
     pose = Rigid3(exp_so3(np.array([0.3, 1.0, 0.2])), np.array([90.0, -30.0, 90.0]))

@@ -19,7 +19,7 @@ LENSES = {
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_lenses(model: str) -> None:
+def test_plausible_lenses_are_accepted(model: str) -> None:
     assert fault_of_lens(camera_model(model)((640, 480), np.array(LENSES[model]))) is None
 
 
@@ -37,7 +37,7 @@ def test_lenses(model: str) -> None:
         ("double_sphere", 1, 1e-9, "focal length"),
     ],
 )
-def test_no_lens(model: str, at: int, value: float, printed: str) -> None:
+def test_implausible_lenses_are_refused(model: str, at: int, value: float, printed: str) -> None:
     parameters = np.array(LENSES[model])
     parameters[at] = value
     assert printed in str(fault_of_lens(camera_model(model)((640, 480), parameters)))

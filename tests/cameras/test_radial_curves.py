@@ -102,7 +102,7 @@ def test_a_curve_that_flattens_at_its_end_does_not_fold_the_camera(model: str, s
     assert camera.max_angle_rad > theta[-1]
 
 
-def test_curves_that_make_no_camera() -> None:
+def test_curves_that_no_camera_has_are_refused() -> None:
     theta, radius = _curve(60)
     for bad_theta, bad_radius, words in (
         (theta[:4], radius[:4], "at least 4"),

@@ -50,7 +50,7 @@ def test_a_pair_moves_as_the_rig_does(first: int, second: int, number: int) -> N
         assert np.abs(np.abs(by) - np.abs(change[8:11])).max() < 1e-4 * MOVE
 
 
-def test_a_scale_that_is_not_sure_makes_baselines_longer() -> None:
+def test_the_scale_uncertainty_is_in_the_baseline() -> None:
     rig = UncertainRig(cameras=CAMERAS, cam_from_rig=POSES, covariance=np.zeros((24, 24)), scale_sigma=1e-3)
     (moved,) = rig.pair(1, 2).moved()
     here = POSES[2] @ POSES[1].inverse()

@@ -39,7 +39,7 @@ def test_another_print_of_a_measured_board_is_the_same_sheet(board: Path) -> Non
     assert before == again
 
 
-def test_a_board_of_either_pattern_is_said_to_be_one(
+def test_an_undetermined_charuco_pattern_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "a.png").touch()
@@ -65,7 +65,9 @@ def test_a_board_keeps_its_name(board: Path) -> None:
         (["--ruler-x-mm", "249", "--ruler-y-mm", "159"], "check the readings"),
     ],
 )
-def test_misread_rulers(board: Path, options: list[str], printed: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_misread_measurements_are_refused(
+    board: Path, options: list[str], printed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = board.read_bytes()
     assert main(["board", str(board), *options]) == 2
     assert printed in capsys.readouterr().err

@@ -72,7 +72,7 @@ def test_from_images_to_file_and_again_without_images(session: Path, capsys: pyt
     assert np.array_equal(again.camera.parameters, result.camera.parameters)
 
 
-def test_a_changed_image_is_looked_at_again(session: Path) -> None:
+def test_a_changed_image_is_detected_again(session: Path) -> None:
     assert main(["calibrate", str(session)]) == 0
     before = load_calibration(session.parent / "calibration.json")
     shutil.copy(session.parent / "00.jpg", session.parent / "01.jpg")
@@ -226,7 +226,7 @@ def test_session_where_nothing_can_be_written(
     assert target.is_file() and not (session.parent / "corners.json").exists()
 
 
-def test_what_is_no_image(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folders_are_skipped_and_missing_images_named(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A folder that the pattern meets is passed over; a listed image that is not there is a mistake."""
     (session.parent / "old.jpg").mkdir()
     assert main(["calibrate", str(session)]) == 0
@@ -271,7 +271,7 @@ def test_image_of_another_size_is_dropped_with_the_reason(session: Path) -> None
         ("scaramuzza", 0, "'degree' must be at least 1"),
     ],
 )
-def test_degrees_that_no_model_has(
+def test_impossible_degrees_are_refused(
     session: Path, capsys: pytest.CaptureFixture[str], model: str, degree: int, printed: str
 ) -> None:
     session.write_text(SESSION.replace("kannala_brandt", model) + f"degree = {degree}\n")
@@ -289,7 +289,9 @@ def test_degrees_that_no_model_has(
         ("rows = 1", "at least 2x2 inner corners"),
     ],
 )
-def test_boards_that_nobody_has(session: Path, capsys: pytest.CaptureFixture[str], line: str, printed: str) -> None:
+def test_impossible_boards_are_refused(
+    session: Path, capsys: pytest.CaptureFixture[str], line: str, printed: str
+) -> None:
     board = session.parent / "board.toml"
     key = line.split()[0]
     board.write_text("\n".join(line if row.startswith(key) else row for row in board.read_text().splitlines()))

@@ -56,7 +56,7 @@ def worst_px(camera: Camera) -> float:
     return float(np.abs(projected - pixels).max())
 
 
-def test_a_link_to_no_image_is_told(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_broken_link_is_named(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A store of data links images that were not fetched to nothing: the others are used, and these are named."""
     folder = of_one_camera(pictures, tmp_path / "photos")
     (folder / "DSC_9999.JPG").symlink_to(tmp_path / "store" / "abc.jpg")
@@ -184,7 +184,9 @@ def test_pictures_of_two_cameras_are_a_rig(pictures: Path, tmp_path: Path, layou
         (["cam0/1.jpg", "cam1/1.jpg", "other/1.jpg"], {"cam0": ["*.jpg"], "cam1": ["*.jpg"]}),
     ],
 )
-def test_what_names_tell_of_cameras(tmp_path: Path, names: list[str], expected: dict[str, list[str]] | None) -> None:
+def test_cameras_are_recognised_by_file_names(
+    tmp_path: Path, names: list[str], expected: dict[str, list[str]] | None
+) -> None:
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
@@ -302,7 +304,7 @@ def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(pictures: Pat
     np.testing.assert_array_equal(reported.covariance, saved_rig.covariance[9:18, 9:18])
 
 
-def test_what_is_known_of_cameras_stands_in_their_session(
+def test_known_cameras_are_written_to_the_session(
     pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     lens, known = tmp_path / "lens.yaml", tmp_path / "known.json"
@@ -352,7 +354,7 @@ def test_the_square_is_enough_where_images_show_the_board(pictures: Path, tmp_pa
         (["--square-mm", "30", "--board", "9x6x30"], "leave --square-mm out"),
     ],
 )
-def test_a_square_that_says_nothing_is_refused(
+def test_an_unusable_square_size_is_refused(
     reported: list[str], words: str, pictures: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["calibrate", str(pictures), *reported]) == 2
@@ -360,7 +362,7 @@ def test_a_square_that_says_nothing_is_refused(
 
 
 @pytest.mark.parametrize("options", [(), ("--board", "9x6x30"), ("--square-mm", "25")])
-def test_a_folder_that_is_not_there_is_said_to_be_missing(
+def test_a_missing_folder_is_named(
     options: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["calibrate", str(tmp_path / "photos"), *options]) == 2

@@ -56,7 +56,7 @@ def test_a_length_with_page_sheet_and_limit(rig: Path, capsys: pytest.CaptureFix
     assert "beyond the limit" in capsys.readouterr().out
 
 
-def test_what_rests_on_a_bad_calibration_is_no_certificate(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bad_calibration_gets_no_certificate(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Its sigmas hold for lenses as it takes them to be: a limit that is kept says nothing."""
     data = json.loads(rig.read_text())
     asked = ["certify", str(rig), "--length", "300", "--distance", "1200", "--limit", "1000"]
@@ -80,7 +80,7 @@ def test_what_rests_on_a_bad_calibration_is_no_certificate(rig: Path, capsys: py
 
 
 @pytest.mark.parametrize("quantity", ["depth", "plane", "angle"])
-def test_the_result_for_programs(quantity: str, rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_has_the_certificate(quantity: str, rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["certify", str(rig), f"--{quantity}", "50", "--distance", "900", "--json"]
     assert main(command) == 0
     reported = json.loads(capsys.readouterr().out)
@@ -114,7 +114,7 @@ def test_bad_input(
     assert rig.read_bytes() == before
 
 
-def test_a_rig_that_does_not_say_how_sure_it_is(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rig_without_covariance_is_refused(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = json.loads(rig.read_text())
     del data["covariance"]
     rig.write_text(json.dumps(data))

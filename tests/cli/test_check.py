@@ -233,7 +233,9 @@ def test_pictures_that_were_flipped_are_no_moved_principal_point(
     assert "not written: the pictures were flipped" in printed.err and not fixed.exists()
 
 
-def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_exit_codes_of_unchanged_and_changed_cameras(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     calibration, register = str(home / "cam.json"), tmp_path / "cam.jsonl"
     also = ["--register", str(register), "--temperature", "20.5"]
     page, fixed = tmp_path / "check.html", tmp_path / "fixed.json"
@@ -280,14 +282,16 @@ def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest
         (["{cam}", "{one}", "--board", "9x7x25"], "9 x 6 inner corners are seen in 1 of 1 images, 9 x 7 are declared"),
     ],
 )
-def test_what_is_refused(command: list[str], words: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unusable_inputs_are_refused(
+    command: list[str], words: str, home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     one = sorted((home / "same").iterdir())[0]
     names = {"cam": str(home / "cam.json"), "same": str(home / "same"), "home": str(home), "one": str(one)}
     assert main(["check", *(part.format(**names) for part in command)]) == 2
     assert words in capsys.readouterr().err
 
 
-def test_another_program_says_not_how_sure_it_is(
+def test_a_calibration_without_covariance_is_refused(
     home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     there = str(tmp_path / "camchain.yaml")
@@ -297,7 +301,9 @@ def test_another_program_says_not_how_sure_it_is(
         assert "does not say how sure it is" in capsys.readouterr().err
 
 
-def test_what_was_wrong_before_is_no_change(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_in_earlier_pictures_are_no_change(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A file whose focal length is off by a hundredth; pictures of before, some more, and some after a knock."""
     wrong, register, fixed = tmp_path / "wrong.json", tmp_path / "cam.jsonl", tmp_path / "fixed.json"
     reported = json.loads((home / "cam.json").read_text())
@@ -323,7 +329,7 @@ def test_what_was_wrong_before_is_no_change(home: Path, tmp_path: Path, capsys: 
     assert "both a fresh image and one of before" in capsys.readouterr().err
 
 
-def test_what_would_have_been_found_needs_no_more_pictures() -> None:
+def test_enough_power_asks_for_no_more_pictures() -> None:
     sure = Power(
         kind="focal length", camera="left", size=0.1, unit="px", chance=0.97, found_from=0.08, frames=3, both=None
     )

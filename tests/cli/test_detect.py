@@ -122,7 +122,7 @@ def test_no_board_anywhere_fails_the_check(tmp_path: Path, capsys: pytest.Captur
     assert not (tmp_path / "c.csv").exists()
 
 
-def test_images_of_another_board_are_told_what_they_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_of_another_board_name_that_board(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = np.full((420, 480), 255, np.uint8)
     for row in range(5):
         for column in range(6):

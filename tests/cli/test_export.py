@@ -54,14 +54,14 @@ def test_a_camera_goes_out_and_comes_back(kind: str, tmp_path: Path, capsys: pyt
     assert np.abs(again - pixels).max() < REFIT_PX
 
 
-def test_what_is_lost_beside_a_calibration_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_losses_of_a_format_are_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO"):
         files = foreign_files(load_calibration(CALIBRATION), tmp_path / "fish.json", ["kalibr"])
     assert [path.name for path in files] == ["fish-kalibr.yaml"]
     assert "fish-kalibr.yaml: " in caplog.text
 
 
-def test_nothing_is_said_where_nothing_is_lost(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_lossless_format_reports_no_loss(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     p = BROWN.parameters.size
     calibration = load_calibration(CALIBRATION)
     brown = replace(calibration, camera=BROWN, covariance=np.eye(p), frame_covariance=np.eye(p + 6))
@@ -263,7 +263,7 @@ def test_a_colmap_model_names_its_two_images_differently(
     assert ("rename the file" in capsys.readouterr().err) == (" " in "".join(files).replace("my rig/", ""))
 
 
-def test_what_is_missing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_inputs_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(LAB), "-o", str(tmp_path / "x.ply")]) == 2
     assert "--pair" in capsys.readouterr().err
     assert main(["export", str(tmp_path / "none.yaml"), "--from", "opencv", "-o", str(tmp_path / "x.json")]) == 2

@@ -128,7 +128,7 @@ def test_a_wrong_archive_leaves_nothing(tmp_path: Path, served: bytes | None, me
     assert not [path for path in (tmp_path / "data").rglob("*") if path.is_file()]
 
 
-def test_what_cannot_be_fetched_yet_is_said(
+def test_files_without_an_address_are_reported(
     tmp_path: Path, server: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     catalogue = described(tmp_path, {"left/01.png": f"{server}/01.png"})

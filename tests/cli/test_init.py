@@ -92,7 +92,7 @@ def test_names_that_begin_with_the_side(tmp_path: Path, rests: tuple[str, str]) 
     assert [p.first.image.stem for p in group_pairs(lefts, root)] == ["left_view1"]
 
 
-def test_what_images_cannot_tell_must_be_said(
+def test_facts_that_images_do_not_show_are_required(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import io
@@ -115,7 +115,7 @@ def test_an_empty_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 @pytest.mark.parametrize(
     "options", [["--square-mm", "nan"], ["--square-mm", "-5"], ["--square-mm", "50", "--baseline-mm", "first=300+-0"]]
 )
-def test_lengths_that_are_none(options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_impossible_lengths_are_refused(options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(IMAGES / "fisheye-general", tmp_path / "first")
     assert main(["init", str(tmp_path), "--calibration", "c.json", "--pose-type", "general", *options]) == 2
     assert "positive number" in capsys.readouterr().err
@@ -200,7 +200,7 @@ def test_a_session_of_two_cameras_is_written_and_loads(tmp_path: Path, capsys: p
 
 
 @pytest.mark.parametrize("declared", ["90", "first=90+-x", "190+-1", "90+-0"])
-def test_angles_that_are_none(declared: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_impossible_angles_are_refused(declared: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "first").mkdir()
     shutil.copy(IMAGES / "fisheye-general" / "view1.jpg", tmp_path / "first")
     assert main(["init", str(tmp_path), "--square-mm", "50", "--angle-deg", declared]) == 2

@@ -94,7 +94,7 @@ def check(code: int, line: str, expected: int, *words: str) -> None:
         assert word in line
 
 
-def test_the_data_set_of_these_tests_is_right(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_unspoiled_data_set_passes(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
     code, line = run(write(), capsys)
     assert (code, line) == (0, "")
 
@@ -229,7 +229,7 @@ def test_a_failed_run_leaves_old_results(write: Write, tmp_path: Path, capsys: p
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["tables.md"]
 
 
-def test_two_boards_are_reconstructed_and_the_third_is_said_to_be_missing(
+def test_two_boards_are_reconstructed_and_the_missing_third_is_named(
     write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from rigkit.detection.detect import detect_boards
@@ -317,7 +317,7 @@ def test_names_that_no_file_system_takes(
     assert not any(tmp_path.iterdir())
 
 
-def test_numbers_that_overflow_are_told_in_one_line(tmp_path: Path) -> None:
+def test_overflowing_numbers_are_one_line(tmp_path: Path) -> None:
     """In a process of its own, as the tests keep warnings to themselves."""
     cloud = Path(__file__).parents[1] / "corpus" / "ply" / "point-not-finite.ply"
     words = [sys.executable, "-m", "rigkit", "mesh", str(cloud), "-o", str(tmp_path / "mesh.ply")]
@@ -347,7 +347,7 @@ def test_numbers_that_overflow_are_told_in_one_line(tmp_path: Path) -> None:
         ("export cloud.ply -p regular-general -o x.las", "--pair"),
     ],
 )
-def test_options_of_one_verb(
+def test_invalid_arguments_of_a_verb_are_one_line(
     words: str, reported: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     places = {

@@ -212,12 +212,12 @@ def room(lab: Lab) -> tuple[Board, ...]:
     return tuple(walls)
 
 
-def test_it_is_printed(lab: Lab) -> None:
+def test_every_board_is_printed(lab: Lab) -> None:
     assert main(["board", lab.target, "--paper", "a1", "-o", lab.path("print")]) == 0
     assert all(Path(lab.path(f"print.{end}")).stat().st_size > 0 for end in ("pdf", "svg"))
 
 
-def test_images_tell_it(lab: Lab, fresh: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_board_is_identified_from_images(lab: Lab, fresh: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["board", "identify", fresh]) == 0
     printed = capsys.readouterr().out
     assert f"seen in {FRESH} of {FRESH} images" in printed
@@ -225,7 +225,7 @@ def test_images_tell_it(lab: Lab, fresh: str, capsys: pytest.CaptureFixture[str]
     assert f"--board {f'{kind}:' if kind else ''}{size.rpartition('x')[0]}xMM" in printed
 
 
-def test_one_camera(lab: Lab, calibration: str) -> None:
+def test_every_board_calibrates_one_camera(lab: Lab, calibration: str) -> None:
     found = load_calibration(calibration)
     assert found.heldout_rms_px is not None and found.heldout_rms_px < HELD_OUT_PX
     assert not found.dropped and len(found.views) == VIEWS
@@ -234,7 +234,7 @@ def test_one_camera(lab: Lab, calibration: str) -> None:
     assert shape.board.size == lab.board.size
 
 
-def test_it_still_holds_without_a_board_told(calibration: str, fresh: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_recognises_every_board(calibration: str, fresh: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", calibration, fresh]) == 0
     assert "Still holds" in capsys.readouterr().out
 
@@ -318,7 +318,7 @@ def test_boards_on_one_mount(lab: Lab, room: tuple[Board, ...]) -> None:
     assert abs(mount.angle_deg("plane1", "plane2")[0] - 90.0) < ANGLE_DEG
 
 
-def test_the_coach_takes_pictures_of_it(lab: Lab, left: str, tmp_path: Path) -> None:
+def test_the_coach_takes_pictures_of_every_board(lab: Lab, left: str, tmp_path: Path) -> None:
     options = CoachOptions(
         folder=tmp_path / "coached",
         boards=(lab.words,),

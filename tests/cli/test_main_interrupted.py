@@ -95,7 +95,9 @@ def test_workers_end_with_the_program(tmp_path: Path, how: signal.Signals, to_al
         time.sleep(0.02)
 
 
-def test_a_full_disk_is_no_bug_of_ours(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_full_disk_is_not_reported_as_a_bug(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def full(args: object) -> int:
         raise OSError(28, "No space left on device", "results/cloud.ply")
 
@@ -104,7 +106,7 @@ def test_a_full_disk_is_no_bug_of_ours(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert "'results/cloud.ply': No space left on device" in capsys.readouterr().err
 
 
-def test_too_little_memory_is_no_bug_of_ours(
+def test_too_little_memory_is_not_reported_as_a_bug(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def large(args: object) -> int:
@@ -121,12 +123,12 @@ def _ends(_: int) -> None:
     os._exit(1)
 
 
-def test_a_worker_that_is_killed_is_told_in_words() -> None:
+def test_a_killed_worker_is_one_line() -> None:
     with pytest.raises(InputError, match="-j 1"), worker_pool(1) as pool:
         list(pool.map(_ends, [0]))
 
 
-def test_a_worker_that_is_killed_while_another_starts_is_told_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_killed_while_another_starts_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """The pool would close its queues under the one that starts, or wait for it for ever."""
     start = ProcessPoolExecutor._spawn_process  # type: ignore[attr-defined]
 
@@ -193,7 +195,7 @@ def test_a_worker_of_the_callers_works_alone(monkeypatch: pytest.MonkeyPatch, jo
     assert list(over_items(lambda k: 2 * k, [1, 2], jobs=2)) == [(0, 2), (1, 4)]
 
 
-def test_a_system_without_these_signals_serves_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_system_without_these_signals_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows has no SIGHUP and no signal masks."""
     monkeypatch.delattr(signal, "SIGHUP")
     monkeypatch.delattr(signal, "pthread_sigmask")

@@ -98,7 +98,7 @@ def test_no_board_truth_or_session_of_a_data_set_is_lost(folder: Path) -> None:
     assert read >= {"dataset.toml", "board.toml", "session.toml", "camera.json", "corners.json", "view1.png"}
 
 
-def test_two_sessions_in_one_folder_do_not_meet(folder: Path) -> None:
+def test_two_sessions_in_one_folder_keep_their_own_results(folder: Path) -> None:
     shutil.copy(folder / "session.toml", folder / "night.toml")
     day, night = load_session(folder / "session.toml"), load_session(folder / "night.toml")
     assert day.result_path.name == "calibration.json" and day.corners_path.name == "corners.json"
@@ -126,7 +126,7 @@ def test_streams_that_cannot_take_every_letter(tmp_path: Path, closed: bool) -> 
 
 
 @pytest.mark.parametrize("full", ["2>/dev/full", ">/dev/full 2>/dev/full", ">&- 2>&-", "<&- 2>/dev/full"])
-def test_what_is_refused_is_refused_though_nobody_can_be_told(folder: Path, full: str) -> None:
+def test_a_closed_stderr_does_not_change_the_exit_code(folder: Path, full: str) -> None:
     done = subprocess.run(
         ["sh", "-c", f'"$@" {full}', "sh", sys.executable, "-m", "rigkit", "diff", "camera.json", "nowhere.json"],
         cwd=folder,

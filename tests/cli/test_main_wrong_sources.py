@@ -21,7 +21,7 @@ from rigkit.cli.main import main
         "validate photos.zip",
     ],
 )
-def test_pictures_that_are_packed(
+def test_archives_of_pictures_are_named(
     words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -31,7 +31,7 @@ def test_pictures_that_are_packed(
     assert "is a ZIP archive; unpack it" in capsys.readouterr().err
 
 
-def test_a_file_that_is_no_session_is_not_said_to_be_one(
+def test_a_file_of_another_kind_is_not_called_a_session(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

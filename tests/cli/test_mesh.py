@@ -52,7 +52,7 @@ def test_a_cloud_of_one_view_is_closed_along_lines_of_sight(tmp_path: Path) -> N
     assert meshes[True, ""] != meshes[False, ""]
 
 
-def test_what_cannot_be_meshed_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_clouds_that_cannot_be_meshed_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_ply(tmp_path / "cloud.ply", make_reconstruction().cloud)
     cloud, taken = str(tmp_path / "cloud.ply"), str(tmp_path / "taken.ply")
     (tmp_path / "taken.ply").write_text("mine")
@@ -108,7 +108,7 @@ def test_points_without_a_normal_are_left_out() -> None:
         poisson_mesh(replace(cloud, normals=normals), depth=3, cut=0.0)
 
 
-def test_normals_that_say_how_sure_they_are_are_read_as_unit_ones(tmp_path: Path) -> None:
+def test_normals_scaled_by_confidence_are_normalised(tmp_path: Path) -> None:
     cloud = make_reconstruction().cloud
     (tmp_path / "sure.ply").write_bytes(ply_bytes(cloud, confidence=True, single_precision=True))
     np.testing.assert_allclose(read_ply(tmp_path / "sure.ply").normals, cloud.normals, atol=1e-6)

@@ -63,7 +63,7 @@ def test_pictures_to_check_with(calibrated: Path, tmp_path: Path, capsys: pytest
     assert data["error_now"] is None and len(data["views"]) == 3
 
 
-def test_what_a_lens_will_reach(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_expected_accuracy_of_a_lens_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     errors = {}
     for views in (4, 12):
         command = ["plan", "--lens", "120", "--size", "1280x960", "--board", "9x6x30", "--views", str(views), "--json"]
@@ -84,7 +84,7 @@ def test_what_a_lens_will_reach(capsys: pytest.CaptureFixture[str]) -> None:
         (["plan", "--lens", "90", "--size", "640x480", "--board", "9x6x30", "--length", "3"], "belong together"),
     ],
 )
-def test_what_is_refused(command: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unusable_inputs_are_refused(command: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(command) == 2
     assert words in capsys.readouterr().err
 

@@ -73,7 +73,7 @@ def test_three_views_become_one_cloud(
     assert sorted(p.name for p in (folder / "out").iterdir()) == ["cloud.png", "scene.html", "scene.ply"]
 
 
-def test_what_cannot_be_fused_is_said(
+def test_views_that_cannot_be_fused_are_named(
     files: tuple[Path, list[str], Corner], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, images, _ = files
@@ -105,7 +105,7 @@ def test_views_are_paired_with_their_neighbours_that_look_the_same_way() -> None
     assert near_pairs([at(0.0, 0.0), at(0.0, 0.0), at(100.0, 0.0)]) == [(0, 2), (1, 2)]
 
 
-def test_images_of_a_rig_that_are_exchanged_are_told(
+def test_exchanged_images_of_a_rig_are_named(
     files: tuple[Path, list[str], Corner], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, images, _ = files

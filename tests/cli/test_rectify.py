@@ -31,7 +31,7 @@ def _files(tmp_path: Path) -> tuple[str, str]:
     return str(tmp_path / "image.png"), str(tmp_path / "camera.json")
 
 
-def test_what_is_to_the_right_comes_to_the_middle(
+def test_a_view_to_the_right_shows_the_right_in_the_middle(
     files: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "new" / "out.png"
@@ -185,7 +185,7 @@ def test_folders_of_a_pair_are_rectified_with_their_geometry(
 
 
 @pytest.mark.parametrize("name", ["out.xyz", "out.json"])
-def test_a_kind_of_image_that_nobody_writes_is_known_before_the_work(
+def test_an_unknown_image_format_is_refused_before_the_work(
     name: str,
     files: tuple[str, str],
     tmp_path: Path,
@@ -334,7 +334,7 @@ def test_two_videos_frame_by_frame(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("angle", ["nan", "inf"])
-def test_a_view_that_is_no_number_is_no_fault_of_the_camera(
+def test_a_view_that_is_not_a_number_is_blamed_on_the_option(
     angle: str, files: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["rectify", files[0], "--camera", files[1], "-o", str(tmp_path / "out.png"), "--yaw-deg", angle]

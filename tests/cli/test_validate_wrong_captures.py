@@ -246,7 +246,7 @@ def test_a_lens_that_is_in_no_calibration_is_named(
 
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
-def test_a_pair_without_a_baseline_does_not_take_the_others_with_it(
+def test_a_pair_without_a_baseline_does_not_end_the_others(
     capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str], jobs: str
 ) -> None:
     scenes = capture[1]

@@ -164,7 +164,7 @@ def test_two_cameras_take_frames_together(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_who_has_no_camera_is_told_what_to_do(tmp_path: Path) -> None:
+def test_without_a_camera_the_page_says_what_to_do(tmp_path: Path) -> None:
     """And nothing is complained of where the pictures come from elsewhere, and none is there yet."""
     (tmp_path / "incoming").mkdir()
     with _guided(None, tmp_path / "a", tmp_path / "pa", "--watch", str(tmp_path / "incoming")) as page:

@@ -106,7 +106,7 @@ def reported(guide: RigGuide, later: Later, found: RigCalibration) -> None:
     assert later.tell(later.rig) == FRAMES - 1
 
 
-def test_a_rig_waits_for_its_own_calibration_and_says_what_that_states(
+def test_a_capture_ends_only_after_the_rig_is_calibrated(
     frames: list[list[FrameObservation]], rig: RigCalibration
 ) -> None:
     later = Later(rig)
@@ -127,7 +127,9 @@ def test_a_rig_waits_for_its_own_calibration_and_says_what_that_states(
     assert state["error"].startswith("left ") and state["share"] <= 1.0 and state["mount_px"] is None
 
 
-def test_a_rig_is_asked_with_what_its_lenses_found(frames: list[list[FrameObservation]], rig: RigCalibration) -> None:
+def test_the_rig_reuses_the_calibrations_of_its_lenses(
+    frames: list[list[FrameObservation]], rig: RigCalibration
+) -> None:
     later = Later(rig, slow=1)
     guide = guide_of(frames, later)
     for _ in range(3):

@@ -70,9 +70,7 @@ def guide_of(views: Sequence[BoardView], executor: Executor, goal_px: float) -> 
     return guide
 
 
-def test_it_waits_for_all_of_calibrate_and_says_what_that_states(
-    views: list[BoardView], whole: WholeCalibration
-) -> None:
+def test_a_capture_ends_only_after_a_whole_calibration(views: list[BoardView], whole: WholeCalibration) -> None:
     later = Later()
     guide = guide_of(views, later, goal_px=10.0)
     seen = FrameObservation(size_px=SIZE, view=views[0], edge_px=2.0, moved_px=0.0, contrast=150.0)
@@ -91,7 +89,9 @@ def test_it_waits_for_all_of_calibrate_and_says_what_that_states(
     assert after.waits and not after.enough and after.left[0].error < now.left[0].error
 
 
-def test_what_all_of_calibrate_is_less_sure_of_is_not_enough(views: list[BoardView], whole: WholeCalibration) -> None:
+def test_a_larger_uncertainty_of_the_whole_calibration_asks_for_more(
+    views: list[BoardView], whole: WholeCalibration
+) -> None:
     stated = float(projection_goal(whole.stated.camera).error(whole.stated.covariance))
     # As with a rival that nobody has told apart yet.
     unsure = replace(whole, stated=UncertainCamera(whole.stated.camera, 9.0 * whole.stated.covariance))
@@ -139,7 +139,7 @@ def test_without_its_process_the_capture_goes_on(views: list[BoardView], whole: 
     assert at_once.arrived() and meanwhile.arrived() and at_once.latest is meanwhile.latest is whole
 
 
-def test_who_asks_how_things_are_is_told_what_was_calibrated_meanwhile(
+def test_asking_for_the_state_takes_in_a_finished_calibration(
     views: list[BoardView], whole: WholeCalibration, tmp_path: Path
 ) -> None:
     """Photos come one by one: no look follows the last."""

@@ -37,7 +37,7 @@ def covered(seed: int, lens: str, kind: str, board: Board = BOARD, noise_levels:
     return scored(list(detect_boards(laid_over(image, mask, kind, rng), [board])), truth.pixels, sides, mask)
 
 
-def test_what_is_seen_of_covered_boards_is_found_and_nothing_else() -> None:
+def test_the_visible_part_of_covered_boards_is_found_and_nothing_else() -> None:
     total = Score()
     for lens, kind, seed in product(("regular", "fisheye"), ("flat", "texture", "hand"), range(SEEDS)):
         total.add(covered(seed, lens, kind))

@@ -98,7 +98,7 @@ def test_the_shape_of_the_blur(length_px: float, direction: float) -> None:
 
 
 @pytest.mark.parametrize("matrix", [[[0.4, -0.25], [-0.25, 0.8]], [[0.3, 0.0], [0.0, 0.3]], [[1.2, 0.1], [0.1, 0.7]]])
-def test_what_is_resampled_lies_where_it_says(matrix: list[list[float]]) -> None:
+def test_resampled_points_map_back_to_the_image(matrix: list[list[float]]) -> None:
     _, corners = moved_board(0.0, 0.0, 0.2)
     u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
     ramp = np.asarray(40.0 + 0.5 * u + 0.2 * v, np.float32)
@@ -124,7 +124,7 @@ def test_a_corner_that_motion_smears_is_one() -> None:
     assert every.mean() > 0.9
 
 
-def test_unsure_corners_stay_where_the_others_foretell_them_as_well_as_they_can() -> None:
+def test_uncertain_corners_are_kept_where_the_others_predict_them() -> None:
     sigma, off, gain = np.full((3, 6, 8), 0.01)
     gain[:] = 1.0
     gain[5] = 2.7

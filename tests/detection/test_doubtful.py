@@ -42,9 +42,7 @@ def test_a_board_too_blurred_to_be_trusted_is_named(tmp_path: Path) -> None:
         detect_in_images([tmp_path / "a.png"])
 
 
-def test_what_is_seen_where_no_board_is_found_is_said_of_its_image(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rejected_grid_is_reported_with_its_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rigkit.workflows.detect._detect", lambda job: ((), f"a grid of {job.image.stem}"))
     (tmp_path / "a.png").touch()
     with pytest.raises(CheckFailed, match="a grid of a"):
@@ -52,7 +50,7 @@ def test_what_is_seen_where_no_board_is_found_is_said_of_its_image(
 
 
 @pytest.mark.parametrize("name", ["noise", "text", "texture"])
-def test_of_pictures_without_any_grid_nothing_is_said(name: str) -> None:
+def test_pictures_without_a_grid_have_no_finding(name: str) -> None:
     assert doubtful_grid(blank(name, np.random.default_rng(0))) is None
 
 

@@ -58,7 +58,7 @@ PLACES = (0.01, 0.02)
         "hexagonal",
     ],
 )
-def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Pattern) -> None:
+def test_everything_but_the_scale_is_identified(size: tuple[int, int], pattern: Pattern) -> None:
     board = Board("b", *size, 60.0, 60.0, pattern=pattern)
     images = []
     for seed in range(2):
@@ -186,7 +186,7 @@ def test_a_board_with_hidden_corners_is_as_large_as_its_grid() -> None:
     assert guess is not None and guess.board.size == (10, 7) and guess.images == (0, 1)
 
 
-def test_markers_far_into_a_dictionary_are_told() -> None:
+def test_markers_far_into_a_dictionary_are_identified() -> None:
     board = Board("b", 8, 5, 60.0, 60.0, pattern=Charuco("DICT_5X5_1000", 45.0, first_marker=600))
     guess = guess_board([shown(board)])
     assert guess is not None and isinstance(guess.board.pattern, Charuco)
@@ -288,7 +288,7 @@ def test_numbers_that_repeat_in_a_lattice_are_chance(monkeypatch: pytest.MonkeyP
     assert not TagObservations().look(0, shown(Board("b", 8, 6, 60.0, 60.0)))
 
 
-def test_circles_are_told_where_there_are_no_squares() -> None:
+def test_circle_grids_are_identified() -> None:
     board = Board("b", 5, 4, 60.0, 60.0, pattern=Circles(diameter_mm=30.0))
     guess = guess_board([shown(board)])
     assert guess is not None and guess.board.pattern.type == "circles" and sorted(guess.board.size) == [4, 5]
@@ -335,7 +335,7 @@ def test_aprilgrids_with_the_same_tags_in_rows_of_other_lengths_are_two() -> Non
     assert guess.board.size == (10, 6) and guess.images == (1,)
 
 
-def test_what_is_wrong_with_a_board_is_said() -> None:
+def test_faults_of_an_identified_board_are_reported() -> None:
     def board(columns: int, rows: int, pattern: Pattern) -> Board:
         return Board("b", columns, rows, 30.0, 30.0, pattern=pattern)
 

@@ -45,7 +45,7 @@ def test_a_board_whose_last_line_blur_hides() -> None:
     assert board_size_in([*cut, *seen((8, 5), (8, 6))]) is None
 
 
-def test_another_board_beside_the_one_told_contradicts_nothing() -> None:
+def test_another_board_beside_the_stated_one_is_no_contradiction() -> None:
     both = [[GridSeen((9, 6), WHOLE), GridSeen((12, 9), WHOLE)]] * 2
     assert board_size_in([*both, *seen(*[(9, 6)] * 3, (12, 9), (12, 9))]) == (((9, 6),), (0, 1, 2, 3, 4))
 

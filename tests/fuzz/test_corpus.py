@@ -14,7 +14,7 @@ CASES = sorted(path for path in CORPUS.rglob("*") if path.is_file())
 
 
 @pytest.mark.parametrize("damaged", CASES, ids=lambda path: str(path.relative_to(CORPUS)))
-def test_what_once_ended_badly(damaged: Path, case_place: Path) -> None:
+def test_inputs_of_former_faults_end_well(damaged: Path, case_place: Path) -> None:
     """Nothing but a result, or one line that names the file, comes of it in any of its readers."""
     (case_place / "out").mkdir()
     case = f"case{damaged.suffix}"
@@ -32,7 +32,7 @@ def test_cases_depend_on_seed_class_and_number_alone(seeds: Path, tmp_path: Path
     assert texts[0] != (seeds / "board.toml").read_bytes()
 
 
-def test_faults_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_harness_reports_faults(monkeypatch: pytest.MonkeyPatch) -> None:
     """An exception of another kind, a message without the file's name, and an exit code for bugs."""
 
     def raising(error: Exception) -> object:

@@ -224,7 +224,7 @@ def _is_worker(pid: int) -> bool:
         return False
 
 
-def test_what_is_cut_would_be_seen(place: Path) -> None:
+def test_the_check_notices_truncated_files(place: Path) -> None:
     for words in QUICK:
         assert main(words.split()) == 0
     results = sorted((place / "out").iterdir())

@@ -148,7 +148,7 @@ def test_a_session_comes_back_where_the_calibration_fails(place: Path, capsys: p
         (["pairs", "again"], "-o new.json", 2),
     ],
 )
-def test_a_calibration_that_fails_is_told_of_what_was_given(
+def test_a_failed_calibration_names_the_given_source(
     given: list[str], output: str, code: int, place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The session that was made of it is gone again; of several cameras the one at fault has its folder's name."""
@@ -192,7 +192,7 @@ def test_formats_of_others_are_recognised_by_content(
     assert "difference 0.0000 px rms" in capsys.readouterr().out
 
 
-def test_a_difference_that_cannot_be_told_names_both_files(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unavailable_difference_names_both_files(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = refused("diff calibration.json opencv.yaml", capsys)
     assert "'calibration.json' and 'opencv.yaml'" in line and "one image size" in line
 

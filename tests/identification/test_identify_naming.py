@@ -62,7 +62,7 @@ def test_layout_overrides_the_rule() -> None:
     assert names[1] == "one" and sorted(names) == ["one", "three", "two"]
 
 
-def test_two_of_three_are_named_by_their_sides_and_it_is_said() -> None:
+def test_two_of_three_boards_are_named_by_their_sides_with_a_note() -> None:
     names, notes = assign_board_ids([hanging("left"), hanging("floor")], board_kinds(EQUAL))
     assert names == ["three", "two"]
     assert "layout" in notes[0]

@@ -73,7 +73,7 @@ def test_native_models_come_back_unchanged(name: str, label: str) -> None:
 
 @pytest.mark.parametrize("name", sorted(set(FORMATS) - {"mrcal"}))
 @pytest.mark.parametrize("label", sorted(CAMERAS))
-def test_what_is_lost_is_stated(name: str, label: str) -> None:
+def test_losses_of_a_format_are_stated(name: str, label: str) -> None:
     """Other models are refitted; the largest error stated is what a user of the file gets."""
     write, read = FORMATS[name]
     camera = CAMERAS[label]

@@ -43,7 +43,7 @@ def test_a_refit_is_good_where_boards_were(outline: Pixels) -> None:
     assert errors[False] < 0.7 * errors[True]
 
 
-def test_what_lies_outside_is_not_forgotten() -> None:
+def test_a_refit_keeps_the_lens_outside_the_outline() -> None:
     """A refit to the middle alone could go anywhere at the border: its error there is stated, and weighed."""
     c = convert_camera(CAMERA, "brown", order=4, outline=OUTLINE)
     corners = np.array([[0.0, 0.0], [639.0, 0.0], [0.0, 479.0], [639.0, 479.0]])
@@ -52,7 +52,7 @@ def test_what_lies_outside_is_not_forgotten() -> None:
     assert off.max() == pytest.approx(c.outside_px, rel=1e-9)
 
 
-def test_mrcal_is_told_where_the_lens_is_known() -> None:
+def test_the_outline_is_written_to_mrcal() -> None:
     text = write_cameramodel(CAMERA, outline=OUTLINE).text
     region = ast.literal_eval(text[text.index("{") :])["valid_intrinsics_region"]
     np.testing.assert_allclose(region, [*OUTLINE, OUTLINE[0]])

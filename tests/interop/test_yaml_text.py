@@ -46,7 +46,7 @@ def test_doubles_come_back() -> None:
         ("a: 1\n" + "#" * MAX_CHARACTERS, "characters"),
     ],
 )
-def test_what_is_refused(text: str, words: str) -> None:
+def test_dangerous_yaml_is_refused(text: str, words: str) -> None:
     with pytest.raises(InputError, match=words) as caught:
         parse_yaml(text, "file.yaml")
     assert "file.yaml" in str(caught.value) and "\n" not in str(caught.value)

@@ -172,7 +172,7 @@ def test_products_are_those_of_all_changes(rng: np.random.Generator) -> None:
     assert right_side == pytest.approx(dense @ rest.ravel(), rel=1e-5, abs=1e-2)
 
 
-def test_values_at_nodes_are_told_on_straight_lines() -> None:
+def test_values_between_nodes_are_linear() -> None:
     places = places_of()
     shares = Shares.at(places, (3, 3), spacing=2.0, beyond=0.5, cubic=False, margin=0)
     row, column = np.mgrid[:3, :3]

@@ -136,7 +136,7 @@ def test_views_that_help_nothing_are_taken_though_rounding_makes_the_error_grow(
     assert taken in ([0], [1])
 
 
-def test_numbers_that_are_none_tell_of_no_view() -> None:
+def test_views_with_nan_are_refused() -> None:
     views = np.stack([np.diag([8.0, 1.0])] * 2)
     with pytest.raises(DegenerateError, match="nothing can be said of any view"):
         choose_views(np.full((2, 2), np.nan), views, Goal(np.eye(2), "px", "one"), 1, effort=lambda _: np.ones(2))
@@ -159,7 +159,7 @@ def test_planned_views_beat_views_anyhow(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize(("hfov", "model"), [(60.0, "brown"), (90.0, "brown"), (150.0, "kannala_brandt")])
-def test_a_guessed_lens_sees_what_was_said(hfov: float, model: str) -> None:
+def test_a_guessed_lens_has_the_stated_field_of_view(hfov: float, model: str) -> None:
     camera = guessed_camera(hfov, (1280, 960))
     assert camera.model == model
     (left, right), valid = camera.unproject(np.array([[-0.5, 479.5], [1279.5, 479.5]]))
@@ -186,7 +186,7 @@ def test_words(at: tuple[float, ...], turn_deg: tuple[float, ...], words: str) -
     assert str(placement(guessed_camera(60.0, (1280, 960)), board, Rigid3(rotation, at - rotation @ middle))) == words
 
 
-def test_an_error_of_the_image_is_told_in_mm() -> None:
+def test_an_image_error_is_converted_to_mm() -> None:
     # A pixel of a narrow lens is an angle of 1 / f.
     narrow = Pinhole((640, 480), np.array([10000.0, 10000.0, 319.5, 239.5]))
     assert px_words(narrow, 0.5) == "0.5 px, 0.05 mm at 1 m"

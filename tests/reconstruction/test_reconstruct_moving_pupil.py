@@ -60,19 +60,19 @@ def moved_by_one_sigma() -> tuple[UncertainCamera, NearCamera]:
     return known, moved
 
 
-def test_near_boards_are_where_they_are() -> None:
+def test_near_boards_are_reconstructed_with_the_pupil() -> None:
     found = geometry(NEAR)
     assert found.metric.baseline_mm == pytest.approx(scene().baseline_mm, abs=1e-5)
     assert off_mm(found).max() < 1e-4
     assert sum("the entrance pupil of the lens moves" in words for words in found.notes) == 2
 
 
-def test_as_if_from_one_point_they_are_not() -> None:
+def test_near_boards_are_wrong_without_the_pupil() -> None:
     found = geometry(NEAR.lens)
     assert np.median(off_mm(found)) > 0.3 and not any("pupil" in words for words in found.notes)
 
 
-def test_how_sure_the_pupil_is_counts_in_as_far_as_it_moves_the_pair() -> None:
+def test_the_pupil_uncertainty_is_in_the_pose_covariance() -> None:
     known, moved = moved_by_one_sigma()
     r = reconstruct_from(geometry(NEAR))
     shifts = calibration_shifts(r, known)
@@ -85,7 +85,7 @@ def test_how_sure_the_pupil_is_counts_in_as_far_as_it_moves_the_pair() -> None:
 
 
 @pytest.mark.parametrize("kind", ["coplanar", "lattice"])
-def test_and_the_planes_of_boards(kind: Planes) -> None:
+def test_the_pupil_uncertainty_is_in_the_planes_of_boards(kind: Planes) -> None:
     known, moved = moved_by_one_sigma()
     here, there = fit_planes(geometry(NEAR), kind, known, one_camera=True), fit_planes(geometry(moved), kind)
     for board in BOARDS:

@@ -77,7 +77,7 @@ def test_images_of_a_wall_meet_after_rectification() -> None:
     assert np.quantile(np.abs(pictures[0] - pictures[1])[seen], 0.99) < 0.5
 
 
-def test_what_cannot_be_rectified() -> None:
+def test_pairs_that_cannot_be_rectified_are_refused() -> None:
     fisheye, narrow = CAMERAS["kannala_brandt"], CAMERAS["pinhole"]
     with pytest.raises(DegenerateError, match="equirectangular"):
         rectify_pair(fisheye, fisheye, FORWARD)

@@ -36,7 +36,7 @@ def test_defaults_keep_the_resolution_and_the_field_of_view() -> None:
     assert target_camera(fisheye, "cylindrical").parameters[0] == pytest.approx(fisheye.focal_px, rel=1e-3)
 
 
-def test_what_no_image_shows() -> None:
+def test_impossible_fields_of_view_are_refused() -> None:
     for projection, hfov_deg in (("perspective", 175.0), ("cylindrical", 361.0), ("equirectangular", 0.0)):
         with pytest.raises(InputError, match="field of view"):
             target_camera(CAMERAS["pinhole"], projection, hfov_rad=np.radians(hfov_deg))  # type: ignore[arg-type]

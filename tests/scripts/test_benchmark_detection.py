@@ -48,7 +48,7 @@ def test_a_worker_answers_and_survives(peers: ModuleType, rng: np.random.Generat
         worker.close()
 
 
-def test_what_cannot_be_had_is_said(peers: ModuleType, tmp_path: Path) -> None:
+def test_missing_detectors_are_reported(peers: ModuleType, tmp_path: Path) -> None:
     assert "did not start" in peers.Worker("rigkit", str(tmp_path / "python")).missing
     # An interpreter without site packages has no peers.
     bare = tmp_path / "bare"

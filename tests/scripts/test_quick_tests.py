@@ -17,7 +17,7 @@ def chooser(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("quick_tests")
 
 
-def test_the_dear_go_where_others_reach_what_they_reach(chooser: ModuleType) -> None:
+def test_expensive_tests_are_left_out_where_others_reach_their_lines(chooser: ModuleType) -> None:
     # Name, seconds here and in processes, the fixture that it uses, and what it reaches of nine lines.
     table = (
         ("tests/a.py::short", 0.1, 0.0, None, "1........"),

@@ -76,7 +76,7 @@ def test_affinities_of_a_surface_that_bends() -> None:
     assert np.abs(found - exact).max() < MAX_CURVED
 
 
-def test_no_marks_are_said() -> None:
+def test_images_without_marks_are_reported() -> None:
     with pytest.raises(DegenerateError, match="no dark mark"):
         mark_lattice(np.full((100, 100), 200, np.uint8) * np.uint8(1), np.zeros(2), 3)
 

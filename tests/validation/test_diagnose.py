@@ -77,7 +77,7 @@ def test_wrong_squares_show_in_several_pairs() -> None:
     assert "square size: all 2 lengths" in found[0]
 
 
-def test_a_misread_baseline_is_told_by_the_other_lengths() -> None:
+def test_a_misread_baseline_is_recognised_by_the_other_lengths() -> None:
     found = diagnose([reported(stated_mm=BASELINE_MM / 1.03)])
     assert len(found) == 1
     assert "baseline comes out +3.0 %" in found[0]
@@ -146,13 +146,13 @@ def test_a_board_that_fits_nowhere_is_named_with_its_size_or_its_place() -> None
     )
 
 
-def test_a_board_that_stands_otherwise_is_named() -> None:
+def test_a_board_in_another_place_than_declared_is_named() -> None:
     found = diagnose([reported(angles=(91.6, 90.0, 88.4), distances=False)])
     assert len(found) == 1
     assert "'plane2' does not stand as measured" in found[0]
 
 
-def test_one_angle_that_was_misread_is_told_by_the_others_that_hold() -> None:
+def test_one_misread_angle_is_recognised_by_the_others() -> None:
     found = diagnose([reported(stated_deg=88.0, distances=False)])
     assert found == (
         "pair 'made': plane1-plane2: 88 was probably misread: the images show 90.00 deg (the other angles hold); "

@@ -62,7 +62,7 @@ def test_the_order_of_the_estimators() -> None:
     assert table.rows[0][3].value == pytest.approx((7.10 + 7.19 + 7.10 + 19.72) / 4)
 
 
-def test_what_is_not_known_bears_nothing_out() -> None:
+def test_unknown_figures_support_no_claim() -> None:
     unknown = evaluate_claim("x", [Comparison(float("nan"), "a", 1.0, "b")])
     assert unknown is not None and not unknown.holds
     assert evaluate_claim("x", []) is None

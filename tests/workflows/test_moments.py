@@ -44,7 +44,7 @@ def test_one_folder_holds_a_rig(inside: bool, tmp_path: Path) -> None:
         moments_of(("left", "right", "top"), [tmp_path])
 
 
-def test_images_without_a_partner_are_told(tmp_path: Path) -> None:
+def test_images_without_a_partner_are_named(tmp_path: Path) -> None:
     left, right = _images(tmp_path / "left", "a1", "a2", "a4"), _images(tmp_path / "right", "b1", "b3", "b4")
     moments, single = moments_of(NAMES, [tmp_path / "left", tmp_path / "right"])
     assert moments == [[left[0], right[0]], [left[2], right[2]]] and single == [left[1], right[1]]

@@ -100,9 +100,7 @@ def test_a_damaged_pupil_is_named(spoil: Callable[[dict[str, Any]], None], saved
         load_calibration(path)
 
 
-def test_whoever_takes_the_lens_for_central_says_so(
-    saved: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_central_approximation_is_reported(saved: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     assert import_camera(saved).model == "kannala_brandt"
     assert LEFT_OUT in caplog.text and "rays are off by up to" in caplog.text
     caplog.clear()
@@ -141,7 +139,7 @@ def at_their_distance(camera: Camera, pixels: Pixels, points: Points) -> Points:
     return starts + along[:, None] * rays
 
 
-def test_diff_compares_what_is_far_away(saved: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_diff_compares_far_points(saved: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     other, central = tmp_path / "other.json", tmp_path / "central.json"
     save_calibration(other, calibrate(views_of(1), SIZE, model="kannala_brandt", board="flat", folds=0))
     same = diff(saved, other)
@@ -168,7 +166,7 @@ def test_fresh_boards_are_checked_with_the_pupil(saved: Path) -> None:
     np.testing.assert_allclose(monitored.covariance[:2, own], known.pupil.with_frame[:2], rtol=0.1)
 
 
-def test_a_pupil_that_is_not_known_well_alarms_nobody(saved: Path) -> None:
+def test_an_uncertain_pupil_raises_no_alarm(saved: Path) -> None:
     """What fresh views see of it is no change of the lens, where the calibration is as unsure."""
     monitored, _ = load_monitored(saved)
     near, p = monitored.cameras[0], monitored.cameras[0].parameters.size
@@ -204,7 +202,7 @@ def test_a_corrected_file_keeps_a_pupil_that_goes_with_it(saved: Path, tmp_path:
     np.testing.assert_allclose(joint[:p, :p], after.covariance, rtol=1e-6)
 
 
-def test_a_pose_takes_the_pupil_out(saved: Path) -> None:
+def test_a_pose_corrects_for_the_pupil(saved: Path) -> None:
     view, near = views_of(3, 1)[0], import_near_camera(saved)
     fixed_pupil = _with_fixed_pupil(near, view)
     assert np.abs(fixed_pupil.pixels - view.pixels).max() > 1.0

@@ -85,7 +85,7 @@ def test_pupils_are_solved_for_with_the_mounts(rig: RigCalibration) -> None:
     assert len(rig.covariance) == 2 * rig.cameras[0].camera.parameters.size + 6
 
 
-def test_as_if_from_one_point_the_cameras_disagree() -> None:
+def test_central_cameras_have_a_wrong_baseline() -> None:
     central = calibrate_rig(
         frames(14, 0), dict.fromkeys(CAMERAS, SIZE), model="kannala_brandt", folds=0, pupil="central"
     )
@@ -106,7 +106,7 @@ def test_a_camera_whose_images_tell_less_has_one_where_another_does(monkeypatch:
     assert len(asked) == 2 and set(rig.pupils) == set(CAMERAS)
 
 
-def test_the_file_holds_them(rig: RigCalibration, saved: Path) -> None:
+def test_the_file_holds_the_pupils(rig: RigCalibration, saved: Path) -> None:
     assert not faults(json.loads(saved.read_text(encoding="utf-8")))
     known = load_saved_rig(saved)
     for camera in rig.cameras:
@@ -124,7 +124,7 @@ def test_a_damaged_pupil_is_named(saved: Path, tmp_path: Path) -> None:
         load_saved_rig(path)
 
 
-def test_cameras_of_points_in_mm_have_them(saved: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_cameras_of_points_in_mm_have_the_pupils(saved: Path, caplog: pytest.LogCaptureFixture) -> None:
     _, cameras, _ = import_pair(saved, near=True)
     pupils = load_saved_rig(saved).pupils
     for name, camera in zip(CAMERAS, cameras, strict=True):
@@ -133,7 +133,7 @@ def test_cameras_of_points_in_mm_have_them(saved: Path, caplog: pytest.LogCaptur
     assert "pupil" not in caplog.text
 
 
-def test_whoever_takes_its_lenses_for_central_says_so(saved: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_central_approximation_is_reported(saved: Path, caplog: pytest.LogCaptureFixture) -> None:
     import_pair(saved)
     assert all(f"entrance pupil of camera '{name}' moves, which is left out here" in caplog.text for name in CAMERAS)
 
@@ -172,7 +172,7 @@ def test_a_certificate_is_of_cameras_with_their_pupils(rig: RigCalibration, save
     assert np.mean(off[0] <= bound) > 0.9 > 0.5 > np.mean(off[1] <= bound)
 
 
-def test_fresh_boards_are_checked_with_them(rig: RigCalibration, saved: Path) -> None:
+def test_fresh_boards_are_checked_with_the_pupils(rig: RigCalibration, saved: Path) -> None:
     fresh = [(c, frame, view) for c, own in enumerate(frames(4, 1).values()) for frame, view in own]
     for monitored in (load_monitored(saved)[0], monitored_rig(rig)):
         seen = [FreshView(f, c, view) for c, f, view in fresh]
@@ -185,7 +185,7 @@ def test_fresh_boards_are_checked_with_them(rig: RigCalibration, saved: Path) ->
     assert check_views(replace(monitored, cameras=tuple(lenses)), seen).rms_px > 0.1
 
 
-def test_frames_are_planned_with_them(saved: Path) -> None:
+def test_frames_are_planned_with_the_pupils(saved: Path) -> None:
     monitored, boards = load_monitored(saved)
     assert all(isinstance(camera, NearCamera) for camera in monitored.cameras)
     plan, (reported, powers) = next_frames(monitored, boards, 2), informative_views(monitored, boards, 2)

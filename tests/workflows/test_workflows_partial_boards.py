@@ -53,7 +53,7 @@ def test_parts_of_boards_are_no_change_of_the_rig(cut: Path, capsys: pytest.Capt
     assert "Still holds" in capsys.readouterr().out
 
 
-def test_parts_are_no_boards_to_hold_or_to_look_for(cut: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_partial_boards_are_not_boards_to_plan_with(cut: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = [cut / "rig.json", *(cut / f"rig-{side}.json" for side in ("left", "right"))]
     for path in files:
         _, boards = load_monitored(path)

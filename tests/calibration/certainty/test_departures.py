@@ -55,7 +55,7 @@ def test_displacements_are_of_one_pixel_in_the_corners() -> None:
     assert (size > 0.5).all() and (size < 3.1).all()
 
 
-def test_a_lens_that_departs_from_its_model_is_less_sure() -> None:
+def test_model_inadequacy_widens_the_projection_uncertainty() -> None:
     """Decentring, which the model lacks: the parameters alone say too little, together they say what it is."""
     truth, departs, ratios = lens("fish"), np.zeros(DISPLACEMENTS), []
     departs[5:7] = 0.3, -0.2
@@ -78,7 +78,7 @@ def test_a_lens_that_is_its_model_is_hardly_less_sure(rng: np.random.Generator) 
     assert rms(stated[covered]) < 1.2 * rms(alone[covered])
 
 
-def test_rivals_that_agree_on_the_boards_differ_elsewhere(tmp_path: Path) -> None:
+def test_rival_models_widen_the_uncertainty_where_no_board_was(tmp_path: Path) -> None:
     """Boards in the left half alone: to the right the polynomial may be of any degree."""
     truth, differ = lens("fish"), []
     for seed in range(6):

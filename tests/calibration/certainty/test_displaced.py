@@ -104,7 +104,7 @@ def test_the_covariance_with_departures_is_that_of_the_projection(monkeypatch: p
     assert len(known.moved()) == known.camera.parameters.size
 
 
-def test_what_a_lens_may_do_beyond_its_model_does_not_turn_it() -> None:
+def test_model_inadequacy_contains_no_rotation() -> None:
     """Decentring, a shift of the principal point and a turn look nearly alike where boards were. Which way a lens looks
     that departs from its model only the model says: stated normals were a quarter too wide for that turn."""
     found = departing(0)
@@ -133,7 +133,7 @@ def test_a_lens_that_is_its_model_stays_as_it_is(rng: np.random.Generator) -> No
     assert rays == pytest.approx(found.camera.unproject(views[0].pixels)[0], abs=1e-12)
 
 
-def test_what_is_known_with_departures_is_their_joint_covariance() -> None:
+def test_knowledge_with_departures_is_the_joint_covariance() -> None:
     """As a plan has it: information of parameters and amounts, of which a view of a board tells both."""
     found = departing(0)
     own, modes = Knowledge.of(found), lens_modes(found)
@@ -149,7 +149,7 @@ def test_what_is_known_with_departures_is_their_joint_covariance() -> None:
     assert one.error > two.error
 
 
-def test_a_rival_is_followed_without_a_turn_and_by_small_amounts() -> None:
+def test_a_rival_model_is_approached_in_small_steps_without_rotation() -> None:
     """Displacements of a hundred pixels that the parameters and a turned camera take up again show a rival at first
     order; the camera that is really moved so far shows something else, and stated normals were fifty times too wide."""
     views, _, _ = random_views(lens("wide"), 14, np.random.default_rng(5), reach_deg=REACH_DEG["wide"], noise_px=0.02)
@@ -175,14 +175,14 @@ def test_a_rival_is_followed_without_a_turn_and_by_small_amounts() -> None:
     assert (shown**2).sum(axis=(0, 2)) == pytest.approx(linear, rel=0.2)
 
 
-def test_what_no_ray_reaches_has_no_pixel() -> None:
+def test_a_ray_outside_the_field_of_view_has_no_pixel() -> None:
     camera = lens("reg")
     shown, design = _projected(camera, np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]), np.inf)
     assert np.isfinite(shown[0]).all() and np.isnan(shown[1]).all()
     assert design.shape == (2, camera.parameters.size + 3, 2)
 
 
-def test_amounts_that_no_camera_has_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_penalties_that_lead_to_impossible_cameras_are_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the penalties with which a rival is followed the softest ask for most; the others serve."""
     views, _, _ = random_views(lens("reg"), 6, np.random.default_rng(5), reach_deg=24.0, noise_px=0.1)
     found = calibrate(views, SIZE, model="brown", degree=4, board="flat", folds=0)

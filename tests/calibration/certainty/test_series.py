@@ -72,7 +72,7 @@ def found_degree(sessions: list[Calibration]) -> int:
     return max(found.camera.parameters.size - 4 for found in sessions)
 
 
-def test_they_are_not_stated_where_boards_were(sessions: list[Calibration]) -> None:
+def test_terms_left_out_add_little_where_boards_were(sessions: list[Calibration]) -> None:
     for found in sessions:
         with_terms = FarProjection.of(found)
         assert with_terms.remainder is not None
@@ -80,7 +80,7 @@ def test_they_are_not_stated_where_boards_were(sessions: list[Calibration]) -> N
         assert alone.usual_px <= with_terms.usual_px < 1.3 * alone.usual_px
 
 
-def test_what_images_see_of_a_displacement_is_what_is_left_of_it(sessions: list[Calibration]) -> None:
+def test_a_displacement_keeps_the_part_that_images_cannot_determine(sessions: list[Calibration]) -> None:
     """A displacement that no corner shows keeps its variance; of one that no residual bears out little is left."""
     found = sessions[0]
 
@@ -95,7 +95,7 @@ def test_what_images_see_of_a_displacement_is_what_is_left_of_it(sessions: list[
     assert amounts[0, 1] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_closed_formula_leaves_nothing_out() -> None:
+def test_a_model_without_a_series_has_no_terms_left_out() -> None:
     views, _, _ = random_views(lens("reg"), 10, np.random.default_rng(1), reach_deg=REACH_DEG["reg"], noise_px=0.05)
     for model, series in (("eucm", 0), ("pinhole", 0), ("brown", 3)):
         found = calibrate(views, SIZE, model=model, board="flat", folds=0)

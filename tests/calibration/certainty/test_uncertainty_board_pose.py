@@ -19,7 +19,7 @@ RELATIVE = 0.02
 
 
 @pytest.mark.parametrize("name", ["reg", "fish"])
-def test_a_changed_lens_moves_the_pose_as_said(name: str) -> None:
+def test_a_changed_lens_moves_the_pose_as_the_covariance_predicts(name: str) -> None:
     camera = lens(name)
     sigma_px = np.full(BOARD.corner_count, 0.05)
     in_cam = POSE.apply(BOARD.points())

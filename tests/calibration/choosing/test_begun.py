@@ -26,7 +26,9 @@ def views() -> list[BoardView]:
     return random_views(lens("reg"), 8, rng, reach_deg=REACH_DEG["reg"], noise_px=0.1, points_mm=bowed)[0]
 
 
-def test_what_is_known_of_a_camera_is_not_found_again(views: list[BoardView], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rig_reuses_the_calibration_of_a_camera_alone(
+    views: list[BoardView], monkeypatch: pytest.MonkeyPatch
+) -> None:
     begun = begin("", views, HOW)
     (alone,) = calibrate_together([("", views, HOW)], known=[begun])
     in_rig = [("left", views, replace(HOW, pupil="central"))]
@@ -46,7 +48,7 @@ def test_what_is_known_of_a_camera_is_not_found_again(views: list[BoardView], mo
     assert found.heldout_rms_px == expected.heldout_rms_px
 
 
-def test_of_other_views_or_another_question_nothing_is_known(views: list[BoardView]) -> None:
+def test_other_views_or_options_reuse_nothing(views: list[BoardView]) -> None:
     known = begin("", views, replace(HOW, model="brown", degree=5, board="flat", folds=0))
     assert known.asked("left", views, known.request) is not None
     moved = [*views[:-1], replace(views[-1], pixels=views[-1].pixels + 0.1)]

@@ -103,7 +103,7 @@ def test_twins_have_images_of_one_size_and_nearly_one_focal_length() -> None:
     assert twins([wide, small]) == [[0], [1]]
 
 
-def test_a_lens_whose_solver_was_stopped_is_none_where_another_one_is_found(
+def test_a_model_that_did_not_converge_is_not_chosen_beside_one_that_did(
     fits: dict[str, tuple[Observations, Fit]],
 ) -> None:
     """Of a lens without distortion on bent boards a double sphere was taken, and called bad as it did not converge."""
@@ -165,7 +165,7 @@ def test_models_in_doubt_widen_the_sigmas_by_their_difference(monkeypatch: pytes
     assert 0.0 < widened < differ
 
 
-def test_where_no_board_was_a_richer_rival_counts_with_what_it_leaves_open() -> None:
+def test_a_richer_rival_counts_its_own_uncertainty_where_no_board_was() -> None:
     views, *_ = random_views(lens("reg"), 12, np.random.default_rng(1), reach_deg=20.0)
     found = calibrate(views, SIZE, model="eucm", board="flat", folds=0)
     richer = calibrate(views, SIZE, model="scaramuzza", degree=6, board="flat", folds=0)
@@ -283,7 +283,7 @@ def test_solutions_that_left_out_other_images_are_compared_on_those_of_both(
     assert not module._better([before] * 2, [again] * 2)
 
 
-def test_a_rival_gone_astray_is_no_number_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rival_with_indefinite_information_gives_finite_uncertainty(monkeypatch: pytest.MonkeyPatch) -> None:
     """As five images of a board of other squares have shown one: by rounding it was told less than nothing."""
     views, *_ = random_views(lens("reg"), 6, np.random.default_rng(3), reach_deg=REACH_DEG["reg"])
     found = calibrate(views, SIZE, model="pinhole", board="flat")

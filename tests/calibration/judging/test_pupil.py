@@ -93,7 +93,7 @@ def test_a_pupil_that_moves_is_found_and_what_it_does_far_away(shape: str) -> No
     assert 0.35 * true < pupil.far_px(FarProjection.of(found)) < 1.1 * true
 
 
-def test_a_lens_that_looks_from_one_point_is_not_accused() -> None:
+def test_a_central_lens_has_no_finding_about_its_pupil() -> None:
     for seed in range(4):
         found = session(NEAR, 0.0, seed, pupil="auto")
         assert found.pupil is None
@@ -112,21 +112,21 @@ def test_a_lens_unlike_its_model_is_no_pupil_that_moves(model: str, rng: np.rand
     assert MESSAGE not in str(found.verdicts)
 
 
-def test_a_pupil_that_moves_is_not_taken_for_what_changes_from_image_to_image() -> None:
+def test_a_moving_pupil_is_not_reported_as_a_change_between_images() -> None:
     """A pupil of 4 mm per rad^2 leaves residuals that each image's own shear follows as well as that of a motion."""
     found = session(NEAR, 4.0, 4)
     assert "row by row" in str(changing(found, neighbour_correlation(found)))
     assert MESSAGE in found.verdicts[0].message and "row by row" not in str(found.verdicts)
 
 
-def test_boards_far_away_do_not_show_a_pupil_that_moves() -> None:
+def test_distant_boards_do_not_determine_a_moving_pupil() -> None:
     found = session(FAR, MM_PER_RAD2, 0, pupil="auto")
     assert found.pupil is None
     assert MESSAGE not in str(found.verdicts)
     assert off_far_away(found) < 0.2
 
 
-def test_a_narrow_lens_leaves_its_pupil_open() -> None:
+def test_a_narrow_lens_does_not_determine_its_pupil() -> None:
     rng = np.random.default_rng(0)
     views = random_views(lens("reg"), 12, rng, reach_deg=REACH_DEG["reg"], noise_px=0.05)[0]
     found = calibrate(views, SIZE, model="brown", board="flat", folds=0)
@@ -164,7 +164,7 @@ def test_residuals_are_those_of_points_in_mm() -> None:
     assert np.linalg.norm(found.camera.project(points)[0] - shown, axis=1).max() > 1.0
 
 
-def test_the_pupil_is_neither_asked_for_nor_left_in_vain() -> None:
+def test_the_option_pupil_decides_whether_one_is_solved_for() -> None:
     assert session(NEAR, MM_PER_RAD2, 0).pupil is None
     forced = session(NEAR, 0.0, 1, pupil="moving").pupil
     assert forced is not None and forced.chance(1e9) > BY_CHANCE
@@ -172,7 +172,7 @@ def test_the_pupil_is_neither_asked_for_nor_left_in_vain() -> None:
         session(NEAR, 0.0, 1, pupil="perhaps")
 
 
-def test_a_pupil_that_may_be_chance_is_not_kept_and_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_insignificant_pupil_is_dropped_with_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rigkit.calibration.calibrate.pupil_moves_significantly", lambda _: False)
     found = session(NEAR, MM_PER_RAD2, 0, pupil="auto")
     assert found.pupil is None
@@ -182,14 +182,14 @@ def test_a_pupil_that_may_be_chance_is_not_kept_and_that_is_told(monkeypatch: py
     assert session(NEAR, MM_PER_RAD2, 0, pupil="moving").pupil is not None
 
 
-def test_a_pupil_that_is_asked_for_and_that_images_leave_open(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_requested_pupil_that_images_do_not_determine_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rigkit.calibration.calibrate.solved_with_pupil", lambda *_: None)
     with pytest.raises(DegenerateError, match="the images do not tell how the entrance pupil moves"):
         session(NEAR, MM_PER_RAD2, 0, pupil="moving")
     assert session(NEAR, MM_PER_RAD2, 0, pupil="auto").pupil is None
 
 
-def test_far_sigmas_count_the_pupil_in() -> None:
+def test_the_pupil_widens_the_uncertainty_of_far_points() -> None:
     """A lens of which the pupil is found, too, is less sure than one whose pupil is known not to move."""
     views = views_of_session(NEAR, 0.0, 1)
     central, moving = (
@@ -201,7 +201,7 @@ def test_far_sigmas_count_the_pupil_in() -> None:
     assert near.valid.all() and (near.worst_px < 0.1).all()
 
 
-def test_what_a_pupil_says_of_its_shift_is_propagated() -> None:
+def test_the_joint_covariance_splits_into_lens_and_pupil() -> None:
     found = session(NEAR, MM_PER_RAD2, 0, pupil="moving")
     assert found.pupil is not None
     joint = found.near_covariance
@@ -219,7 +219,7 @@ def _rim(found: Calibration) -> float:
     return float(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]).max())
 
 
-def test_views_that_the_central_lens_leaves_out_are_taken_back() -> None:
+def test_views_dropped_by_the_central_lens_return_with_a_pupil() -> None:
     """A board so near that its corners are pixels off where boards further away have put a central lens."""
     rng, true = np.random.default_rng(1), NearCamera.of(lens("fish"), (3.0, -0.3))
     views, nearer = (
@@ -235,7 +235,7 @@ def test_views_that_the_central_lens_leaves_out_are_taken_back() -> None:
     assert moving.pupil is not None and moving.rms_px < 1.5 * np.sqrt(2.0) * NOISE_PX
 
 
-def test_it_does_not_matter_of_how_many_corners_rows_are_held(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_corners_in_a_block_of_rows_does_not_change_the_pupil(monkeypatch: pytest.MonkeyPatch) -> None:
     found = session(NEAR, MM_PER_RAD2, 0)
 
     def reported() -> FloatArray:

@@ -159,7 +159,7 @@ def test_sigmas_of_angles_and_distances_follow_the_covariance(rng: np.random.Gen
         assert quantity(rig(np.zeros(12)))[1] == pytest.approx(np.linalg.norm(slope @ root), rel=1e-5)
 
 
-def test_sigmas_that_few_images_tell_are_widened() -> None:
+def test_sigmas_from_few_images_are_widened() -> None:
     places = (Rigid3.identity(), Rigid3(exp_so3(np.array([0.0, 1.5, 0.0])), [300.0, 0.0, 0.0]))
     placed = tuple(MountedBoard(b, b.points(), p) for b, p in zip(DIFFERENT[:2], places, strict=True))
     names = [b.board_id for b in DIFFERENT[:2]]
@@ -193,7 +193,7 @@ def test_too_few_images_for_a_shape_leave_the_boards_flat(frames: int, rng: np.r
     assert max(abs(e) for e in errors_in_sigmas(rig, room, DIFFERENT)) < SIGMAS
 
 
-def test_ties_make_a_camera_surer() -> None:
+def test_tied_boards_lower_the_uncertainty_of_a_camera() -> None:
     """Three images: 30 unknown numbers of poses and places instead of 54."""
     tied, alone, surer = [], [], []
     for seed in range(12):

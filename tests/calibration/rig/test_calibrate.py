@@ -302,7 +302,7 @@ def test_cameras_of_different_noise_keep_their_own(rng: np.random.Generator) -> 
     assert (sharp.parameter_sigmas[:4] / rig.overdispersion < 1.05 * alone.parameter_sigmas[:4]).all()
 
 
-def test_transfer_is_as_sure_as_it_says() -> None:
+def test_transfer_errors_agree_with_their_sigmas() -> None:
     """Where points of one camera appear in another: errors over predicted deviations, 20 rigs."""
     z = []
     for seed in range(20):

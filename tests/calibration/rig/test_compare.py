@@ -44,7 +44,7 @@ def moved(rig: Mounted, name: str, by: Rigid3) -> Mounted:
     return Mounted(cameras, rig.covariance, rig.freedom)
 
 
-def test_a_rig_of_boards_of_another_size_is_told_from_one_that_moved(rigs: list[Mounted]) -> None:
+def test_another_board_size_is_reported_as_scale_and_not_as_motion(rigs: list[Mounted]) -> None:
     """All lengths are longer by one factor; a camera that moved otherwise leaves no such factor."""
     first, second = rigs[:2]
     scaled = {n: (c, Rigid3(m.rotation, 1.2 * m.translation_mm)) for n, (c, m) in second.cameras.items()}
@@ -86,7 +86,7 @@ def test_a_turn_of_the_lens_that_the_mount_takes_up_is_no_motion(rigs: list[Moun
     assert hidden.chance > plain.chance
 
 
-def test_mounts_of_a_rig_that_does_not_say_how_sure_it_is_have_no_chance(rigs: list[Mounted]) -> None:
+def test_a_rig_without_covariance_has_no_p_values(rigs: list[Mounted]) -> None:
     found = compare_mounts(rigs[0], Mounted(rigs[1].cameras, None))
     assert found.chance is None and found.same is None and found.mounts[0].shift_mm > 0.0
 

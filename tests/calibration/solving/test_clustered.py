@@ -63,7 +63,7 @@ def sessions(name: str, images_px: float, count: int) -> list[Calibration]:
 
 
 @pytest.mark.parametrize("images_px", [0.0, IMAGES_PX])
-def test_sigmas_are_right_whatever_repeats(images_px: float) -> None:
+def test_sigmas_are_right_for_errors_of_corners_and_of_whole_images(images_px: float) -> None:
     rng = np.random.default_rng(5)
     camera = lens("wide")
     squared, predicted, overdispersion = [], [], []
@@ -106,7 +106,7 @@ def test_a_moved_principal_point_is_found_behind_an_uncertain_focal_length(name:
     assert found.difference.rms_px < 2.0 * found.usual_px[1]
 
 
-def test_one_cluster_says_nothing() -> None:
+def test_one_cluster_leaves_the_covariance_unchanged() -> None:
     unit = np.diag([1.0, 4.0])
     found = clustered_covariance(unit, np.eye(2)[None], np.ones((1, 2)), np.zeros((2, 2)), 0.5)
     assert (found.covariance == 0.25 * unit).all() and found.overdispersion == 1.0 and np.isinf(found.freedom)
@@ -172,7 +172,7 @@ def in_order(alike: float, count: int, rng: np.random.Generator) -> FloatArray:
 
 
 @pytest.mark.parametrize(("alike", "low", "high"), [(0.0, 0.9, 1.1), (0.6, 1.35, 2.0)])
-def test_frames_that_err_like_their_neighbours_count_for_fewer(alike: float, low: float, high: float) -> None:
+def test_autocorrelated_frames_have_fewer_degrees_of_freedom(alike: float, low: float, high: float) -> None:
     """The mean of frames scatters by 1 and by 2 (first order: sqrt((1 + .6) / (1 - .6))) times 1 / sqrt(N)."""
     rng, count = np.random.default_rng(5), 60
     information = np.tile(np.eye(2), (count, 1, 1))

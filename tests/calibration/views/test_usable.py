@@ -72,7 +72,7 @@ def test_a_smaller_board_that_passes_for_part_of_the_stated_one() -> None:
     assert other_size(seen, STATED) is None
 
 
-def test_parts_of_the_stated_board_are_not() -> None:
+def test_parts_of_the_stated_board_are_no_larger_board() -> None:
     assert other_size(shown(grid(9, 6), grid(8, 7), grid(9, 5), grid(7, 7), grid(9, 6)), STATED) is None
     assert other_size(shown(*[grid(9, 6)] * 4, grid(7, 9, corners=40)), STATED) is None
     assert other_size(shown(*[grid(9, 6)] * 2), STATED) is None

@@ -85,7 +85,7 @@ def count(seeds: range, lens: str, covered: bool) -> tuple[int, int, int]:
     return right, wrong, left
 
 
-def test_parts_are_placed_rightly_or_not_at_all() -> None:
+def test_parts_of_boards_are_never_placed_wrongly() -> None:
     results = [count(range(20), "regular", covered) for covered in (False, True)]
     assert sum(r[0] for r in results) >= 5
     assert sum(r[1] for r in results) == 0

@@ -148,7 +148,7 @@ def test_parts_of_a_board_that_something_covers_stay_together(rng: np.random.Gen
     assert len(split_at_discontinuities(sheet(covered))) == 1
 
 
-def test_a_quick_look_tells_most_boards() -> None:
+def test_only_suspicious_lattices_need_the_full_search() -> None:
     whole = sheet(smooth(8, 6))
     assert not may_be_discontinuous(whole, SIZE_PX)
     hidden = whole.without(np.add.outer(np.arange(6), np.arange(8)) < 3)

@@ -50,7 +50,7 @@ def test_boards_seen_badly_are_found(options: dict[str, float]) -> None:
     assert [[len(item.grid) for item in boards] for boards in found] == [[CORNERS]] * 3
 
 
-def test_each_measure_has_a_say_and_none_decides_alone() -> None:
+def test_no_single_measure_decides() -> None:
     board = Evidence(0.002, 1.5, 0.05, 0.05)
     assert board.score > 0.0
     for name in Evidence._fields:
@@ -95,7 +95,7 @@ def strong_bend(noise_px: float) -> tuple[np.ndarray, np.ndarray]:
     return pixels + noise_px * np.random.default_rng(5).standard_normal(pixels.shape), np.full((6, 7), 0.05)
 
 
-def test_what_a_lens_bends_is_no_scatter() -> None:
+def test_lens_distortion_does_not_count_as_scatter() -> None:
     everything = [(slice(0, 6), slice(0, 7))]
     pixels, sigma_px = strong_bend(0.05)
     along, both = excess_scatter(pixels, sigma_px, everything)[0], scatter_factors(pixels, sigma_px, everything)[0]

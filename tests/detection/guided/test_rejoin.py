@@ -67,7 +67,7 @@ def test_parts_of_one_board_are_one_grid(turns: int) -> None:
     ],
     ids=["beside the grid", "another wall", "other colours", "too large", "the same place"],
 )
-def test_what_is_not_of_one_board_stays_apart(other: RefinedLattice) -> None:
+def test_parts_of_different_boards_are_not_joined(other: RefinedLattice) -> None:
     assert len(rejoined([part(range(6), range(6)), other], [BOARD], CAMERA)) == 2
 
 

@@ -129,7 +129,7 @@ def test_holes_do_not_part_a_board() -> None:
     assert part.size == (7, 5)
 
 
-def test_a_corner_astray_is_left_out() -> None:
+def test_an_outlying_corner_is_dropped() -> None:
     board = lattice(7, 5)
     corner = np.zeros((5, 7), bool)
     corner[0, 1:] = True

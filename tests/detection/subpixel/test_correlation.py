@@ -164,7 +164,7 @@ def test_boards_in_images_as_they_come(
     assert BOARD_BAND[0] < np.sqrt((every**2).mean() / (predicted**2).mean()) < BOARD_BAND[1]
 
 
-def test_windows_of_few_pixels_say_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_windows_of_few_pixels_give_no_correlation(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blurred squares of 6 px: the fit takes nearly all of the noise in their windows."""
     seen: list[np.ndarray] = []
 

@@ -140,7 +140,7 @@ def test_windows_are_narrower_than_edges_ask_where_that_is_wanted(rng: np.random
     assert np.abs(narrow.blur - 0.8).max() < 0.01
 
 
-def test_neighbouring_edges_in_the_blur_do_not_pull() -> None:
+def test_neighbouring_edges_within_the_blur_do_not_bias_corners() -> None:
     """A Gaussian-blurred chessboard with lines 7 px before and 8.5 px after the corner, at s = 1.9."""
     blur, before, after = 1.9, 7.0, 8.5
 
@@ -164,7 +164,7 @@ def test_neighbouring_edges_in_the_blur_do_not_pull() -> None:
     assert off[1] > 0.03
 
 
-def test_what_lies_behind_the_last_squares_does_not_pull() -> None:
+def test_the_background_beyond_the_board_does_not_bias_corners() -> None:
     """A board's last corner: squares 7.5 px wide to the right and 8.5 px high below, then paper; s = 2."""
     blur, right, below = 2.0, 7.5, 8.5
 

@@ -59,7 +59,7 @@ def test_rounding_is_the_least_noise_of_whole_grey_levels_only(compiled: bool, m
 
 
 @pytest.mark.parametrize("blur_px", [0.7, 1.0])
-def test_predicted_without_noise(blur_px: float) -> None:
+def test_predicted_sigmas_without_noise(blur_px: float) -> None:
     scores = []
     for seed in range(3):
         scene = three_boards(np.random.default_rng(seed))

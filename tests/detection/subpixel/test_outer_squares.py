@@ -66,7 +66,7 @@ def cut_board(ends: tuple[float, float, float, float], blur_px: float, margin: f
     ids=["whole", "cut on two sides", "cut on all", "grey margin"],
 )
 @pytest.mark.parametrize("blur_px", [2.0, 3.0, 4.0])
-def test_squares_cut_short_do_not_pull_at_corners(
+def test_truncated_squares_do_not_bias_corners(
     ends: tuple[float, float, float, float], margin: float, blur_px: float
 ) -> None:
     image, truth = cut_board(ends, blur_px, margin)
@@ -78,7 +78,7 @@ def test_squares_cut_short_do_not_pull_at_corners(
 
 
 @pytest.mark.parametrize("blur_px", [2.0, 3.0])
-def test_nor_with_a_camera(blur_px: float) -> None:
+def test_truncated_squares_do_not_bias_guided_corners(blur_px: float) -> None:
     image, truth = cut_board((0.45, 1.0, 0.6, 1.0), blur_px, 200.0)
     camera = Pinhole((image.shape[1], image.shape[0]), np.array([800.0, 800.0, 190.0, 150.0]))
     (found,) = detect_boards(image, [Board("b", COLUMNS, ROWS, 30.0, 30.0)], camera=camera)
@@ -126,7 +126,7 @@ def test_real_boards_out_of_focus_are_found_whole(blur_px: float, every: int) ->
     assert whole == len(paths[::every])
 
 
-def test_what_is_blurred_beside_a_sharp_board_changes_none_of_its_corners() -> None:
+def test_a_blurred_board_does_not_change_a_sharp_one() -> None:
     """Whether what lies beyond the outer squares matters is asked of each board by itself."""
     sharp, _ = cut_board((0.45, 1.0, 1.0, 1.0), 0.8, 200.0)
     soft, corners = cut_board((1.0, 1.0, 1.0, 1.0), 2.5, 120.0)

@@ -27,7 +27,7 @@ def test_scatter_raises_sigmas(times: float, low: float, high: float) -> None:
     assert low <= np.median(factors) <= high
 
 
-def test_what_a_lens_bends_does_not() -> None:
+def test_lens_distortion_does_not_raise_sigmas() -> None:
     sigma_px = np.full((6, 4), 0.001)
     bent = corners(4, 6, bend=2.0) + 0.001 * np.random.default_rng(1).standard_normal((6, 4, 2))
     assert small_scatter(bent, sigma_px) == 1.0

@@ -260,7 +260,7 @@ def test_an_inverted_board_out_of_focus_is_placed_as_finely() -> None:
     assert np.abs(errors_by_place(found, scene.truth()[0])).max() < BLURRED_PX
 
 
-def test_boards_alike_in_one_image_are_told() -> None:
+def test_equal_boards_in_one_image_are_reported() -> None:
     grid = Board("g", 6, 6, 40.0, 40.0, pattern=AprilGrid(0.3))
     for board in (BOARD, grid):
         picture = one_board(np.random.default_rng(0), board=board, max_tilt_deg=10.0).render()

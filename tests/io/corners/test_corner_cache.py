@@ -12,7 +12,7 @@ from rigkit.io.disk.toml_reader import toml_text
 from rigkit.kernels import building
 
 
-def test_an_editor_s_lock_is_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lock_files_of_editors_do_not_change_the_source_hash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Editors put links that lead nowhere beside the files that they change."""
     monkeypatch.setattr("rigkit.__path__", [str(tmp_path)])
     for name in ("module.py", "kernel.c", "kernel.h"):

@@ -100,7 +100,7 @@ def test_a_database_of_colmap(
         read_correspondences(tmp_path / "db.db")
 
 
-def test_what_does_not_fit_is_refused(tmp_path: Path, points: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+def test_inconsistent_arrays_are_refused(tmp_path: Path, points: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
     first, second, pairs = points
     for arrays, words in (
         ({"keypoints0": first, "keypoints1": second}, "must say which match"),

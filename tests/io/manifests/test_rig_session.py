@@ -122,7 +122,7 @@ def test_images_of_one_name_in_many_folders_are_named() -> None:
         frames_of_images({"a": ["mon/a/img.jpg", "tue/a/img.jpg"], "b": ["mon/b/img.jpg", "tue/b/img.jpg"]})
 
 
-def test_frames_that_nothing_tells() -> None:
+def test_images_without_a_common_frame_are_named() -> None:
     with pytest.raises(InputError, match='frames = "order"'):
         frames_of_images({"l": ["a.jpg", "b.jpg"], "r": ["c.jpg", "d.jpg"]})
     with pytest.raises(InputError, match="2 of 'l', 1 of 'r'"):

@@ -114,7 +114,7 @@ def test_a_changed_byte_in_a_png_is_found(tmp_path: Path, colour: np.ndarray) ->
         read_image(tmp_path / "a.png")
 
 
-def test_what_is_no_image(tmp_path: Path) -> None:
+def test_files_that_are_no_images_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         read_image(tmp_path / "none.jpg")
     with pytest.raises(InputError, match="folder"):

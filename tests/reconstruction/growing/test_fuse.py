@@ -70,7 +70,7 @@ def distances(corner: Corner, points: np.ndarray) -> np.ndarray:
     return np.abs((points - corner.apex_mm) @ corner.axes).min(axis=1)
 
 
-def test_what_pairs_say_of_one_place_becomes_one_point_and_more_exact() -> None:
+def test_points_of_several_pairs_fuse_into_one_more_exact_point() -> None:
     corner, clouds = corner_clouds()
     fused = fuse_clouds(clouds)
     sizes = [len(c.cloud) for c in clouds]
@@ -105,7 +105,7 @@ def test_the_order_of_the_clouds_and_the_frame_do_not_matter() -> None:
     np.testing.assert_allclose(turned.cloud.points_mm, fused.cloud.points_mm, atol=1e-9)
 
 
-def test_what_the_rig_leaves_open_is_in_the_sigmas_and_is_not_averaged_away() -> None:
+def test_rig_uncertainty_is_in_the_sigmas_and_is_not_averaged_away() -> None:
     """A rig with lenses and mounts as wrong as its covariance says, and the same one that is said to be exact."""
     rng = np.random.default_rng(7)
     corner = Corner.of_a_room()

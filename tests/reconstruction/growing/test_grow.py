@@ -144,7 +144,7 @@ def test_no_place_of_image_2_is_grown_from_two_places_of_image_1() -> None:
     assert apart[~np.eye(len(places), dtype=bool)].min() > 1.5
 
 
-def test_what_the_calibration_leaves_open_is_in_the_sigmas() -> None:
+def test_calibration_uncertainty_is_in_the_sigmas() -> None:
     """A camera whose focal length and centre are one standard deviation off, of its covariance."""
     corner, images, seeds = matched_corner("pinhole")
     true = LENSES["pinhole"]

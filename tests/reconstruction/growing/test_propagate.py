@@ -41,7 +41,7 @@ def corner() -> tuple[Corner, DenseScene, DenseScene]:
         return room, whole, grow_scene(sparse, seeds, *images, pose_is_known=True)
 
 
-def test_holes_are_filled_with_what_was_there(corner: tuple[Corner, DenseScene, DenseScene]) -> None:
+def test_holes_are_filled_with_the_true_surface(corner: tuple[Corner, DenseScene, DenseScene]) -> None:
     _, whole, filled = corner
     before, after = (d.maps()["range"][HOLES] for d in (whole, filled))
     known = np.isfinite(before)

@@ -58,7 +58,7 @@ def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, tuple[Gr
 
 
 @pytest.mark.parametrize("lens", SMALL_LENSES)
-def test_what_patches_leave_open_is_filled_as_well_as_stated(lens: str) -> None:
+def test_gaps_between_patches_are_filled_to_the_stated_accuracy(lens: str) -> None:
     grown, measured, views, corner = grown_with_hole(lens)
     done, _ = filled(grown, measured, *views, CAM2_FROM_CAM1)
     # Only beside the seams of the walls the sweep contradicts patches.

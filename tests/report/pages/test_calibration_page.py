@@ -114,7 +114,7 @@ def test_a_training_rms_above_the_heldout_one_is_explained(calibration: Calibrat
     assert "every corner alike" not in describe(replace(calibration, heldout_rms_px=2.0 * calibration.rms_px))
 
 
-def test_what_was_chosen_is_called_what_it_is(calibration: Calibration) -> None:
+def test_chosen_models_are_named_as_chosen(calibration: Calibration) -> None:
     """Whether the lens looks from one point is no model of it, and what was not kept is not called chosen."""
     asked = [Candidate(name, 9, 0.1, 0.1, name == MOVING, f"why {name}") for name in (CENTRAL, MOVING)]
     models = [Candidate(name, 9, 0.1, 0.1, name == "brown 5", f"why {name}") for name in ("ucm", "brown 5")]
@@ -160,7 +160,7 @@ def test_the_focal_length_of_a_lens_at_the_edge_of_its_model_is_told(calibration
     assert sigma == pytest.approx(expected, rel=0.1)
 
 
-def test_says_what_the_calibration_says(calibration: Calibration) -> None:
+def test_the_page_has_the_figures_of_the_calibration(calibration: Calibration) -> None:
     text = re.sub(r'src="data:[^"]*"', "", page(calibration))
     assert f"held-out RMS <b>{calibration.heldout_rms_px:.3f} px</b>" in text
     assert f"training RMS {calibration.rms_px:.3f} px" in text
@@ -193,7 +193,7 @@ def test_numbers_on_the_uncertainty_map(calibration: Calibration) -> None:
         assert f">{worst:.3g}<" in svg
 
 
-def test_pattern_tells_chance_from_a_lens_that_does_not_fit(calibration: Calibration) -> None:
+def test_residual_patterns_separate_chance_from_a_lens_that_does_not_fit(calibration: Calibration) -> None:
     def coloured(c: Calibration) -> tuple[int, int]:
         found = re.search(r"(\d+) of (\d+) coloured", pattern_svg(c))
         assert found is not None

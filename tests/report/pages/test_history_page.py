@@ -33,7 +33,7 @@ def entry(
     )
 
 
-def test_overwritten_calibrations_are_apart() -> None:
+def test_overwritten_calibrations_are_separate_editions() -> None:
     entries = [
         entry(1, ""),
         entry(2, "a"),

@@ -45,7 +45,7 @@ def test_a_check_that_failed_stands_first_with_its_cause() -> None:
     assert page_of(report).index("canvas") < page_of(report).index("<h2>")
 
 
-def test_all_is_well_in_the_users_units_and_how_fine_the_rule_is() -> None:
+def test_a_passed_verdict_is_in_the_users_units_with_the_accuracy_of_the_ruler() -> None:
     first = words_of(page_of(reported(90.0)))
     assert "all checks passed" in first and "4 of 4 facts" in first
     assert "lengths to 0.50 mm" in first and "angles to 0.000 deg" in first

@@ -81,7 +81,7 @@ def test_svg_says_its_size_in_mm() -> None:
     assert len(black) == len(sheet.rectangles)
 
 
-def test_too_large_a_board_is_told_which_paper_would_do() -> None:
+def test_a_board_too_large_for_the_paper_names_a_paper_that_fits() -> None:
     with pytest.raises(InputError, match="use --paper a2, or squares of up to 26 mm"):
         board_sheet(Board("b", 8, 6, 50.0, 50.0), "a4")
     with pytest.raises(InputError, match="take squares of up to 26 mm"):

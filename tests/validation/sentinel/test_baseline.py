@@ -59,7 +59,7 @@ def _boards(camera: Camera, rng: np.random.Generator, which: slice) -> Look:
 
 
 @SEEDS
-def test_a_rig_that_never_held_is_checked_for_what_moved_since(seed: int) -> None:
+def test_a_wrong_rig_is_checked_for_changes_since_earlier_frames(seed: int) -> None:
     rng = np.random.default_rng(seed)
     before, same, moved = (_scenes(_turned(MOUNT, d), n, rng) for d, n in ((0.0, 2), (0.0, 1), (TURN_DEG, 1)))
     assert not evaluate_evidence(_file(), same).holds
@@ -113,7 +113,7 @@ def _known(focus: float) -> tuple[Camera, Monitored]:
 
 
 @SEEDS
-def test_a_lens_whose_file_is_off_is_checked_for_what_moved_since(seed: int) -> None:
+def test_a_wrong_lens_is_checked_for_changes_since_earlier_frames(seed: int) -> None:
     camera, file = _known(1.01)
     longer = camera.with_parameters(camera.parameters * np.where(np.arange(camera.parameters.size) < 2, 1.001, 1.0))
     fresh = slice(BEFORE, None)

@@ -66,7 +66,7 @@ def test_pictures_find_what_was_promised_and_more_than_others(calibration: Calib
     assert 0.05 < worst < 0.9 * min(p.chance for p in promised)
 
 
-def test_each_picture_tells_more(calibration: Calibration) -> None:
+def test_each_picture_raises_the_power(calibration: Calibration) -> None:
     plan, _ = informative_views(monitored_camera(calibration, "cam"), [BOARD], FRESH)
     errors = [plan.error, *(view.error for view in plan.views)]
     assert not np.isfinite(errors[0])

@@ -137,7 +137,7 @@ def test_a_view_all_of_whose_corners_stray_says_nothing(calibration: Calibration
     assert beside.holds and beside.rms_px == pytest.approx(alone.rms_px, rel=0.05)
 
 
-def test_what_a_lens_does_beyond_its_model_is_no_change() -> None:
+def test_model_inadequacy_raises_no_alarm() -> None:
     """A lens that no model is, calibrated where boards were left of the middle, is quiet right of it; a longer focal
     length is found there, too."""
     camera = lens("wide")
@@ -186,7 +186,7 @@ def test_the_correction_is_a_calibration_that_says_so(calibration: Calibration, 
     assert calibration_text(fixed) != calibration_text(calibration)
 
 
-def test_a_lens_that_changed_in_several_ways_is_told_by_what_it_does(calibration: Calibration) -> None:
+def test_a_lens_changed_in_several_ways_is_described_by_its_displacement(calibration: Calibration) -> None:
     def several(p: np.ndarray) -> np.ndarray:
         return p * [1.004, 1.004, 1, 1, 1.1, 1, 1, 1, 1] + [0, 0, 9.0, -7.0, 0, 0, 0, 0, 0]
 
@@ -208,7 +208,7 @@ def test_the_same_calibration_again_is_no_change(calibration: Calibration, tmp_p
     assert entry.chance > 0.5
 
 
-def test_what_moves_nothing_is_no_other_camera(calibration: Calibration) -> None:
+def test_rounding_errors_raise_no_alarm(calibration: Calibration) -> None:
     """Rounding alone can leave many times as much as expected where that is nothing, as in the same camera again."""
     check = checked(calibration, lens("reg"), np.random.default_rng(0))
     rounded = replace(check, chance=1.0, expected_px=4e-14, rms_px=4e-14, rms_fixed_px=2e-12)

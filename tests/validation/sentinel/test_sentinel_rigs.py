@@ -59,7 +59,7 @@ def _rig_check(pose: Rigid3, second: Camera, rng: np.random.Generator) -> Sentin
     return check_views(rig, views)
 
 
-def test_a_rig_that_nobody_touched_holds() -> None:
+def test_an_unchanged_rig_holds() -> None:
     checks = [_rig_check(MOUNT, lens("wide"), np.random.default_rng(seed)) for seed in range(5)]
     assert all(check.holds for check in checks)
     powers = {(p.kind, p.camera): p for p in checks[0].powers}
@@ -100,7 +100,7 @@ def _matches(pose: Rigid3, rng: np.random.Generator, noise_px: float = MATCH_NOI
     return PairMatches(0, 1, np.clip(noisy[0], 0.0, None), np.clip(noisy[1], 0.0, None))
 
 
-def test_a_scene_tells_of_a_mount_without_any_board() -> None:
+def test_a_changed_mount_is_found_from_a_scene_without_boards() -> None:
     quiet, named, draws = 0, 0, 3
     turn = np.radians([0.05, 0.0, 0.0])
     moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
@@ -141,7 +141,7 @@ def test_what_an_affine_warp_leaves_of_the_map_between_lenses_is_taken_back(rng:
     assert after.holds and after.rms_px < 0.2 * before.rms_px
 
 
-def test_matches_that_say_nothing_are_told_from_those_that_say_little() -> None:
+def test_matches_without_information_are_refused() -> None:
     with pytest.raises(DegenerateError, match="texture"):
         check_matches(_rig(), [])
     # All in one corner of the image; and none that a lens sees.
@@ -209,7 +209,7 @@ def test_what_a_change_of_a_rig_costs_in_a_length() -> None:
         length_goals(monitored.cameras, monitored.cam_from_rig, far)
 
 
-def test_what_a_calibration_leaves_open_is_no_other_rig() -> None:
+def test_calibration_uncertainty_raises_no_alarm() -> None:
     """A mount known to 0.06 degrees only: matches are off by many times their scatter, as the calibration says."""
     sigmas = np.array([*LENS_SIGMAS, *LENS_SIGMAS, *[1e-3] * 3, *[0.01] * 3])
     unsure = replace(_rig(), covariance=np.diag(sigmas**2))
@@ -234,7 +234,7 @@ def test_a_change_does_not_hide_behind_the_scatter_it_makes(axis: int, rng: np.r
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_wrong_matches_that_lie_alone_do_not_rename_a_change(axis: int) -> None:
+def test_isolated_outliers_do_not_change_the_hypothesis(axis: int) -> None:
     # A lens can bend to a few matches where there are no others: off by little, as those of tiles are by a period.
     turn = np.radians(0.05) * np.eye(3)[axis]
     moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
@@ -273,7 +273,7 @@ def test_few_matches_raise_no_alarm() -> None:
         assert check.holds and check.chance > 1e-3
 
 
-def test_what_matches_of_a_part_of_the_image_share_raises_no_alarm() -> None:
+def test_correlated_errors_of_neighbouring_matches_raise_no_alarm() -> None:
     chances = []
     for seed in range(10):
         rng = np.random.default_rng(seed)

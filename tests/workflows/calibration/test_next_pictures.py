@@ -72,7 +72,7 @@ def test_frames_bring_what_was_promised_and_more_than_others() -> None:
     assert with_planned < 0.1 * with_free
 
 
-def test_what_a_rig_is_for_is_how_far_pixels_move_when_the_world_follows() -> None:
+def test_the_goal_of_a_rig_is_the_displacement_of_pixels() -> None:
     """Against differences: pixels of all points in both cameras, less what a motion of the world takes up."""
     cameras, poses = zip(*(mounts()[name] for name in NAMES), strict=True)
     points = []

@@ -82,7 +82,7 @@ def test_a_register_that_the_work_reads_is_not_added_to(tmp_path: Path) -> None:
         ({"temperature_c": -400.0}, "no temperature is -400 C"),
     ],
 )
-def test_entries_that_cannot_be(
+def test_impossible_entries_are_refused(
     changed: dict[str, float], words: str, calibration: Calibration, tmp_path: Path
 ) -> None:
     register = tmp_path / "cam.jsonl"
@@ -93,7 +93,7 @@ def test_entries_that_cannot_be(
         load_history(register)
 
 
-def test_dates_to_come_are_told(calibration: Calibration, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_future_dates_are_warned_of(calibration: Calibration, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     register = tmp_path / "cam.jsonl"
     check = checked(calibration, lens("reg"), np.random.default_rng(3))
     add_entry(register, HistoryEntry.of_check(check, Path("c.json")))

@@ -22,7 +22,7 @@ BLUR_PX, NOISE_LEVELS = 4.0, 10.0
 
 
 @pytest.mark.parametrize("pattern", [AprilGrid(0.3), Charuco("DICT_4X4_50", 30.0)])
-def test_two_boards_alike_are_told(pattern: Pattern, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_equal_boards_are_reported(pattern: Pattern, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     board = Board("b", 8, 6, 40.0, 40.0, pattern=pattern)
     picture = one_board(np.random.default_rng(0), board=board, max_tilt_deg=10.0).render(supersample=2)
     for name, image in (("one.png", picture), ("two.png", np.hstack([picture, picture]))):

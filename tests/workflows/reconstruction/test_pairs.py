@@ -28,7 +28,7 @@ CAMERA = KannalaBrandt((800, 600), np.array([400.0, 400.0, 405.0, 295.0, -0.02, 
 BOARDS = tuple(Board(name, 11, 8, 30.0, 30.0) for name in ("plane1", "plane2", "plane3"))
 
 
-def test_boards_behind_a_pole_are_found_as_the_camera_sees_them(tmp_path: Path) -> None:
+def test_boards_behind_a_pole_are_found_with_the_camera(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     scene = trihedral_pair(BOARDS, CAMERA, PoseType.GENERAL, rng, distance=(0.8, 1.1))
     cam = scene.cam1_from_world
@@ -72,7 +72,7 @@ def test_boards_behind_a_pole_are_found_as_the_camera_sees_them(tmp_path: Path) 
         assert off.max() < 0.1
 
 
-def test_a_validated_pair_is_called_as_its_best_report() -> None:
+def test_a_validated_pair_has_the_name_of_its_best_report() -> None:
     angle = MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set square")
     best = validate(replace(make_reconstruction(), pair_id="left-right"), PairTruth(None, (angle,)))
     done = PairValidation(reports=(best,), best=best, crosscheck=None, causes=(), files={}, section=None)

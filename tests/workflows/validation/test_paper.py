@@ -76,7 +76,7 @@ def test_directions_and_scale_are_options(tmp_path: Path) -> None:
     assert squared["3SDIR"] == patch["3SDIR"]
 
 
-def test_what_does_not_go_together_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_contradictory_options_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for options, words in (
         (["--own-solvers"], "add that"),
         (["--paper", "--directions", "line"], "of its own"),

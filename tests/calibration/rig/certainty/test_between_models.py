@@ -58,7 +58,7 @@ def with_heldout_errors(alone: tuple[float | None, ...], together: float) -> Rig
 @pytest.mark.parametrize(
     ("alone", "together", "printed"), [((0.1, 0.2), 0.3, True), ((0.1, 0.2), 0.16, False), ((0.1, None), 0.3, False)]
 )
-def test_frames_that_took_no_part_against_the_cameras_alone(
+def test_held_out_frames_are_compared_with_the_cameras_alone(
     alone: tuple[float | None, ...], together: float, printed: bool
 ) -> None:
     """What a camera alone comes to is not known where its images were too few to hold some out."""

@@ -45,7 +45,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> list[FloatArray]:
     return out
 
 
-def test_flat_boards_have_none(found: list[FloatArray]) -> None:
+def test_flat_boards_add_no_uncertainty(found: list[FloatArray]) -> None:
     for seed in range(6):
         calibrate_rig(two(np.random.default_rng(seed), 0.0), sizes(), model=MODELS, folds=0)
     assert len(found) == 6 and not np.concatenate(found).any()

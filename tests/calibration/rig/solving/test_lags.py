@@ -139,7 +139,7 @@ WRONG = {
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (1, 2))])
 @pytest.mark.parametrize("what", WRONG)
-def test_ways_that_are_no_motion_do_no_harm(what: str, seed: int) -> None:
+def test_a_wrong_frame_order_or_jerky_motion_gives_no_false_lag(what: str, seed: int) -> None:
     """Frames in another order than they were taken in, and motion that frames do not follow."""
     rig = rig_of(0.05, seed, **WRONG[what][0], **WRONG[what][1])  # type: ignore[arg-type]
     off, sigma = off_mm(rig)
@@ -148,7 +148,7 @@ def test_ways_that_are_no_motion_do_no_harm(what: str, seed: int) -> None:
         assert abs(own.frames) < 0.05 + 3.0 * own.sigma
 
 
-def test_times_are_told_by_numbers_or_by_order() -> None:
+def test_times_come_from_numbers_or_from_order() -> None:
     def times(*names: str) -> list[float]:
         keys = [(name, "board") for name in names]
         return times_of(keys, dict(zip(keys, names, strict=True))).tolist()
