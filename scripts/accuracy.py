@@ -1,6 +1,7 @@
-"""Accuracy on lab-a against its exact truth: corners, calibration, pose, baseline, planes and normals, as Markdown.
+"""Accuracy on lab-a (RENDERED) against its exact truth: corners, calibration, pose, baseline, planes and normals.
 
-The truth (truth.json of each capture) is not part of the repository:
+Prints Markdown tables of errors, and of errors over their sigmas. The truth (truth.json of each capture) is not part of
+the repository:
 
     python scripts/accuracy.py FOLDER     # a folder with captures/<pair>/truth.json and calibration/<lens>/truth.json
 """

@@ -1,5 +1,7 @@
 """Errors of clouds of pairs (points, ranges, normals, meshes, poses), compared with OpenCV's semi-global matching.
 
+REAL scenes with measured depth, or RENDERED rooms with exact depth.
+
 python scripts/bench_clouds.py ../shared/data/scenes            every pair of pairs.json
 python scripts/bench_clouds.py ../shared/data/scenes motorcycle --known-pose
 python scripts/bench_clouds.py rooms                            of scripts/path_traced_rooms.py

@@ -1,4 +1,4 @@
-"""Validate 200 small rendered data sets with local processes and on a local Dask cluster: the tables must be equal.
+"""Validate 200 small RENDERED data sets with local processes and on a local Dask cluster: the tables must be equal.
 Needs joblib and distributed (pip install 'rigkit[cluster]').
 
 python scripts/bench_many.py [--count 200] [--workers 2]

@@ -1,8 +1,8 @@
 """Measure how many pictures the planner saves, compared with sessions as people take them, and on real images.
 
-Simulated: five lenses. Boards are held where the planner asks, with a human's error (5 degrees, 5 % of the distance,
+SIMULATED: five lenses. Boards are held where the planner asks, with a human's error (5 degrees, 5 % of the distance,
 2 % of it sideways), at random, or in a fixed pattern of twelve. Counted are the frames until the true projection error,
-over the image and after the best rotation, reaches the final median of the random sessions. Real: the planner chooses
+over the image and after the best rotation, reaches the final median of the random sessions. REAL: the planner chooses
 some images of a capture, compared with as many at random; the error is the difference to the calibration from all
 images. For comparison: plain greedy selection, and the figures for an exactly true covariance.
 

@@ -1,4 +1,4 @@
-"""Measure how many pictures `rigkit plan rig.json` saves for simulated rigs of two equal lenses.
+"""Measure how many pictures `rigkit plan rig.json` saves for SIMULATED rigs of two equal lenses.
 
 Both cameras see the board in six frames. Then three more are taken, held where the plan asks, with a human's error, or
 at random. The goal is the error of both cameras' projections where boards are, including the extrinsics: "stated" is

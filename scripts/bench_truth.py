@@ -1,4 +1,4 @@
-"""The table of truth: rigkit, OpenCV, mrcal and COLMAP on real captures with measured truth.
+"""The table of truth: rigkit, OpenCV, mrcal and COLMAP on REAL captures with measured truth.
 
     python scripts/bench_truth.py [SET ...] [--data DIR] [--work DIR] [--model MODEL] [--json FILE]
         [--page datasets/public/README.md] [--short docs/pages/accuracy-truth.md]

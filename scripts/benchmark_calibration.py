@@ -1,4 +1,4 @@
-"""Compare calibration with OpenCV, mrcal and Ceres on the same corners: time, error, failures.
+"""Compare calibration with OpenCV, mrcal and Ceres on the same SIMULATED corners: time, error, failures.
 
     python scripts/benchmark_calibration.py [--views 40] [--repeats 15] [--failures 20 [--omnidir 3]]
 

@@ -2,8 +2,9 @@
 
 python scripts/benchmark_core.py [--only affine|epipolar|robust] [--corners 1000000] [--json]
 
-Times are processor times. Ratios are rigkit's rate over the other's on the same problems: above 1 rigkit is faster.
-PoseLib is optional (pip install poselib). If both programs estimate the same pose, the median errors are shown too.
+Matches are SIMULATED. Times are processor times. Ratios are rigkit's rate over the other's on the same problems: above
+1 rigkit is faster. PoseLib is optional (pip install poselib). If both programs estimate the same pose, the median
+errors are shown too.
 """
 
 from __future__ import annotations

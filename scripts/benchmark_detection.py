@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure corner detection on rendered scenes with exact truth, compared with other detectors and the Cramer-Rao bound.
+"""Measure corner detection on RENDERED scenes with exact truth, compared with other detectors and the Cramer-Rao bound.
 
     python scripts/benchmark_detection.py [--parts accuracy conditions peers speed pairs] [--poses 6] [--pairs 200]
                                           [--peers-python PYTHON] [--json FILE]

@@ -1,8 +1,8 @@
 """Compare circle grids with OpenCV: recall, and the error of cv2.calibrateCamera from each program's centres.
 
-    python scripts/compare_circles.py --board circles.toml IMAGE...     real images
+    python scripts/compare_circles.py --board circles.toml IMAGE...     REAL images
     python scripts/compare_circles.py --board circles.toml --worse IMAGE...
-    python scripts/compare_circles.py                                   rendered ones, with the errors of the centres
+    python scripts/compare_circles.py                                   RENDERED ones, with the errors of the centres
 
 With `--worse` real images are degraded in many ways. Printed are whole grids found, wrong grids, and the RMS
 displacement of centres, per axis, from those in the original image; for rigkit also in its stated sigmas.

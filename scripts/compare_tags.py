@@ -5,9 +5,10 @@
     python scripts/compare_tags.py --board grid.toml IMAGE...
     python scripts/compare_tags.py --board grid.toml --calibration grid.json --body body0.csv --target data.csv IMAGE...
 
-The first renders boards and prints errors over the Cramer-Rao bound. The second prints tags found and processor time,
-also of pupil-apriltags if installed. The third compares board poses with tracked ones after a hand-eye calibration.
-Tracked poses are CSV: time in ns, x, y, z in m, quaternion x, y, z, w. Images are named by their time in ns.
+The first renders boards (RENDERED) and prints errors over the Cramer-Rao bound. The second prints tags found in REAL
+images and processor time, also of pupil-apriltags if installed. The third compares board poses with tracked ones after
+a hand-eye calibration. Tracked poses are CSV: time in ns, x, y, z in m, quaternion x, y, z, w. Images are named by
+their time in ns.
 """
 
 from __future__ import annotations

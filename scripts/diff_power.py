@@ -1,4 +1,4 @@
-"""Measure the false alarms and the power of `rigkit diff` on simulated sessions of 20 images.
+"""Measure the false alarms and the power of `rigkit diff` on SIMULATED sessions of 20 images.
 
 For every lens (60, 110, 185 degrees) and kind of error, one camera is calibrated from two sessions, and from another
 one after the lens was changed. Errors are independent for each corner, or also have a smooth displacement common to an

@@ -1,4 +1,4 @@
-"""Test certificates: measure with simulated rigs and cameras that were calibrated from noisy corners.
+"""Test certificates: measure with SIMULATED rigs and cameras that were calibrated from noisy corners.
 
 Each trial is a rig of two cameras (or one camera), calibrated from a few images of a board with noisy corners, and
 certified. Then lengths, depths, planes and angles of known size are measured all over the image from corners with new

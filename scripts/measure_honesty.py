@@ -1,4 +1,4 @@
-"""Test the stated sigmas, including the calibration's uncertainty, on newly rendered laboratories.
+"""Test the stated sigmas, including the calibration's uncertainty, on newly RENDERED laboratories.
 
 A laboratory is a random lens, images of a board to calibrate it from, and pairs of views of three perpendicular boards,
 one for each pose type. The lens has 55 to 75 or 170 to 190 degrees and a projection that no model has. Images are
@@ -9,7 +9,7 @@ angle, baseline and normal are compared with their sigmas: 68 and 95 % should be
     python scripts/measure_honesty.py --sessions 20 [--moving] [--images 3,4,5,7,10,20]
 
 One laboratory takes 20 to 40 s. With --json, laboratories that the file has are not repeated, so it can run in parts;
-the table is of all. --sessions N simulates corners, without images: N sessions of each kind, from three images on.
+the table is of all. --sessions N uses SIMULATED corners, without images: N sessions of each kind, from three images on.
 """
 
 from __future__ import annotations

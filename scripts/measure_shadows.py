@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Errors of corners close to the edge of a hard shadow, which is multiplied onto images with known corners.
+"""Errors of corners close to the edge of a hard shadow, which is multiplied onto REAL images.
 
     python scripts/measure_shadows.py BOARDS=FOLDER ... [--left 0.25] [--count 18]
 

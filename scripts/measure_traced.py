@@ -1,4 +1,4 @@
-"""Errors of rigkit on path-traced captures: `python scripts/measure_traced.py traced/*`.
+"""Errors of rigkit on path-traced captures (RENDERED): `python scripts/measure_traced.py traced/*`.
 
 The folders are those of `path_traced.py`. Each is calibrated like `rigkit calibrate images --board board.toml`. The
 table has the errors of the corners used (2-D RMS), of the projection at those corners after the best rotation, with the

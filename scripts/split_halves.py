@@ -1,4 +1,4 @@
-"""Test the stated uncertainties of real calibrations: calibrate two halves of one camera's images separately.
+"""Test the stated uncertainties of REAL calibrations: calibrate two halves of one camera's images separately.
 
 The images of every set are split randomly into halves. The difference of two calibrations of the same camera, after the
 best rotation and where both had boards, must agree with its prediction: the ratio of observed to predicted difference

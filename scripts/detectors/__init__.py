@@ -1,1 +1,2 @@
-"""Detectors of boards behind one interface, and degradations of images, for the benchmarks of detection."""
+"""Detectors of boards behind one interface, and degradations of images, for `compare_detection.py` and the other
+scripts that measure detection."""

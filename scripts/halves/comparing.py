@@ -1,4 +1,4 @@
-"""Halves of images, calibrated apart, and in how far they agree where sigmas are true."""
+"""Calibrations from two halves of the images, and how well they agree if sigmas are true."""
 
 from __future__ import annotations
 

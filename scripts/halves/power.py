@@ -1,4 +1,4 @@
-"""Lenses that were touched between two halves: are they found?"""
+"""Power of the comparison: are lenses found that were changed between two halves?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Halves of a rig's frames, calibrated apart: are its baselines and mounts as far apart as is stated?
+"""Calibrations from two halves of a rig's frames: do baselines and mounts differ by what their sigmas predict?
 
 Frames are split at random, every second one apart, and in time: neighbouring frames may err alike, which only the last
 shows.

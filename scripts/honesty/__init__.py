@@ -1,4 +1,5 @@
-"""Laboratories and small sessions of `measure_honesty.py`, with scenes of the tests."""
+"""Laboratories and small sessions for `measure_honesty.py` and `split_halves.py`; their scenes are those of
+`tests/helpers`."""
 
 import sys
 from pathlib import Path

@@ -1,1 +1,1 @@
-"""The planner's benchmark on real captures."""
+"""REAL captures for `bench_planner.py` and `bench_coach.py`."""
