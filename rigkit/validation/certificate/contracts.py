@@ -72,7 +72,8 @@ class Instrument:
                 f"certificate: two different cameras of {', '.join(known.names)} are needed, got {' and '.join(names)}"
             )
         order = [known.names.index(name) for name in names]
-        layout, covariance = known.layout, known.covariance
+        layout = known.layout
+        covariance = known.covariance[layout.cameras[order[0]], layout.cameras[order[0]]]
         if len(order) == 2:
             place, absent = np.arange(layout.count), np.full(6, -1)
             rows = [place[layout.cameras[k]] for k in order] + [place[layout.mount(k)] if k else absent for k in order]

@@ -1,7 +1,9 @@
 """The evidence of fresh views of boards about a camera or a rig: information matrix and score of all parameters.
 
-theta are the intrinsics of all cameras, then the mounts of all but the first. Every board in every frame has its own
-pose, common to all cameras that see it in the frame, and eliminated. A change d of theta gives scores of mean I d.
+theta are the intrinsics of all cameras, the mounts of all but the first, then the warps of boards that the calibration
+solved for: a board of another aspect ratio passes for another lens, so both are wrong together. Every board in every
+frame has its own pose, common to all cameras that see it in the frame, and eliminated. A change d of theta gives scores
+of mean I d.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from rigkit.calibration.solving.clustered import reduced_by_cluster
 from rigkit.calibration.solving.linearise import view_products
 from rigkit.calibration.solving.outliers import inliers, sigma_of
 from rigkit.calibration.solving.poses import refine_poses
+from rigkit.calibration.solving.shape import NONE, WARP_UNKNOWNS, ShapeModel, warp_of_board
 from rigkit.calibration.solving.state import State, evaluate
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
@@ -54,6 +57,7 @@ class Monitored:
         stated.
     freedom : degrees of freedom of the covariance.
     boards_mm : corners (N, 3) of boards, by name, as calibrated; other boards, also of the same name, are as stated.
+    warped : names of the boards whose warps theta contains.
     """
 
     names: tuple[str, ...]
@@ -65,6 +69,7 @@ class Monitored:
     freedom: float = float("inf")
     scale_sigma: float = 0.0
     boards_mm: Mapping[str, Points] = field(default_factory=dict)
+    warped: tuple[str, ...] = ()
 
     @property
     def fresh_sigma_px(self) -> float:
@@ -74,34 +79,43 @@ class Monitored:
 
     @property
     def layout(self) -> Layout:
-        """Indices of lenses and mounts in theta."""
-        return Layout.of_cameras(self.cameras)
+        """Indices of lenses, mounts and warps in theta."""
+        return Layout.of([c.parameters.size for c in self.cameras], (), WARP_UNKNOWNS * len(self.warped))
 
     @property
     def of_models(self) -> IntArray:
         """Indices in theta of the parameters of the lens models and of the mounts."""
         layout = self.layout
         others = np.zeros(layout.count, dtype=bool)
+        others[layout.shape] = True
         for camera, own in zip(self.cameras, layout.cameras, strict=True):
             others[own.start + lens_of(far_camera(camera)).parameters.size : own.stop] = True
         return np.flatnonzero(~others)
 
     def state(self, c: int, observations: Observations, rotation: FloatArray, translation_mm: Points) -> State:
         """Return camera `c` with boards in these poses, in their calibrated shapes where known."""
-        known = [self._shape(board) for board in observations.boards]
-        start = State.start(self.cameras[c], rotation, translation_mm, observations)
-        return replace(start, shape=replace(start.shape, flat=np.concatenate(known)))
+        each = [self._shape(board) for board in observations.boards]
+        points, basis = (np.concatenate(parts) for parts in zip(*each, strict=True))
+        unknowns = np.zeros(basis.shape[-1])
+        return State(
+            self.cameras[c], rotation, translation_mm, ShapeModel("warp", points, basis, unknowns, NONE), unknowns
+        )
 
-    def _shape(self, board: Board) -> Points:
-        found, stated = self.boards_mm.get(board.board_id), board.points()
-        if found is None or found.shape != stated.shape:
-            return stated
-        square = min(board.squares_mm)
-        same = np.abs(found - stated).max() < SAME_BOARD * square * max(board.size)
-        return found if same else stated
+    def _shape(self, board: Board) -> tuple[Points, FloatArray]:
+        """Return the corners (N, 3) of a board, and their derivatives (N, 3, B) by all warps."""
+        found, points = self.boards_mm.get(board.board_id), board.points()
+        basis = np.zeros((*points.shape, WARP_UNKNOWNS * len(self.warped)))
+        if found is None or found.shape != points.shape:
+            return points, basis
+        if np.abs(found - points).max() >= SAME_BOARD * min(board.squares_mm) * max(board.size):
+            return points, basis
+        if board.board_id in self.warped:
+            first = WARP_UNKNOWNS * self.warped.index(board.board_id)
+            basis[..., first : first + WARP_UNKNOWNS] = warp_of_board(found).basis
+        return found, basis
 
     def changed(self, change: FloatArray) -> Monitored:
-        """Return cameras and mounts after a change (T,) of theta."""
+        """Return cameras, mounts and boards after a change (T,) of theta."""
         layout = self.layout
         cameras = [
             c.with_parameters(c.parameters + change[own]) for c, own in zip(self.cameras, layout.cameras, strict=True)
@@ -110,7 +124,10 @@ class Monitored:
             pose if own is None else pose.moved(change[own])
             for pose, own in zip(self.cam_from_rig, layout.mounts, strict=True)
         ]
-        return replace(self, cameras=tuple(cameras), cam_from_rig=tuple(mounts))
+        boards = dict(self.boards_mm)
+        for name, warp in zip(self.warped, change[layout.shape].reshape(-1, WARP_UNKNOWNS), strict=True):
+            boards[name] = boards[name] + warp_of_board(boards[name]).basis @ warp
+        return replace(self, cameras=tuple(cameras), cam_from_rig=tuple(mounts), boards_mm=boards)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -247,7 +264,8 @@ class _PosedBoards:
                 own = view_products(seen, self.state(monitored, c, seen), self.weight[c])
                 lever = self.translation_mm[self.group[c]] @ pose.rotation.T
                 follow = pose_jacobians_of_mount(pose.rotation, layout.mounts[c], self.group[c], lever)
-                each.append((own, np.arange(lens.start, lens.stop), (follow,)))
+                theta = np.r_[lens.start : lens.stop, layout.shape.start : layout.shape.stop]
+                each.append((own, theta, (follow,)))
         return summed_products(each, len(self.frame), layout.count)
 
     def moved(self, step: FloatArray) -> _PosedBoards:

@@ -204,6 +204,8 @@ def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = (
         size_px, max_px = _sizes_px(monitored, evidence, step, unsure)
         change = replace(best, amounts=amounts, size_px=size_px, max_px=max_px)
     goals = cost or lens_goals(monitored)
+    # Goals are of lenses and mounts, which come first.
+    moved = step[: len(goals[0].weight)]
     return SentinelCheck(
         chance=chance,
         change=change,
@@ -220,7 +222,7 @@ def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = (
         powers=()
         if exceeds_expected(after.rms_px, expected_px)
         else powers_of(monitored, evidence, [c.hypothesis for c in known], ALARM_CHANCE),
-        cost=float(np.sqrt(max([0.0, *(float(step @ g.weight @ step) for g in goals)]))),
+        cost=float(np.sqrt(max([0.0, *(float(moved @ g.weight @ moved) for g in goals)]))),
         cost_unit=goals[0].unit,
     )
 

@@ -15,18 +15,19 @@ from rigkit.cameras.moving_pupil import PUPIL_TERMS, NearCamera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.planning.information import Knowledge
 from rigkit.validation.sentinel.evidence import Monitored
 
 
 def monitored_camera(calibration: Calibration, name: str, *, beyond_model: bool = True) -> Monitored:
-    """Return a calibrated camera, by default with the inadequacy of its model among its parameters; a moving pupil has
-    its covariance from the solution."""
+    """Return a calibrated camera, by default with the inadequacy of its model and the warps of its boards among the
+    unknowns; a moving pupil has its covariance from the solution."""
     known = (
         uncertain_camera(calibration, quoted=False, near=True)
         if beyond_model
         else UncertainCamera(calibration.near, calibration.near_covariance[:-6, :-6])
     )
-    return Monitored(
+    camera = Monitored(
         names=(name,),
         cameras=(known.camera,),
         cam_from_rig=(Rigid3.identity(),),
@@ -36,6 +37,25 @@ def monitored_camera(calibration: Calibration, name: str, *, beyond_model: bool 
         freedom=calibration.freedom,
         boards_mm={shape.board_id: shape.points_mm for shape in calibration.boards},
     )
+    return _with_warps(camera, Knowledge.of(calibration)) if beyond_model else camera
+
+
+def _with_warps(camera: Monitored, known: Knowledge) -> Monitored:
+    """Return a camera with the warps of its boards, as `known` with the model's P parameters from the same views.
+
+    The covariance of the warps w given the parameters x is I_ww^-1, and w follows x by -I_ww^-1 I_wx: where a board's
+    aspect ratio and that of the pixels were not told apart, they are wrong together.
+    """
+    p = known.camera.parameters.size
+    if not known.warped:
+        return camera
+    rest = scaled_pinv(known.information[p:, p:])
+    follows = np.zeros((len(rest), len(camera.covariance)))
+    follows[:, :p] = -rest @ known.information[p:, :p]
+    through = np.concatenate([np.eye(len(camera.covariance)), follows])
+    covariance = through @ camera.covariance @ through.T
+    covariance[-len(rest) :, -len(rest) :] += rest
+    return replace(camera, covariance=covariance, warped=known.warped)
 
 
 def monitored_rig(rig: RigCalibration) -> Monitored:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.calibration_scenes import REACH_DEG, lens, noisy_view, random_views
+from helpers.calibration_scenes import BOARD, REACH_DEG, lens, noisy_view, random_views
 from helpers.sentinel_scenes import NOISE_PX, best_held, changed_lens, checked, poses_held
 
 from rigkit.calibration.calibrate import calibrate
@@ -16,17 +16,20 @@ from rigkit.calibration.certainty.displaced import DisplacedCamera, lens_of
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibrations.calibration_file import calibration_text, load_calibration, save_calibration
 from rigkit.io.calibrations.history_file import load_history
 from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.planning.goal import projection_goal
 from rigkit.report.pages.check_page import check_facts, check_page
-from rigkit.validation.sentinel.evidence import FreshView
+from rigkit.validation.sentinel.evidence import FreshView, evidence_of
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, check_views
 from rigkit.validation.sentinel.power import FOUND
 from rigkit.validation.sentinel.watch import monitored_camera
+from rigkit.validation.sentinel.whitened import Whitened
 from rigkit.workflows.checks.check import fixed_text
 from rigkit.workflows.checks.history import add_to_history
 
@@ -231,3 +234,30 @@ def test_images_that_disagree_are_judged_more_carefully(calibration: Calibration
     disagreeing = replace(calibration, overdispersion=4.0)
     unsure = checked(disagreeing, camera, np.random.default_rng(1))
     assert sure.chance < 1e-3 and unsure.chance > 1e3 * sure.chance
+
+
+def test_a_board_that_passed_for_another_lens_is_no_change(rng: np.random.Generator) -> None:
+    """Boards that were never turned leave open whether pixels or squares are longer one way. Three standard deviations
+    of both together are three of the check, also where the board is now turned by a quarter."""
+
+    def held(turn_rad: float, tilts: list[tuple[float, float]]) -> list[Rigid3]:
+        turned = [exp_so3(np.array([x, y, 0.0])) @ exp_so3(np.array([0.0, 0.0, turn_rad])) for x, y in tilts]
+        return [Rigid3(turn, np.array([0.0, 0.0, 700.0]) - turn @ BOARD.points().mean(axis=0)) for turn in turned]
+
+    before = [(x, y) for x in (-0.3, 0.0, 0.3) for y in (-0.3, 0.1, 0.3)]
+    views = [noisy_view(lens("reg"), pose, f"{k}", rng, NOISE_PX) for k, pose in enumerate(held(0.0, before))]
+    known = calibrate(views, lens("reg").size_px, model="brown", degree=5, board="warp", folds=0)
+    monitored = monitored_camera(known, "cam")
+    aspect = monitored.layout.shape.start
+    sigma = float(np.sqrt(monitored.covariance[aspect, aspect]))
+    assert sigma > 3e-4
+    true = monitored.changed(3.0 * monitored.covariance[:, aspect] / sigma)
+    fresh = []
+    for k, pose in enumerate(held(0.5 * np.pi, [(0.5, 0.0), (0.0, 0.5), (-0.5, 0.3)])):
+        pixels, _ = true.cameras[0].project(pose.apply(true.boards_mm[BOARD.board_id]))
+        view = BoardView(f"{k}", BOARD, BOARD.grid(), pixels, np.full(BOARD.corner_count, NOISE_PX))
+        fresh.append(FreshView(view.image, 0, view))
+    seen = Whitened.of(monitored, evidence_of(monitored, fresh))
+    assert 1.0 < seen.score @ np.linalg.solve(seen.covariance, seen.score) < 3.0**2 * 1.05
+    # The correction for it leaves nothing.
+    assert evidence_of(true, fresh).rms_px < 1e-3 < evidence_of(monitored, fresh).rms_px
