@@ -14,9 +14,10 @@ scene: a rig in front of rendered textured walls; the extrinsics rotate by 0.05 
 pairs: real pairs of textured scenes with known cameras and pose; without change, or with extrinsics rotated by 0.05
 degrees, checked as published, or against the rig's other pairs (`--before`).
 real: real captures; three, or half, of the images are checked against a calibration from the others.
-since: the same, and real rigs whose mount turned, since others of these images (`--before`).
+ordered: real captures; the first or last images are checked against a calibration from the others.
+since: the same as real, and real rigs whose mount turned, since others of these images (`--before`).
 
-    python scripts/bench_sentinel.py [lens] [rig] [departs] [pupil] [rendered] [scene] [pairs] [real] [since]
+    python scripts/bench_sentinel.py [lens] [rig] [departs] [pupil] [rendered] [scene] [pairs] [real] [ordered] [since]
         [--seeds 20] [--lens NAME ...] [--board 9x6x25] [--parameters-alone]
 """
 
@@ -35,7 +36,7 @@ import numpy as np
 from bench_planner import LENSES, Lens, by_hand, free_poses, see
 from halves.captures import identified
 from scipy.special import ndtr, ndtri
-from sentinel.captures import SAID, left_out, real
+from sentinel.captures import SAID, left_out, ordered, real
 from sentinel.pupils import pupils
 from sentinel.scenes import pairs
 from sentinel.since import RIGS, since_cameras, since_rigs
@@ -347,7 +348,7 @@ REAL = ("caliper", "camodocal", "ov-plane", "ocam", "fisheye-chess", "cylinder",
 
 
 def main() -> None:
-    kinds = ("lens", "rig", "departs", "pupil", "rendered", "scene", "pairs", "real", "since")
+    kinds = ("lens", "rig", "departs", "pupil", "rendered", "scene", "pairs", "real", "ordered", "since")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kinds", nargs="*", choices=[*kinds, []], help="default all")
     parser.add_argument("--seeds", type=int, default=20)
@@ -371,6 +372,7 @@ def main() -> None:
         "scene": [partial(scene, args.seeds, args.noise, n) for n in args.lens],
         "pairs": [partial(pairs, args.data, args.seeds)],
         "real": [partial(real, n, args.data, args.cache, args.seeds) for n in args.sets],
+        "ordered": [partial(ordered, n, args.data, args.cache) for n in args.sets],
         "since": [
             *(partial(since_rigs, n, args.data, args.cache, args.seeds) for n in RIGS),
             *(partial(since_cameras, n, args.data, args.cache, args.seeds) for n in args.sets),

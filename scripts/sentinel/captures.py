@@ -53,6 +53,21 @@ def real(name: str, data: Path, cache: Path, draws: int) -> None:
             )
 
 
+def ordered(name: str, data: Path, cache: Path) -> None:
+    """Check the first and the last images of a capture, as their names order them, against the others: they may be
+    unlike these, as images of another day are and random ones are not."""
+    found, size = load(name, data, cache)
+    images, checks = list(found.values()), []
+    for fresh in dict.fromkeys((FRESH, len(images) // 4, len(images) // 2)):
+        for parts in ((images[:fresh], images[fresh:]), (images[-fresh:], images[:-fresh])):
+            own, others = ([v for image in part for v in image] for part in parts)
+            try:
+                checks.append(checked(calibrate(others, size), own))
+            except RigkitError as error:
+                print(f"{name}: {error}")
+    tell(f"{name}: the first or last", checks, "nothing")
+
+
 def touched(full: Calibration, what: str, rng: np.random.Generator) -> Camera:
     """Return a calibrated camera of any model after a change that leaves 0.15 px rms after the best rotation."""
     monitored = monitored_camera(full, "camera")
