@@ -22,6 +22,7 @@ from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.checks.validate import has_edge_offset
 from rigkit.detection.guided.corner_fit import MARKER_BLURS, RADIUS_PX, fit_corners, gap_to_markers
 from rigkit.detection.guided.guided import MAX_ADDED_RESIDUAL_MARKED, completed
+from rigkit.detection.guided.lopsided_blur import blur_shift_px
 from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
@@ -69,7 +70,7 @@ class CharucoFinder(Finder):
         if search.quick:
             return every
         pairs = zip(every, found, strict=True)
-        return [relit(search.grey, detection, item.refined, item.board) for detection, item in pairs]
+        return [_less_sure(relit(search.grey, seen, item.refined, item.board), item) for seen, item in pairs]
 
 
 def _too_unlike(fitted: RefinedLattice, sure: BoolArray) -> BoolArray:
@@ -368,6 +369,14 @@ def _fitted(image: GreyImage, refined: RefinedLattice, board: Board, blur: float
     drop = known.copy()
     drop[known] = ~fit.valid | (fit.contrast <= 0.0)
     return fitted.without(drop)
+
+
+def _less_sure(detection: BoardDetection, found: _MarkedBoard) -> BoardDetection:
+    """Return `detection` with sigmas that include the common shift of its corners by lopsided blur."""
+    if isinstance(found.shown.pattern, Charuco):
+        return detection
+    shift_px = blur_shift_px(found.picture, found.refined, found.shown)
+    return replace(detection, sigma_px=np.hypot(detection.sigma_px, shift_px)) if shift_px > 0.0 else detection
 
 
 def _detection(found: _MarkedBoard) -> BoardDetection:
