@@ -12,6 +12,7 @@ from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging import verdicts
+from rigkit.calibration.judging.captured import stretched_images
 from rigkit.calibration.judging.changing import CHANGES
 from rigkit.calibration.judging.verdicts import diagnose_session
 from rigkit.calibration.result import Calibration
@@ -95,6 +96,19 @@ def test_wrong_aspect_and_bent_board(rng: np.random.Generator) -> None:
     shaped = calibrate(views, SIZE, model="brown")
     assert shaped.boards[0].kind != "flat" and printed(shaped, "departs from a plane")
     assert not printed(shaped, "neighbouring corners agree")
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"), [((0.97, 1.0), "% smaller along x"), ((1.0, 0.97), "% smaller along y"), ((1, 1), "")]
+)
+def test_stretched_images_are_told(scale: tuple[float, float], words: str, rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("reg"), 12, rng, reach_deg=33.0, noise_px=0.05)
+    views = [replace(view, pixels=view.pixels * np.array(scale)) for view in views]
+    result = calibrate(views, SIZE, model="brown", board="flat")
+    assert printed(result, words or "held-out") and printed(result, "stretched the images") == bool(words)
+    # A turned board tells it from squares that are longer one way.
+    assert not printed(result, "or the board's squares are longer")
+    assert all("or the board's squares are longer" in str(f) for f in stretched_images(result, upright=True))
 
 
 def test_few_images_and_one_bad_view(rng: np.random.Generator) -> None:
