@@ -1,4 +1,4 @@
-"""What corner and pose errors alone do to normals, predicted and by Monte Carlo: the directions are exact here."""
+"""Errors of normals from corner noise and pose noise alone (directions exact): prediction against Monte Carlo."""
 
 from __future__ import annotations
 

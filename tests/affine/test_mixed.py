@@ -1,4 +1,4 @@
-"""Any mix of directions with and without lengths: the pure cases are the registry's, the mixed ones exact."""
+"""Estimators for any mix of directions with and without lengths: exact, and equal to those of the registry."""
 
 from __future__ import annotations
 

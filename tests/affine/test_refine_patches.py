@@ -1,4 +1,4 @@
-"""Patches that are aligned between images of different scales: their sigmas against the exact affinity."""
+"""Alignment of patches between images of different scales: its sigmas against the exact affinity."""
 
 from __future__ import annotations
 

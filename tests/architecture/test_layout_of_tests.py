@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from helpers.data import REPOSITORY
 
 TESTS, PACKAGE, SCRIPTS = REPOSITORY / "tests", REPOSITORY / "rigkit", REPOSITORY / "scripts"
@@ -27,6 +29,12 @@ def test_a_test_file_begins_with_the_name_of_what_it_tests() -> None:
         if not any(tested == name or tested.startswith(f"{name}_") for name in names_in(folder)):
             misplaced.append(path.relative_to(TESTS).as_posix())
     assert not misplaced
+
+
+def test_no_test_file_imports_another() -> None:
+    """What several files need is in tests/helpers: an imported test file would run its module twice."""
+    pattern = re.compile(r"^\s*(?:from|import) [\w.]*\btest_\w+", re.MULTILINE)
+    assert not [path.name for path in TESTS.rglob("*.py") if pattern.search(path.read_text(encoding="utf-8"))]
 
 
 def test_contributing_explains_every_folder_of_tests_across_parts() -> None:

@@ -1,4 +1,4 @@
-"""calibrate(): from views without any guess to a camera that is right, or to a message that says why not."""
+"""calibrate(): from views without an initial guess to the right camera, or to a message with the reason."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.solving.test_clustered import disturbed
 from helpers.calibration_scenes import (
     BOARD,
     REACH_DEG,
@@ -17,6 +16,7 @@ from helpers.calibration_scenes import (
     random_views,
     with_outliers,
 )
+from helpers.session_scenes import disturbed
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.uncertainty import FarProjection

@@ -1,4 +1,4 @@
-"""Views that say little or nothing: a message or a sound result, never a crash, never a sigma of zero."""
+"""Views with little information: a message or a sound result, never a crash or a sigma of zero."""
 
 from __future__ import annotations
 

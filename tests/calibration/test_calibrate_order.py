@@ -1,4 +1,4 @@
-"""A calibration is that of its images, in whatever order they come."""
+"""The result of a calibration does not depend on the order of its images."""
 
 from __future__ import annotations
 

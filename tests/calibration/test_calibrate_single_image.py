@@ -1,4 +1,4 @@
-"""One image of three perpendicular boards calibrates a camera when nothing else is there."""
+"""One image of three perpendicular boards is enough to calibrate a camera."""
 
 from __future__ import annotations
 

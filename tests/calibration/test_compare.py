@@ -1,3 +1,5 @@
+"""Comparison of calibrations: a camera does not differ from itself, nor in another lens model; a moved lens does."""
+
 from __future__ import annotations
 
 import itertools

@@ -1,4 +1,4 @@
-"""How often any test could find a focal length that is longer by a thousandth: what two sessions hold of it.
+"""The upper bound of the power of any test for a focal length that changed by a thousandth.
 
 The Cramér-Rao bound of a session's focal length, with the errors that the corners of an image have in common known
 exactly, and of that difference the most powerful test there is, one that knows what it looks for. What `rigkit diff`
@@ -12,8 +12,8 @@ import itertools
 
 import numpy as np
 import pytest
-from calibration.solving.test_clustered import CORNERS_PX, FAIR_PX, GOOD_PX, longer, sessions
 from helpers.focal_bounds import LENSES, best_powers
+from helpers.session_scenes import CORNERS_PX, FAIR_PX, GOOD_PX, longer, sessions
 
 from rigkit.calibration.compare import CameraVerdict, compare_calibrations
 

@@ -1,4 +1,4 @@
-"""Hand-eye calibration: errors within its own sigmas, and what makes it impossible said in words."""
+"""Hand-eye calibration: errors within its sigmas, and messages for degenerate motions."""
 
 from __future__ import annotations
 

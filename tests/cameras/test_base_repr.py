@@ -1,4 +1,4 @@
-"""A camera says in one line what it is: its model, size and every number by its name."""
+"""repr of a camera: model, image size and every parameter by its name."""
 
 from __future__ import annotations
 

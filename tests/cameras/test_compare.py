@@ -1,4 +1,4 @@
-"""Differences of cameras: what a recalibration may change freely is taken out, the rest is measured in px."""
+"""Differences of cameras: a rotation is free, the rest is measured in px."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The camera of points in mm: rays start where the pupil is."""
+"""The camera of points in mm: rays start at the entrance pupil of their own angle."""
 
 from __future__ import annotations
 

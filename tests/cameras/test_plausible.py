@@ -1,4 +1,4 @@
-"""Cameras that no lens can be."""
+"""Parameters that no lens can have."""
 
 from __future__ import annotations
 

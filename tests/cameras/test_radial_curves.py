@@ -1,4 +1,4 @@
-"""Every model starts from the radial curve of any lens that it can see, near enough for a solver to take over."""
+"""from_radial_curve starts every model close enough to any lens in its field of view for a solver to converge."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Our models beside OpenCV's and COLMAP's implementations of the same."""
+"""Camera models against OpenCV's and COLMAP's implementations."""
 
 from __future__ import annotations
 

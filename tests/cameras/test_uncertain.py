@@ -1,4 +1,4 @@
-"""Two cameras of a rig are as sure as the rig: what each of its numbers moves, exactly."""
+"""Displacements of two cameras along the principal axes of a rig's covariance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`rigkit board`: what is printed, and the measured print back into the board's file."""
+"""`rigkit board`: sheets to print, and the measured print in the board's file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`rigkit calibrate` from images on disk to the file, and what it says to bad input."""
+"""`rigkit calibrate` from images to the file, and its messages for bad input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A newcomer's way: folders of pictures and the size of the board, one command, nothing written by hand."""
+"""`rigkit calibrate FOLDER`: folders of pictures and the size of the board, without any file written by hand."""
 
 from __future__ import annotations
 
@@ -336,10 +336,7 @@ def test_known_cameras_are_written_to_the_session(
 
 
 def test_the_square_is_enough_where_images_show_the_board(pictures: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for path in pictures.glob("left*.jpg"):
-        shutil.copy(path, folder)
+    folder = of_one_camera(pictures, tmp_path / "photos")
     assert main(["calibrate", str(folder), "--square-mm", "30", "--model", "brown"]) == 0
     assert 'board = "board-9x6x30.toml"' in (folder / "session.toml").read_text()
     # What the session says is kept: again without a word, or with the same ones.

@@ -1,4 +1,4 @@
-"""`rigkit calibrate` on a rig, from corners kept beside the session: the file, the words, the page, the exit code."""
+"""`rigkit calibrate` on a rig, from cached corners: file, messages, page, exit code."""
 
 from __future__ import annotations
 

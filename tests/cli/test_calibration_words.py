@@ -1,4 +1,4 @@
-"""Images that are left out are said by reason: of a video hundreds may show no board."""
+"""Images that are left out are grouped by reason in what `rigkit calibrate` prints."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""`rigkit export`: cameras, rigs and clouds to the formats of other programs and back, with the stated losses."""
+
 from __future__ import annotations
 
 import json

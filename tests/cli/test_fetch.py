@@ -1,4 +1,4 @@
-"""`rigkit fetch`: public captures come from a server or are found here, and are held against their hashes."""
+"""`rigkit fetch`: public captures from a server or from a local folder, checked by their hashes."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""`rigkit init`: manifests of data sets and rigs from folders of images, and the facts that it asks for."""
+
 from __future__ import annotations
 
 import json

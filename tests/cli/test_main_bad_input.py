@@ -1,4 +1,4 @@
-"""Bad input: one line that says what, where and what to do; the right exit code; nothing lost."""
+"""Bad input: one line with the place, the reason and the remedy; the right exit code; no file lost."""
 
 from __future__ import annotations
 

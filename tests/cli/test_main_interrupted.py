@@ -1,4 +1,4 @@
-"""A program that is interrupted or killed: one line, the signal's exit code, no process and no half file left."""
+"""Interrupted or killed programs: one line, the exit code of the signal, no process and no partial file left."""
 
 from __future__ import annotations
 

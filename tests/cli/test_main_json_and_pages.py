@@ -1,4 +1,4 @@
-"""`--json` gives everything that the pages show."""
+"""`--json` has everything that the pages show."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.pages import assert_all_is_in
+from helpers.pages import assert_all_is_in, reported
 from helpers.reconstructions import make_reconstruction
 from helpers.schemas import faults
 from helpers.stereo_pictures import of_one_camera
-from report.pages.test_page_first_screen import reported
 
 from rigkit.cli.main import main
 from rigkit.report.pages.page import build_page, validation_facts

@@ -1,4 +1,4 @@
-"""Many data sets or sessions at once: one table, the same whoever computes it, and none ends the rest."""
+"""Many data sets or sessions in one call: one table, equal for any number of processes; one failure ends no other."""
 
 from __future__ import annotations
 

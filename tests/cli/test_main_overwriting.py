@@ -1,4 +1,4 @@
-"""With --force results are replaced, never what a command reads: raw images, sessions, calibrations, manifests."""
+"""--force replaces results, never an input: images, sessions, calibrations, manifests."""
 
 from __future__ import annotations
 

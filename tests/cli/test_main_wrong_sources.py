@@ -1,4 +1,4 @@
-"""Sources that are not what a command takes: archives, other files, folders of a camera that saw nothing."""
+"""Sources of a kind that a command does not take: archives, other files, folders without boards."""
 
 from __future__ import annotations
 

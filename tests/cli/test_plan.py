@@ -1,4 +1,4 @@
-"""`rigkit plan`: from a calibration, for a lens, what is refused, and what the page shows."""
+"""`rigkit plan`: from a calibration or for a lens, its refusals, and its page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Captures with one thing wrong, from rendered images through the command: the right check fails, and says why."""
+"""Captures with one fault, RENDERED, through `rigkit validate`: the right check fails and names it."""
 
 from __future__ import annotations
 

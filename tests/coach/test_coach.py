@@ -1,23 +1,21 @@
-"""The coach: what it takes and keeps, that it goes on where it was left, and what its server refuses."""
+"""The coach: which frames it takes and keeps, resuming a capture, and requests that its server refuses."""
 
 from __future__ import annotations
 
-import http.client
 import json
 import os
 import re
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from helpers.coach_scenes import BOARD, CAMERA, SIZE, ask, options, picture
 from helpers.sentinel_scenes import best_held
 
 from rigkit.calibration.certainty.displaced import uncertain_camera
-from rigkit.cameras.brown import Brown
 from rigkit.cameras.compare import compare_cameras
 from rigkit.coach.coach import Coach, Take
 from rigkit.coach.guide import MIN_GAIN, MIN_GAIN_OF_PHOTO, CaptureGuide, GuideOptions
@@ -30,27 +28,9 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibrations.calibration_file import load_calibration
 from rigkit.planning.goal import projection_goal
-from rigkit.synthetic.photometry import Photometry
-from rigkit.synthetic.render import Optics, render
-from rigkit.synthetic.scene import PlacedBoard
 from rigkit.workflows.capture.coach import CoachOptions, coach_frames, coach_recording, open_coach, run_coach
 
-SIZE = (640, 480)
-BOARD = Board("board-9x6x25", 9, 6, 25.0, 25.0)
-CAMERA = Brown(SIZE, np.array([620.0, 621.0, 322.0, 236.0, -0.12, 0.05, 0.0, 0.0, 0.0]))
 FRAMES = 9
-
-
-def picture(pose: Rigid3, rng: np.random.Generator, *, blur_px: float = 0.5) -> np.ndarray:
-    grey = render(
-        [PlacedBoard(BOARD, pose)],
-        CAMERA,
-        Rigid3.identity(),
-        optics=Optics(blur_px, supersample=2),
-        photometry=Photometry(noise_levels=1.0),
-        rng=rng,
-    )
-    return np.repeat(grey[..., None], 3, axis=2)
 
 
 @pytest.fixture(scope="module")
@@ -62,11 +42,6 @@ def poses() -> list[Rigid3]:
 def pictures(poses: list[Rigid3]) -> list[np.ndarray]:
     rng = np.random.default_rng(1)
     return [picture(pose, rng) for pose in poses]
-
-
-def options(folder: Path, **more: object) -> CoachOptions:
-    guide = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=0.1)
-    return CoachOptions(folder=folder, boards=("9x6x25",), guide=guide, **more)  # type: ignore[arg-type]
 
 
 def test_a_frame_is_taken_when_it_is_still_sharp_and_helps(pictures: list[np.ndarray], poses: list[Rigid3]) -> None:
@@ -281,25 +256,6 @@ def test_killed_and_started_again_nothing_is_lost(pictures: list[np.ndarray], tm
 def served(tmp_path: Path, serve: Callable[[Coach, tuple[str, ...]], int]) -> tuple[Coach, int]:
     coach = open_coach(options(tmp_path))
     return coach, serve(coach, LOCAL)
-
-
-def ask(port: int, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
-    own = {"Origin": f"http://127.0.0.1:{port}", **headers} if method == "POST" else headers
-    if headers.get("chunks"):
-        # Nobody says how much it will be.
-        connection.putrequest(method, path)
-        for name, value in own.items():
-            connection.putheader(name, value)
-        connection.endheaders()
-        megabyte = b"100000\r\n" + bytes(2**20) + b"\r\n"
-        with suppress(OSError):
-            for _ in range(MAX_UPLOAD_BYTES // 2**20 + 2):
-                connection.send(megabyte)
-    else:
-        connection.request(method, path, body, {k.replace("_", "-"): v for k, v in own.items() if v})
-    answer = connection.getresponse()
-    return answer.status, answer.read()
 
 
 def test_the_server_answers_its_own_page_alone(served: tuple[Coach, int], pictures: list[np.ndarray]) -> None:

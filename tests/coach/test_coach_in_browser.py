@@ -1,4 +1,4 @@
-"""The coach in a browser whose camera plays a rendered capture: it finds, guides, takes, stops, and loses nothing."""
+"""The coach in a browser whose camera plays a rendered capture: from the first frame to the stop, without losses."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from coach.test_coach import BOARD, CAMERA, SIZE, picture
-from coach.test_rig import shared_boards
 from helpers.browser import chromium
+from helpers.coach_scenes import BOARD, CAMERA, SIZE, picture, shared_boards
 from helpers.driven import DrivenPage
 from helpers.sentinel_scenes import best_held
 

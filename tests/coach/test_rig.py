@@ -1,17 +1,28 @@
-"""Several cameras whose frames are taken together: what they are told, what is kept, and how sure their mounts are."""
+"""The coach for several cameras: advice, kept frames, and the uncertainty of the mounts."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from coach.test_coach import BOARD, CAMERA, SIZE, ask, options, picture
-from helpers.calibration_scenes import noisy_view
+from helpers.coach_scenes import (
+    BOARD,
+    CAMERA,
+    MOUNT,
+    NOISE_PX,
+    REACH,
+    SIZE,
+    ask,
+    both,
+    frame_observation,
+    options,
+    picture,
+    shared_boards,
+)
 
 from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.choosing.models_tried import Request
@@ -26,33 +37,15 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import angle_between, exp_so3, log_so3, unit
+from rigkit.geometry.rotation import angle_between, log_so3, unit
 from rigkit.io.manifests.rig_session import load_rig_session
-from rigkit.planning.candidates import Reach, held_boards
-from rigkit.planning.information import CornerError, HeldBoards
+from rigkit.planning.candidates import held_boards
+from rigkit.planning.information import CornerError
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
 from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.workflows.capture.coach import CoachOptions, open_coach
 
-MOUNT = Rigid3(exp_so3(np.array([0.0, 0.06, 0.01])), [-60.0, 1.0, 2.0])
-NOISE_PX, DRAWS = 0.05, 120
-REACH = Reach(nearest_mm=250.0)
-
-
-def shared_boards(count: int) -> tuple[HeldBoards, HeldBoards]:
-    """Boards that both cameras see whole."""
-    in_a = _shared_boards()
-    chosen = in_a.chosen(np.arange(min(count, len(in_a))))
-    rotation = MOUNT.rotation @ chosen.rotation
-    translation = chosen.translation_mm @ MOUNT.rotation.T + MOUNT.translation_mm
-    return chosen, HeldBoards(chosen.points_mm, rotation, translation, chosen.seen)
-
-
-@cache
-def _shared_boards() -> HeldBoards:
-    in_a = held_boards(CAMERA, BOARD, REACH)
-    pixels = [CAMERA.project((MOUNT @ in_a.pose(k)).apply(BOARD.points()))[0] for k in range(len(in_a))]
-    return in_a.chosen(np.flatnonzero([CAMERA.on_image(p).all() for p in pixels]))
+DRAWS = 120
 
 
 def test_the_error_of_a_mount_is_what_repeated_frames_show(rng: np.random.Generator) -> None:
@@ -76,18 +69,6 @@ def test_the_error_of_a_mount_is_what_repeated_frames_show(rng: np.random.Genera
     assert 0.3 * NOISE_PX < in_px < 3.0 * NOISE_PX
     assert mount_error_px(shared, 4.0 * information[0]) == pytest.approx(0.5 * in_px)
     assert np.allclose(mean_motion([MOUNT] * 3).matrix(), MOUNT.matrix())
-
-
-def frame_observation(pose: Rigid3, rng: np.random.Generator, name: str) -> FrameObservation:
-    """What a camera sees of a board held still, without a picture."""
-    view = noisy_view(CAMERA, pose, name, rng, NOISE_PX, board=BOARD)
-    if len(view.grid) < 30:
-        return FrameObservation(size_px=SIZE, view=None)
-    return FrameObservation(size_px=SIZE, view=view, edge_px=2.0, moved_px=0.0, contrast=150.0)
-
-
-def both(pose: Rigid3, rng: np.random.Generator, name: str) -> list[FrameObservation]:
-    return [frame_observation(pose, rng, name), frame_observation(MOUNT @ pose, rng, name)]
 
 
 def test_a_rig_is_enough_when_lenses_and_mounts_are(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""A rig has frames enough only where all of its calibration says so: lenses, mounts, and what is to be measured."""
+"""The coach for rigs stops only after a calibration of the whole rig: lenses, mounts and the user's measurement."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from coach.test_coach import BOARD, SIZE
-from coach.test_rig import REACH, both, shared_boards
+from helpers.coach_scenes import BOARD, REACH, SIZE, both, shared_boards
 
 from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration

@@ -1,4 +1,4 @@
-"""There are enough frames only where all of `calibrate`, done while the capture goes on, says so of them."""
+"""The coach stops only after a whole calibration in the background."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from coach.test_coach import BOARD, CAMERA, SIZE
 from helpers.calibration_scenes import noisy_view
+from helpers.coach_scenes import BOARD, CAMERA, SIZE
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera

@@ -1,4 +1,4 @@
-"""Every file that we write: read back equal, refused over an existing one, whole or not there at all."""
+"""Every file that we write: read back equal, not overwritten without force, whole or absent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What makes no sense is refused in words where it is handed in, not computed with."""
+"""Nonsensical values are refused with a message where they are passed in."""
 
 from __future__ import annotations
 

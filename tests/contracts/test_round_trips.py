@@ -1,4 +1,4 @@
-"""Values drawn at random by Hypothesis: what a writer wrote its reader reads back, and so do the readers of others.
+"""Values drawn by Hypothesis: every writer's output is read back equal, by our readers and by other programs'.
 
 RIGKIT_EXAMPLES=1000 draws more of them than the few that run by default.
 """

@@ -1,4 +1,4 @@
-"""Short ways to what numpy takes longer for, to ask what is known here: they agree with it."""
+"""Fast replacements of numpy functions agree with numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures without a board: nothing is found, and clutter is given up before it costs what boards cost."""
+"""Pictures without a board: nothing is found, and clutter is abandoned early."""
 
 from __future__ import annotations
 

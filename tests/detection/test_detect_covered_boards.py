@@ -1,4 +1,4 @@
-"""Boards half of which something covers: what is seen of them is found, and nothing else is claimed."""
+"""Half-covered boards: the visible part is found, without false corners."""
 
 from __future__ import annotations
 

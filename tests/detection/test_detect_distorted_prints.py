@@ -1,4 +1,4 @@
-"""Boards that a printer or too much light has changed: squares a little too large or too small, or rounded."""
+"""Boards changed by the printer or overexposure: squares slightly too large, too small, or rounded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Boards smeared by motion, or far out of focus: found whole, their corners in place, with sigmas that are true."""
+"""Boards with motion blur or far out of focus: found whole, accurate, with true sigmas."""
 
 from __future__ import annotations
 

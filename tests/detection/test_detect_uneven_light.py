@@ -1,4 +1,4 @@
-"""Corners that the edge of a shadow or glare crosses say so by their sigmas, and do not draw others aside."""
+"""Corners crossed by the edge of a shadow or glare get larger sigmas, and do not bias others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is seen but not trusted is said, with its cause."""
+"""Boards that are seen but not trusted are reported with the reason."""
 
 from __future__ import annotations
 

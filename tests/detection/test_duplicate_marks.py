@@ -1,4 +1,4 @@
-"""Boards alike in one image."""
+"""Equal boards in one image are recognised by markers that occur twice."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Boards that nobody has described: all but their scale is told from images."""
+"""Undescribed boards: everything but their scale is identified from images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Boards that nobody has described, where light or ink has moved edges, or rows of markers were not read."""
+"""Undescribed boards whose edges were moved by light or ink, or whose rows of markers were not read."""
 
 from __future__ import annotations
 

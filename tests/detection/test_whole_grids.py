@@ -1,4 +1,4 @@
-"""How large a chessboard is, where images show it in part."""
+"""The size of a chessboard from images that show it in part."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pages of the documentation: every command and every block of Python runs, and every link leads somewhere."""
+"""The pages of the documentation: every command and every block of Python runs, and every link has a target."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from helpers.data import REPOSITORY
+from helpers.stereo_pictures import of_two_cameras
 
 from rigkit.cli.main import main
 
@@ -32,10 +33,7 @@ def set_up(needs: str, folder: Path, images: Path) -> None:
             for k, path in enumerate(sorted(images.glob("left*.jpg"))[:FRAMES]):
                 shutil.copy(path, folder / "photos" / f"{k}.jpg")
         elif need == "rig":
-            for side in ("left", "right"):
-                (folder / side).mkdir()
-                for path in sorted(images.glob(f"{side}*.jpg"))[:FRAMES]:
-                    shutil.copy(path, folder / side / path.name.replace(side, "IMG"))
+            of_two_cameras(images, folder, FRAMES)
         else:
             assert need == "lab"
             (folder / "lab-a").symlink_to(REPOSITORY / "datasets" / "lab-a")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import runpy
-import shutil
 import sys
 from pathlib import Path
 
 import pytest
 from helpers.data import REPOSITORY
+from helpers.stereo_pictures import of_one_camera, of_two_cameras
 
 EXAMPLES = REPOSITORY / "examples"
 
@@ -28,10 +28,7 @@ def test_one_camera(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for path in pictures.glob("left*.jpg"):
-        shutil.copy(path, folder)
+    folder = of_one_camera(pictures, tmp_path / "photos")
     printed = run("one_camera.py", [str(folder), "9x6x30"], monkeypatch, capsys, tmp_path)
     assert "held-out RMS" in printed and "100% of it seen" in printed
     assert (folder / "camera.yaml").is_file() and (folder / "calibration.html").is_file()
@@ -43,12 +40,8 @@ def test_stereo(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    for side in ("left", "right"):
-        (tmp_path / side).mkdir()
-        for path in pictures.glob(f"{side}*.jpg"):
-            shutil.copy(path, tmp_path / side / path.name.replace(side, "IMG"))
-    sides = [str(tmp_path / side) for side in ("left", "right")]
-    printed = run("stereo.py", [*sides, "9x6x30"], monkeypatch, capsys, tmp_path)
+    sides = of_two_cameras(pictures, tmp_path)
+    printed = run("stereo.py", [*map(str, sides), "9x6x30"], monkeypatch, capsys, tmp_path)
     # The cameras stand 90 mm apart.
     assert "mm apart" in printed and abs(float(printed.split(" ±")[0].split()[-1]) - 90.0) < 0.3
     assert len(list((tmp_path / "rectified").rglob("*.jpg"))) == 2 * len(list((tmp_path / "left").iterdir()))

@@ -1,4 +1,4 @@
-"""Every damaged input that once ended badly ends well, and the harness that finds them would say so if it did not."""
+"""Damaged inputs of former faults end well, and the harness that finds such faults would report them."""
 
 from __future__ import annotations
 

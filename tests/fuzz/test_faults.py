@@ -1,5 +1,5 @@
-"""Faults of the surroundings: a kill at any moment, a full disk, a folder that may not be written, two runs at once, a
-worker that dies. Files are whole or not there; what is wrong is said in one line."""
+"""Faults of the environment: a kill at any moment, a full disk, a read-only folder, two runs at once, a worker that
+dies. Files are whole or absent, and the error is one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One bad thing of several ends nothing but itself: the rest is done, it is named, and the exit code says so."""
+"""One bad input of several ends nothing but itself: the others are done, it is named, and the exit code is right."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever name a result is given, nothing that a command reads is lost, and a name that cannot be written is told."""
+"""No name of a result destroys an input, and names that cannot be written are refused."""
 
 from __future__ import annotations
 

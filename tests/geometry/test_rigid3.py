@@ -1,3 +1,5 @@
+"""Rotations and rigid motions: exponential map, composition, inverse, refusals."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import re
 import shutil
 import subprocess
@@ -49,3 +50,40 @@ def probed(text: str, folder: Path) -> list[str]:
     reported = re.search(r'data-probe="([^"]*)"', loaded(page))
     assert reported is not None
     return reported[1].split("|")
+
+
+MIN_FONT_PX = 11.0
+"""Smaller words are hard to read on a phone."""
+WIDTHS = (400, 768, 1366)
+FRAMES = """<!doctype html><body><script>
+const page = atob("%PAGE%"), widths = %WIDTHS%;
+const text = new TextDecoder().decode(Uint8Array.from(page, (c) => c.charCodeAt(0)));
+let left = widths.length;
+const told = [];
+for (const width of widths) {
+  const frame = document.createElement("iframe");
+  frame.style = `width: ${width}px; height: 900px; border: 0`;
+  frame.srcdoc = text;
+  frame.addEventListener("load", () => {
+    const page = frame.contentDocument, scale = (e) => {
+      const box = e.ownerSVGElement && e.ownerSVGElement.viewBox.baseVal;
+      return box ? e.ownerSVGElement.getBoundingClientRect().width / box.width : 1;
+    };
+    const words = [...page.querySelectorAll("p, td, th, label, figcaption, svg text, button")]
+      .filter((e) => e.textContent.trim() && e.getBoundingClientRect().width > 0);
+    const size = (e) => parseFloat(frame.contentWindow.getComputedStyle(e).fontSize) * scale(e);
+    const small = Math.min(...words.map(size));
+    told.push([width, page.documentElement.scrollWidth, small.toFixed(2)].join(" "));
+    if (--left === 0) document.body.dataset.probe = told.join("|");
+  });
+  document.body.append(frame);
+}
+</script></body>"""
+
+
+def measured_at_widths(page: str, folder: Path) -> dict[int, tuple[int, float]]:
+    """Return by width of the window how wide the page gets, and its smallest words, px."""
+    coded = base64.b64encode(page.encode()).decode()
+    found_words = probed(FRAMES.replace("%PAGE%", coded).replace("%WIDTHS%", str(list(WIDTHS))), folder)
+    rows = [text.split() for text in found_words]
+    return {int(width): (int(wide), float(small)) for width, wide, small in rows}

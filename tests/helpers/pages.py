@@ -8,6 +8,14 @@ from typing import Any
 
 import pytest
 
+from helpers.reconstructions import make_reconstruction
+from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
+from rigkit.report.pages.page import build_page
+from rigkit.report.pages.validation_page import pair_section, summary_table
+from rigkit.report.pages.validation_verdict import verdict_of
+from rigkit.validation.checks import ValidationReport, validate
+from rigkit.validation.diagnose import diagnose
+
 SKIPPED = ("script", "style", "svg", "nav", "button")
 
 
@@ -109,3 +117,20 @@ def _as_shown(text: str, cell: Any) -> bool:
     first = text.split(" ")[0]
     digits = len(first.partition(".")[2])
     return float(first) == pytest.approx(value, abs=0.51 * 10.0**-digits)
+
+
+def reported(stated_deg: float) -> ValidationReport:
+    """Return the report on an exact reconstruction, whose first angle (90 degrees) was measured as `stated_deg`."""
+    made = make_reconstruction(baseline_sigma_mm=0.1)
+    angles = tuple(
+        MeasuredAngle(a, b, stated_deg if (a, b) == ("plane1", "plane2") else 90.0, 0.3, "set square")
+        for a, b in (("plane1", "plane2"), ("plane1", "plane3"), ("plane2", "plane3"))
+    )
+    return validate(made, PairTruth(MeasuredLength(made.baseline_mm + 0.5, 2.0, "steel rule"), angles))
+
+
+def page_of(report: ValidationReport) -> str:
+    """Return the page of a report."""
+    verdict = verdict_of([report], [report], causes=diagnose([report]))
+    section = pair_section(make_reconstruction(), [report], [])
+    return build_page("title", "lead", verdict, [summary_table([report])], [section], {"rigkit": "x"})

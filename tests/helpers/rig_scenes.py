@@ -15,6 +15,8 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
 NOISE_PX = 0.2
+SIGMAS = 4.0
+"""A mount further than this from the truth, in its own standard deviations, is wrong: 1 in 16000 by chance."""
 MODELS = {"reg": "brown", "wide": "kannala_brandt", "fish": "kannala_brandt"}
 
 Views = dict[str, list[tuple[str, BoardView]]]

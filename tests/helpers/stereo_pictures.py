@@ -41,6 +41,15 @@ def write_pictures(folder: Path) -> None:
             cv2.imwrite(str(folder / f"{name}{count:02d}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 97])
 
 
+def of_two_cameras(pictures: Path, folder: Path, count: int = FRAMES) -> list[Path]:
+    """Return the folders left and right in `folder`, with the first `count` images of each camera under equal names."""
+    for side in ("left", "right"):
+        (folder / side).mkdir()
+        for path in sorted(pictures.glob(f"{side}*.jpg"))[:count]:
+            shutil.copy(path, folder / side / path.name.replace(side, "IMG"))
+    return [folder / "left", folder / "right"]
+
+
 def of_one_camera(pictures: Path, folder: Path) -> Path:
     """Return a folder with the images of one camera, named as cameras do."""
     folder.mkdir(parents=True)

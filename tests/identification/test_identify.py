@@ -1,4 +1,4 @@
-"""Boards of a pair: the same physical corner must get the same index in both images, or the tie must be stated."""
+"""Boards of a pair: the same physical corner gets the same index in both images, or ambiguity is reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which of equal boards gets which name, which corner is the first: a rule, and a layout where the rule is wrong."""
+"""Names and first corners of equal boards: by rule, or by a layout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Boards whose points are not one square apart, in a pair: told apart, placed, and with true directions."""
+"""Targets whose points are not one square apart, in a pair: identified, placed, with exact directions."""
 
 from __future__ import annotations
 

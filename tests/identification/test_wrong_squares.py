@@ -1,4 +1,4 @@
-"""A board whose squares were declared of another size is found with the size that it has."""
+"""The true square size of a board that was declared with another one."""
 
 from __future__ import annotations
 

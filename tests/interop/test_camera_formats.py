@@ -1,4 +1,4 @@
-"""Camera files of other programs: written, read back, and read by the programs themselves where they are at hand."""
+"""Camera files of other programs: written, read back, and read by those programs where they are installed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What boards showed of a lens decides how it is refitted for a format that lacks its model; mrcal's files say it."""
+"""A refit for a format without the lens's model is weighted by the outline of the boards, which mrcal's files hold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the other programs' own readers make of files of ours, where these programs are installed."""
+"""Our camera files read by the other programs' own code, where it is installed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A camera that went out into another program's format and came back is the camera that it was."""
+"""A camera written in another program's format and read back is equal."""
 
 from __future__ import annotations
 

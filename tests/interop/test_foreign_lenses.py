@@ -1,4 +1,4 @@
-"""Lens models of other programs that are no model here: held against the programs themselves, and the error stated."""
+"""Lens models that only other programs have: read within a stated error, against those programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of mrcal: splines of fisheyes, what mrcal itself projects, poses in metres."""
+"""mrcal's files: splines of fisheyes against mrcal's own projection, poses in metres."""
 
 from __future__ import annotations
 

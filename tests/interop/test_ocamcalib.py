@@ -1,4 +1,4 @@
-"""Files of OCamCalib and of its Python successor: their rays are ours, and ours theirs."""
+"""Files of OCamCalib and of py-OCamCalib: equal rays in both directions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""YAML within limits: what calibration files have is read, what could build, repeat or nest without end is refused."""
+"""YAML within limits: calibration files are read; tags, duplicates and deep nesting are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLY files as other programs see them, and files that are not ours."""
+"""PLY files in other programs, and files of other programs."""
 
 from __future__ import annotations
 

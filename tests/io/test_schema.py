@@ -1,4 +1,4 @@
-"""The published schemas against the readers, which know their keys themselves, and against files that people wrote."""
+"""The published schemas against the readers, and against files that people wrote."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The kernels of boards against rays: residuals, and the poses of least squares, against the same in numpy."""
+"""The kernels of board poses: residuals and least-squares poses against numpy."""
 
 from __future__ import annotations
 

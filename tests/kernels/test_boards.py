@@ -1,4 +1,4 @@
-"""The kernels of the picture of a whole board, against maps and pictures that numpy has in closed form."""
+"""The kernels that model the image of a whole board, against closed forms in numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The kernel that says which pixels boards covered agrees with its definition in numpy."""
+"""The kernel of the pixels that boards covered agrees with its definition in numpy."""
 
 from __future__ import annotations
 

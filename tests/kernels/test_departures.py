@@ -1,4 +1,4 @@
-"""The kernels of what a lens may do beyond its model agree with their definition in numpy."""
+"""The kernels of model inadequacy agree with their definition in numpy."""
 
 from __future__ import annotations
 

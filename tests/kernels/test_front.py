@@ -1,4 +1,4 @@
-"""The kernels of the detector's front against numpy and OpenCV: the same corners and links, to rounding."""
+"""The kernels of corner candidates against numpy and OpenCV: the same corners and links, up to rounding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The library is taken only whole and for the sources it was built from; every call of it is checked."""
+"""The library is loaded only if complete and built from the present sources; arguments of every call are checked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The kernel that reads what lies beyond the outermost squares agrees with its definition in numpy."""
+"""The kernel that reads the paper beyond the outermost squares agrees with its definition in numpy."""
 
 from __future__ import annotations
 

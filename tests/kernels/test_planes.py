@@ -1,4 +1,4 @@
-"""The kernel that fits planes to the nodes of a grid agrees with its definition in numpy, and keeps an edge sharp."""
+"""The kernel that fits planes to nodes of a grid agrees with its definition in numpy, and keeps edges sharp."""
 
 from __future__ import annotations
 

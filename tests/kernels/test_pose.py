@@ -1,4 +1,4 @@
-"""The compiled kernels of the relative pose against the numpy ones: the same answers, to rounding."""
+"""The kernels of the relative pose against numpy: equal up to rounding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The kernels of cameras that look the same all around agree with their definition in numpy."""
+"""The kernels of radially symmetric cameras agree with their definition in numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The kernel's step of normal equations is that of one dense system."""
+"""The kernel's step of the normal equations (Schur complement) is that of one dense system."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Descents reach minima that are known otherwise, say how they ended, and refuse steps that do harm."""
+"""Levenberg-Marquardt reaches known minima, reports how it ended, and rejects harmful steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Variances of small samples, drawn together as far as they differ by chance alone."""
+"""Variances of small samples, pooled as far as they differ by chance alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a view tells before it is taken: predicted errors are those found, poses can be held, words say where."""
+"""Planning: predicted errors against true ones, poses that a person can hold, advice in words."""
 
 from __future__ import annotations
 

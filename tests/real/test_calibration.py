@@ -1,4 +1,4 @@
-"""Public captures and the exact lab: calibrated with no guess, against what is known of them."""
+"""REAL public captures and the exact laboratory: calibrated without a guess, against their known values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Three boards that look alike and look the same turned by 180 degrees, from images: never a wrong answer.
+"""Three identical, symmetric boards in RENDERED images: never identified wrongly.
 
 `scripts/benchmark_detection.py --parts pairs` does the same for 200 pairs.
 """

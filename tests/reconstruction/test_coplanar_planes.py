@@ -1,4 +1,4 @@
-"""Planes on which the points of a board lie: sharper than free ones, their sigmas honest, priors of the level kept."""
+"""Planes constrained to the points of a board: more accurate than free ones, true sigmas, level priors kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras on a vehicle: tilted, their level known, their motion planar in level frames."""
+"""Tilted cameras on a vehicle with a known level: planar motion in level frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Planes from known lattices: more certain than free ones, honestly so, and undisturbed by what is no corner."""
+"""Planes from known lattices: more certain than free ones, with true sigmas, robust to false corners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Edges of depth of a cloud seen from one place: nothing hangs in the air between near and far."""
+"""Depth edges of a cloud seen from one place: no surface between foreground and background."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Boards that look alike are told apart by the angles that a person measured, where these say so clearly."""
+"""Identical boards are distinguished by measured angles, where these are decisive."""
 
 from __future__ import annotations
 

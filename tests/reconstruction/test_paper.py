@@ -1,4 +1,4 @@
-"""The paper's pipeline: exact where its formulas are, five estimators that differ, and as good as its inputs are."""
+"""The paper's pipeline: exact where its formulas are, five estimators that differ, errors as its inputs explain."""
 
 from __future__ import annotations
 

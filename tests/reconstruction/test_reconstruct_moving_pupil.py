@@ -1,4 +1,4 @@
-"""Pairs of a lens whose pupil moves: what that does to near corners is taken out, and its uncertainty counted in."""
+"""Pairs of a lens with a moving pupil: close corners are corrected, and the pupil's uncertainty is included."""
 
 from __future__ import annotations
 

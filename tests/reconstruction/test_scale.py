@@ -1,4 +1,4 @@
-"""Metric scale: exact, precise, honest, robust."""
+"""Metric scale: exact without noise, robust, and with true sigmas."""
 
 from __future__ import annotations
 

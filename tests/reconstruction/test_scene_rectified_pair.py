@@ -1,4 +1,4 @@
-"""Rectified pairs are told from their cameras and matches; their pose is exact. Others are estimated."""
+"""Rectified pairs are recognised by their cameras and matches; their pose is exact. Others are estimated."""
 
 from __future__ import annotations
 

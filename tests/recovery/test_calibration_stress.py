@@ -1,4 +1,4 @@
-"""The conditions under which calibrations usually fail: each must be solved, with nothing dropped without a reason."""
+"""The conditions under which calibrations usually fail: each is solved, and nothing is dropped without a reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The predicted uncertainty of a projection against what repeated calibrations really scatter by."""
+"""The predicted uncertainty of a projection against the scatter of repeated calibrations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sigmas of free points and normals against truth, the cameras calibrated anew from noisy corners for every cloud."""
+"""Sigmas of free points and normals against truth, with cameras calibrated anew from noisy corners for each cloud."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers.board_scenes import noisy_pair
 from helpers.calibration_scenes import REACH_DEG, lens
+from helpers.recalibrations import SIGMA_PX, random_scene, recalibration
 from helpers.reconstructions import BOARDS
-from recovery.test_honest_sigmas import SIGMA_PX, random_scene, recalibration
 from scipy.spatial import cKDTree
 
 from rigkit.cameras.uncertain import UncertainCamera

@@ -1,4 +1,4 @@
-"""Captures unlike the laboratory's own: other boards, lenses, walls and motions, worse images; against exact truth."""
+"""Captures unlike the laboratory's: other boards, lenses, walls and motions, worse images; against exact truth."""
 
 from __future__ import annotations
 

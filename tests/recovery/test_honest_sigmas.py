@@ -1,4 +1,4 @@
-"""Reported sigmas against what happens: 400 noisy corner sets of random captures, through the whole chain.
+"""Sigmas against true errors: 400 noisy corner sets of random captures, through the whole chain.
 
 Cameras are either exact, or calibrated anew for every capture from noisy corners: then the calibration's own
 uncertainty is a large part of every sigma.
@@ -6,49 +6,36 @@ uncertainty is a large part of every sigma.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 from helpers.board_scenes import fisheye_camera, noisy_pair, regular_camera
-from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
+from helpers.calibration_scenes import REACH_DEG, lens
+from helpers.recalibrations import (
+    SIGMA_PX,
+    Calibrate,
+    random_scene,
+    recalibration,
+)
 from helpers.reconstructions import BOARDS
 
-from rigkit.calibration.assemble import assemble
-from rigkit.calibration.solving.fit import fit_kept
-from rigkit.calibration.solving.initialise import initialise
-from rigkit.calibration.solving.solver import solve
-from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
-from rigkit.cameras.registry import MODELS
 from rigkit.cameras.uncertain import UncertainCamera
-from rigkit.core.arrays import FloatArray
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.reconstruction.calibration_shifts import calibration_shifts
 from rigkit.reconstruction.reconstruct import reconstruct_pair
-from rigkit.synthetic.pairs import StereoScene, trihedral_pair
+from rigkit.synthetic.pairs import StereoScene
 from rigkit.validation.checks import ValidationReport, validate
 
 DRAWS = 400
-SIGMA_PX = 0.03
-CALIBRATION_PX = 0.1
-CALIBRATION_VIEWS = 15
-LEVEL_DEG = 0.2
 WITHIN_ONE, WITHIN_TWO = (0.63, 0.73), (0.92, 0.98)
 """68.3 and 95.4 % for a Gaussian; 1200 angles, three of a scene correlated, are good to about 1.8 and 0.8 %."""
 WITHIN_ONE_BASELINE, WITHIN_TWO_BASELINE = (0.58, 0.78), (0.91, 0.99)
 """One baseline a draw: 2.3 and 1 %."""
 PAIRS = (("plane1", "plane2"), ("plane1", "plane3"), ("plane2", "plane3"))
 TYPES = (PoseType.GENERAL, PoseType.STANDARD, PoseType.FORWARD)
-
-Calibrate = Callable[[], tuple[Camera, FloatArray]]
-
-
-def random_scene(camera: Camera, pose_type: PoseType, rng: np.random.Generator) -> StereoScene:
-    """Three perpendicular boards; the level holds as well as the pipeline takes it to hold."""
-    return trihedral_pair(BOARDS, camera, pose_type, rng, level_sigma_deg=LEVEL_DEG, distance=(0.9, 1.3), walls=False)
 
 
 def report_of(scene: StereoScene, rng: np.random.Generator, calibrate: Calibrate | None = None) -> ValidationReport:
@@ -65,20 +52,6 @@ def report_of(scene: StereoScene, rng: np.random.Generator, calibrate: Calibrate
         known = UncertainCamera(camera, covariance)
         shifts = calibration_shifts(reconstruction, known)
     return validate(reconstruction, truth, shifts=shifts)
-
-
-def recalibration(camera: Camera, reach_deg: float, rng: np.random.Generator) -> Calibrate:
-    """Return a source of calibrations of `camera`, each from the same views with new noise, and their covariances."""
-    views, _, _ = random_views(camera, CALIBRATION_VIEWS, rng, reach_deg=reach_deg, noise_px=0.0)
-    exact = Observations.from_views(views)
-    start = solve(exact, next(initialise(exact, SIZE, MODELS[camera.model], None))).state
-
-    def calibrate() -> tuple[Camera, FloatArray]:
-        noisy = replace(exact, pixels=exact.pixels + CALIBRATION_PX * rng.normal(size=exact.pixels.shape))
-        result = assemble(noisy, fit_kept(noisy, start, exact.present), None, (), ())
-        return result.camera, result.covariance
-
-    return calibrate
 
 
 def shares(values: Sequence[float]) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""A soft level is nearly as good as the better of hard constraint and general solution, in between better than both.
+"""A soft level constraint is close to the better of hard constraint and general solution, and in between better.
 
 Three boards, 0.1 px; the deviations from the pose type are drawn with the level's sigma.
 """

@@ -1,4 +1,4 @@
-"""Results in a notebook: a verdict, a drawing that is XML, nothing large; a bar that fills."""
+"""Results in a notebook: a verdict, a drawing that is valid XML, small output; a progress bar."""
 
 from __future__ import annotations
 

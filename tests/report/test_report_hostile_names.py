@@ -1,4 +1,4 @@
-"""Names that people give to pairs, cameras and boards cannot break a page, a Markdown table or a spreadsheet."""
+"""Hostile names of pairs, cameras and boards cannot break a page, a Markdown table or a spreadsheet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmark of detectors: its workers answer, and survive what detectors do; its verdicts say what was measured."""
+"""`benchmark_detection.py`: workers answer, survive crashes of detectors, and verdicts agree with the figures."""
 
 from __future__ import annotations
 

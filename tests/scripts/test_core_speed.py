@@ -1,4 +1,4 @@
-"""What the benchmark compares gives the same answers: a loop written from the paper, and the batched estimators."""
+"""What `benchmark_core.py` compares gives equal results: a loop written from the paper, and the batched estimators."""
 
 from __future__ import annotations
 

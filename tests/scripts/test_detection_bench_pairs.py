@@ -1,4 +1,4 @@
-"""Pairs of equal boards: what they promise, and that the judge of identities tells right from wrong."""
+"""Pairs of identical boards: their promised properties, and the judgement of right and wrong identities."""
 
 from __future__ import annotations
 

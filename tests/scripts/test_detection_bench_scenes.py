@@ -1,4 +1,4 @@
-"""Benchmark scenes: what is promised is in the image, for both lenses."""
+"""Scenes of the detection benchmark show what they promise, for both lenses."""
 
 from __future__ import annotations
 

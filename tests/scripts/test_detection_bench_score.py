@@ -1,4 +1,4 @@
-"""Scores of detectors: every kind of mistake is counted as what it is."""
+"""Scores of detectors count every kind of mistake."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Marks on a printed cylinder: found where they are drawn, and compared with the design."""
+"""Marks on a printed cylinder: found at their true places, and compared with the design."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers of the table of truth: their digits say how far they are known."""
+"""Numbers in the table of truth have as many digits as are significant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The synthetic study: statistics that another implementation measured, and what must not depend on how it is run."""
+"""The synthetic study: statistics against another implementation's, and independence of processes and chunks."""
 
 from __future__ import annotations
 

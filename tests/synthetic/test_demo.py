@@ -1,4 +1,4 @@
-"""The demo capture is complete, readable, and its truth is the truth of its images."""
+"""The demo capture is complete and readable, and its truth belongs to its images."""
 
 from __future__ import annotations
 

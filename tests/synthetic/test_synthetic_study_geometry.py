@@ -1,4 +1,4 @@
-"""Batched pairs, directions on lattices and noise: what the synthetic study is made of."""
+"""Batched pairs, directions on lattices and noise of the synthetic study."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Verdicts on reconstructions made from exact geometry: right ones pass, each wrong one fails its own check only."""
+"""Checks of exact reconstructions: right ones pass, each wrong one fails only its own check."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The other methods find what the geometry is, agree with a right reconstruction, and contradict a wrong one."""
+"""Other methods find the geometry, agree with a right reconstruction, and contradict a wrong one."""
 
 from __future__ import annotations
 

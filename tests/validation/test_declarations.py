@@ -1,4 +1,4 @@
-"""A pose type or level that was declared and does not hold fails a check of its own, with the true angle."""
+"""A declared pose type, level or board size that is wrong fails its own check, with the true value."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each mistake that a person can make is named, and nothing is named where nothing is wrong."""
+"""Every mistake that a person can make is named, and correct data get no suspicion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The calibrations' share of every sigma, against calibrations drawn from their covariance."""
+"""The calibrations' part of every sigma, against calibrations drawn from their covariance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's claims are judged both ways, on our figures and on its own."""
+"""Claims of the paper, judged on our figures and on its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Planes against planes that we made, against Open3D's own PCA, and the predicted tilt against the observed one."""
+"""Planes against exact planes and Open3D's PCA, and the predicted tilt against the observed one."""
 
 from __future__ import annotations
 

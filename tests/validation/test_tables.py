@@ -1,4 +1,4 @@
-"""The tables hold what the reports and the paper say, and come back from every format."""
+"""The tables have the figures of the reports and of the paper, and come back from every format."""
 
 from __future__ import annotations
 

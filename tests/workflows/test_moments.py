@@ -1,4 +1,4 @@
-"""Which images of a rig were taken together."""
+"""Which images of a rig were taken at the same moment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the workflows write, and where never: a manifest does not decide it, nor a link, nor what is already there."""
+"""Where the workflows write: not where a manifest or a link points, and not over existing files."""
 
 from __future__ import annotations
 

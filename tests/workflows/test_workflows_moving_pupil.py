@@ -1,4 +1,4 @@
-"""A calibration with a pupil that moves: its file, and what uses the pupil or says that it does not."""
+"""Calibrations with a moving pupil: their file, and the workflows that use the pupil or report its neglect."""
 
 from __future__ import annotations
 

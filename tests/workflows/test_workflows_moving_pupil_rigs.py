@@ -1,4 +1,4 @@
-"""A rig of lenses whose pupils move: solved for together, in its file, and used or told of by what reads that."""
+"""Rigs of lenses with moving pupils: joint solution, file, and the workflows that use it."""
 
 from __future__ import annotations
 

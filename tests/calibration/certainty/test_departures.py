@@ -1,4 +1,4 @@
-"""What a lens may do beyond its model is in the projection's uncertainty: where it departs, and where no board was."""
+"""Model inadequacy in the uncertainty of the projection: inside the covered part of the image and outside."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a lens may do beyond its model goes along with the covariance of its parameters."""
+"""Model inadequacy as displacements of the camera, joint with the covariance of its parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Beyond the boards a lens may differ by the terms that its series leaves out, though no residual tells of them."""
+"""Terms that a lens model truncates widen the uncertainty outside the part of the image that boards covered."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pose is as sure as the lens it was found with."""
+"""The uncertainty of a board's pose includes that of the lens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was found of a camera alone is not found again for its rig, and the rig's result is the same to the last bit."""
+"""A rig reuses the calibrations of its single cameras, with the same result to the last bit."""
 
 from __future__ import annotations
 

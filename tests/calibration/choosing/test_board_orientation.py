@@ -1,4 +1,4 @@
-"""Boards that look the same turned, counted from any end: the print's own errors tell which views do otherwise."""
+"""Symmetric boards whose corners were counted from different ends: found by the print errors that all views share."""
 
 from __future__ import annotations
 

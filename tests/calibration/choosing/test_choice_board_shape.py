@@ -1,4 +1,4 @@
-"""The shape of a board is chosen by what it predicts of the same corners."""
+"""The shape of a board is chosen by its held-out error on the same corners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Twins share a model, and what nobody knows of the model is in the sigmas."""
+"""Equal cameras of a rig share a lens model, and the uncertainty between models is part of the sigmas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of boards, and of images that are unlike the others: true, and once."""
+"""Findings about boards and about deviating images: right, and reported once."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.judging.test_verdicts_wrong_sessions import poses, seen
 from helpers.calibration_scenes import SIZE, lens, random_views
+from helpers.session_scenes import poses, seen
 
 from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.calibrate import calibrate

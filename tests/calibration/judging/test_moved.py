@@ -1,4 +1,4 @@
-"""When the lens changed: the image from which on it was another one, and where none is to be named."""
+"""When the lens changed during a session: the first image after the change, or none if that is not determined."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A lens that does not look from one point is told from one that does, and by how much what is far away is off."""
+"""Moving entrance pupils: detected, not confused with other faults, solved for, and their effect on distant points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images of two kinds, unlike each other in how their lens shows things: named, and told from what only looks so."""
+"""Images of two different distortions in one session: named, and not confused with what resembles it."""
 
 from __future__ import annotations
 

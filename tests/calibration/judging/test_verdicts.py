@@ -1,4 +1,4 @@
-"""Verdicts: each fault that was put into the views is named, and sound views get none of them."""
+"""Verdicts: each fault that is simulated in the views is named, and good views get no finding."""
 
 from __future__ import annotations
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
+from helpers.session_scenes import NOISE_PX, poses, seen
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging.changing import MIN_NEIGHBOUR_CORRELATION, changing
@@ -17,35 +18,12 @@ from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.judging.view_evidence import view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras
 from rigkit.cameras.pinhole import Pinhole
-from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Finding, Severity, worst
 from rigkit.geometry.rotation import exp_so3
-
-NOISE_PX = 0.1
-
-
-def seen(camera: Camera, rotation: FloatArray, translation_mm: FloatArray, rng: np.random.Generator) -> list[BoardView]:
-    """Return the views of boards at poses (V, 3, 3) and (V, 3), of those that the image holds."""
-    out = []
-    for k, (turn, shift) in enumerate(zip(rotation, translation_mm, strict=True)):
-        pixels, valid = camera.project(BOARD.points() @ turn.T + shift)
-        if valid.all() and camera.on_image(pixels).all():
-            noisy = np.clip(pixels + NOISE_PX * rng.normal(size=pixels.shape), -0.5, np.array(SIZE) - 0.5)
-            out.append(BoardView(f"{k:03d}.png", BOARD, BOARD.grid(), noisy, np.full(len(noisy), NOISE_PX)))
-    return out
-
-
-def poses(rng: np.random.Generator, count: int, about: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return poses all over the image, turned by the rotation vectors `about` (count, 3)."""
-    depth = rng.uniform(500.0, 1000.0, count)
-    place = np.stack([0.45 * depth * rng.uniform(-1, 1, count), 0.33 * depth * rng.uniform(-1, 1, count), depth], -1)
-    rotation = exp_so3(about)
-    return rotation, place - rotation @ BOARD.points().mean(axis=0)
 
 
 def first(result: Calibration) -> str:

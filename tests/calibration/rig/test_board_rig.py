@@ -1,4 +1,4 @@
-"""Boards mounted to each other: their geometry and its sigmas, naming by arrangement, what they do for a camera."""
+"""Boards mounted to each other: their geometry and its sigmas, names by arrangement, what they add for a camera."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD
-from helpers.rig_scenes import MODELS, NOISE_PX, mounts, rig_views, sizes
+from helpers.rig_scenes import MODELS, NOISE_PX, SIGMAS, mounts, rig_views, sizes
 
 from rigkit.calibration.certainty.covariance import GlobalCovariance
 from rigkit.calibration.rig.calibrate import calibrate_rig
@@ -30,8 +30,6 @@ from rigkit.geometry.rotation import exp_so3, log_so3
 
 SHAPE_WEIGHT = 0.3
 """px of a corner, against which the priors of boards' shapes are weighed."""
-SIGMAS = 4.0
-"""A mount further than this from the truth, in its own standard deviations, is wrong: 1 in 16000 by chance."""
 
 
 @pytest.mark.parametrize("chain", [False, True])

@@ -1,4 +1,4 @@
-"""Rigs whose views are named, weighted or tied in ways that must not go unnoticed."""
+"""Rigs with wrongly named, weighted or tied views: refused or reported."""
 
 from __future__ import annotations
 

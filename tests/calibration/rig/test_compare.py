@@ -1,4 +1,4 @@
-"""Rigs compared with each other, and what a rig's file says of its lenses."""
+"""Comparison of rigs, and what a rig's file has of its lenses."""
 
 from __future__ import annotations
 

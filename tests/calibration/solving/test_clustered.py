@@ -1,4 +1,4 @@
-"""Covariances from images that disagree: right whether errors are the corners' own or those of whole images."""
+"""Covariances clustered by image: right for independent errors of corners and for errors that an image shares."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.calibration_scenes import BOARD, REACH_DEG, lens, random_views
+from helpers.calibration_scenes import REACH_DEG, lens, random_views
+from helpers.session_scenes import FAIR_PX, GOOD_PX, IMAGES_PX, disturbed, longer, sessions
 
 from rigkit.calibration.assemble import assemble
-from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.compare import CameraVerdict, compare_calibrations
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving import clustered
@@ -25,41 +25,16 @@ RUNS, VIEWS = 40, 15
 RATIO = (0.75, 1.3)
 """Observed over predicted standard deviation, root mean square over parameters and runs: 40 runs of 15 views know it to
 about 10 %."""
-CORNERS_PX, IMAGES_PX = 0.05, 0.15
 FEW_RUNS = 20
 FEW_RATIO = (0.7, 2.2)
 """The same of three images, median of runs: 1.4, and 4.3 if corners are taken for independent."""
-GOOD_PX, FAIR_PX = 0.03, 0.05
-"""Errors in common of a good image, and of one with which a thousandth of a focal length is not found any more."""
 MOVED_PX = {"reg": 2.47, "wide": 1.82, "fish": 0.46}
 """Along x, and half as much along y: 0.2 px rms remain after the best rotation."""
-
-
-def disturbed(views: list[BoardView], rng: np.random.Generator, images_px: float) -> list[BoardView]:
-    """Return the views with noise of every corner and, of every image, a smooth displacement field of its own."""
-    x, y = (BOARD.grid() / (np.array(BOARD.size) - 1.0) * 2.0 - 1.0).T
-    fields = np.stack([x * x, x * y, y * y, x * x * y, x * y * y], axis=-1)
-    out = []
-    for view in views:
-        own = images_px * fields @ rng.normal(size=(fields.shape[1], 2))
-        out.append(replace(view, pixels=view.pixels + own + CORNERS_PX * rng.normal(size=view.pixels.shape)))
-    return out
 
 
 def calibrated(views: list[BoardView], start: State) -> Calibration:
     observations = Observations.from_views(views)
     return assemble(observations, fit_kept(observations, start, observations.present), None, (), ())
-
-
-def sessions(name: str, images_px: float, count: int) -> list[Calibration]:
-    """Return calibrations of a lens from sessions of 20 images each."""
-    rng = np.random.default_rng(3)
-    camera = lens(name)
-    views = [
-        disturbed(random_views(camera, 20, rng, reach_deg=REACH_DEG[name], noise_px=0.0)[0], rng, images_px)
-        for _ in range(count)
-    ]
-    return [calibrate(own, camera.size_px, model=camera.model, board="flat") for own in views]
 
 
 @pytest.mark.parametrize("images_px", [0.0, IMAGES_PX])
@@ -85,13 +60,6 @@ def test_power_and_false_alarms() -> None:
     for a, b in itertools.pairwise(results):
         assert compare_calibrations(a, b).verdict is not CameraVerdict.OTHER
     assert compare_calibrations(results[0], longer(results[1])).verdict is CameraVerdict.OTHER
-
-
-def longer(calibration: Calibration) -> Calibration:
-    """Return a calibration whose focal length is longer by a thousandth."""
-    parameters = np.array(calibration.camera.parameters)
-    parameters[:2] *= 1.001
-    return replace(calibration, camera=calibration.camera.with_parameters(parameters))
 
 
 @pytest.mark.parametrize("name", ["reg", "wide", "fish"])

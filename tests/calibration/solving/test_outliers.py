@@ -1,4 +1,4 @@
-"""Corners that lie off with all around them were found where they are; those that lie off alone were not."""
+"""Corners that deviate together with their neighbours are kept; corners that deviate alone are outliers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The solver: its derivatives, its optimum, and what it does with data that determine little."""
+"""The solver: derivatives, optimum, and data that determine few parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images that repeat each other are found whatever their number."""
+"""Repeated images are found, whatever their number."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A wrong size in the board file is told from boards that the frame cuts."""
+"""A wrong board size in the board file is distinguished from boards cut by the frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parts of boards of known size: placed where their borders show it, and never in the wrong place."""
+"""Partial boards of known size: placed where their borders determine the place, and never wrongly."""
 
 from __future__ import annotations
 

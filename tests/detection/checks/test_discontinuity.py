@@ -1,4 +1,4 @@
-"""Boards that touch or overlap, nearly in line: each is one board, and what their borders make is no corner."""
+"""Boards that touch or overlap, nearly in line: each is one board, and their common border has no corners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Boards that are hard to see and are boards; what resembles boards and is none; what a lens adds to the scatter."""
+"""Boards that are hard to see are accepted, patterns that resemble boards are not; lens distortion is no scatter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The second look at known boards: more corners, none of them false, and each as good as its sigma says."""
+"""Guided detection with a known camera: more corners, no false ones, each with a true sigma."""
 
 from __future__ import annotations
 

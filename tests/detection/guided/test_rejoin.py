@@ -1,4 +1,4 @@
-"""Parts of one board become one grid where the camera says so, and nothing else does."""
+"""Parts of one board become one grid if the camera confirms it; parts of different boards do not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lattices: turning and cutting keep the colours of the squares and agree with `BoardDetection`."""
+"""Lattices: rotation and cropping keep the colours of the squares and agree with `BoardDetection`."""
 
 from __future__ import annotations
 

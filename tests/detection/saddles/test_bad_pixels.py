@@ -1,4 +1,4 @@
-"""Bad pixels of the sensor: salt and pepper, hot pixels. Boards are found all the same, and their corners stay good."""
+"""Bad pixels of the sensor (salt and pepper, hot): boards are found, and corners keep their accuracy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ring test: directions against corners whose angle is known, and what must not pass for a corner."""
+"""The ring test: directions at corners of known angles, and patterns that it must reject."""
 
 from __future__ import annotations
 

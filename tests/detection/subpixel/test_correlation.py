@@ -1,4 +1,4 @@
-"""Predicted sigmas where the noise of neighbouring pixels is not independent, against the scatter about the truth."""
+"""Predicted sigmas under correlated noise of neighbouring pixels, against the scatter about the truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The edge model and its fit: derivatives by differences, exact corners from exact pixels, sigma from many noises."""
+"""The edge model and its fit: derivatives, exact corners of exact pixels, sigma against repeated noise."""
 
 from __future__ import annotations
 

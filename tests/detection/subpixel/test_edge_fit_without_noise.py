@@ -1,4 +1,4 @@
-"""Predicted sigmas of corners in images without noise: those of rounding to whole grey levels, if the image is such."""
+"""Predicted sigmas of corners in images without noise: those of rounding to whole grey levels, if values are whole."""
 
 from __future__ import annotations
 

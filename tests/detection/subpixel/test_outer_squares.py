@@ -1,4 +1,4 @@
-"""Boards out of focus: what blur brings into the windows of the outermost corners does not move them."""
+"""Boards out of focus: the surroundings that blur mixes into the outermost windows do not bias corners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Boards of few corners: their sigmas are raised to what the corners scatter, where that is no lens's bend."""
+"""Sigmas of boards of few corners are raised to the observed scatter, without counting lens distortion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Corners that the edge of a shadow crosses: the light is found and taken out, and they are as good as any other."""
+"""Corners crossed by the edge of a shadow: the step of light is fitted, and they are as accurate as others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Corners of whole lattices on rendered images, against where they truly are."""
+"""Corners of whole lattices on rendered images, against their exact positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lattices of small squares beside a board: what else they cost, and that the board does not notice them."""
+"""Lattices of small squares next to a board: bounded cost, and no effect on the board."""
 
 from __future__ import annotations
 

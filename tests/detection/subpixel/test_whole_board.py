@@ -1,4 +1,4 @@
-"""Boards whose squares are small against the blur: all corners are placed together."""
+"""Boards of squares that are small compared with the blur: all corners are fitted together."""
 
 from __future__ import annotations
 

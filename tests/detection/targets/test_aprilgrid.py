@@ -1,4 +1,4 @@
-"""AprilGrids: every tag by its number, its corners as fine as those of chessboards."""
+"""AprilGrids: every tag by its number, corners as accurate as those of chessboards."""
 
 from __future__ import annotations
 

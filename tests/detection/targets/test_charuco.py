@@ -1,4 +1,4 @@
-"""ChArUco boards: named and placed by their markers, corners as fine as on chessboards with markers between them."""
+"""ChArUco boards: named and placed by their markers, corners as accurate as on chessboards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Circle grids: found, named, and their centres without the bias of slant and lens, as fine as the pixels allow."""
+"""Circle grids: found and named, centres without the bias of slant and lens, close to the Cramer-Rao bound."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Board, session, calibration and rig files: what is written comes back, what is wrong is named."""
+"""Board, session, calibration and rig files: read back equal, and faults are named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which code computed a result."""
+"""The hash of the source code that cached corners and results depend on."""
 
 from __future__ import annotations
 

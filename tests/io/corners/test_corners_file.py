@@ -1,4 +1,4 @@
-"""Corners files: what was written comes back; what cannot be understood is refused with its line."""
+"""Corners files: read back equal, and faults are refused with their line."""
 
 from __future__ import annotations
 

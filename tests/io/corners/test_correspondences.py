@@ -1,4 +1,4 @@
-"""Correspondence files: read back exactly, AffineExtractor's layout, refused in words."""
+"""Correspondence files: read back exactly, AffineExtractor's layout, and refusals."""
 
 from __future__ import annotations
 

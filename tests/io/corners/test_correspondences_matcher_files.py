@@ -1,4 +1,4 @@
-"""Files of other tools' matchers: the same matches under every name; bare points get affinities from the images."""
+"""Files of other matchers: equal matches for every naming; points without affinities get them from the images."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""What no file and no path may do to a program that reads it: each of these once ended in a traceback, in no end, or in
-a result."""
+"""Hostile files and paths are refused with a message; each of these once ended in a traceback, an endless read or a
+wrong result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Manifests: everything that a person may write, and one clear line for everything that they got wrong."""
+"""Manifests: every key that a person may write, and one clear line for every mistake."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sessions of several cameras: which images belong together, and what is wrong with a file."""
+"""Sessions of several cameras: which images belong together, and faults of the file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses by moment: an image named by its moment has the pose between the two rows around it."""
+"""Poses by time: an image gets the pose interpolated between the rows around it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images as they are, and images that are not whole."""
+"""Image files: pixels of every format unchanged, and damaged or truncated files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clouds of several pairs fused: nearer to the exact surface than each, normals to their cameras, nothing twice."""
+"""Fusion of clouds of several pairs: closer to the exact surface than each, normals facing cameras, no duplicates."""
 
 from __future__ import annotations
 

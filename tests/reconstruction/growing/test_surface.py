@@ -1,4 +1,4 @@
-"""Planes through what nodes say of a flat wall with a hole: where it ends, and how sure they are there."""
+"""Planes through noisy nodes on a flat wall with a hole: their extent and their sigmas."""
 
 from __future__ import annotations
 

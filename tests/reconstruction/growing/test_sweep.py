@@ -1,4 +1,4 @@
-"""A sweep through the ranges fills what patches leave open, and says how well it knows it."""
+"""A plane sweep fills the gaps between patches, with true sigmas."""
 
 from __future__ import annotations
 

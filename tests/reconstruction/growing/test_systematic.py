@@ -1,4 +1,4 @@
-"""Poses of many pairs whose errors are a smooth field besides noise: the error is as stated, and smaller."""
+"""Poses of many matches with smooth systematic errors besides noise: smaller errors, and true sigmas."""
 
 from __future__ import annotations
 

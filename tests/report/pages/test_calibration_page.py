@@ -1,4 +1,4 @@
-"""The page of a calibration: in a browser, and what its drawings say against what is known."""
+"""The page of a calibration: in a browser, and its drawings against known values."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.browser import probed
+from helpers.browser import MIN_FONT_PX, measured_at_widths, probed
 from helpers.calibration_scenes import BOARD, lens, random_views, with_outliers
-from report.pages.test_page_in_browser import MIN_FONT_PX, measured_at_widths
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty

@@ -1,4 +1,4 @@
-"""The register: calibrations that were overwritten are told apart, amounts over the temperature, the page."""
+"""The register's page: overwritten calibrations are separate editions, changes over temperature."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pages for everybody: axe-core finds no fault, by day and by night, on a phone and on a screen.
+"""Accessibility of the pages: axe-core finds no fault, light and dark, on a phone and on a screen.
 
 axe-core is not part of this repository: `npm install --no-save axe-core` puts it where this looks, or RIGKIT_AXE says
 where axe.min.js is.
@@ -19,8 +19,8 @@ import pytest
 from helpers.browser import loaded
 from helpers.calibration_scenes import lens
 from helpers.data import REPOSITORY
+from helpers.pages import page_of, reported
 from helpers.rig_scenes import rig_views
-from report.pages.test_page_first_screen import page_of, reported
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration

@@ -1,3 +1,5 @@
+"""Sheets of boards to print: true to scale, right pattern, a paper that fits."""
+
 from __future__ import annotations
 
 import re

@@ -1,4 +1,4 @@
-"""Certificates against Monte Carlo: a rig and a camera that are wrong by their own covariance measure what they see."""
+"""Certificates against Monte Carlo: rigs and cameras drawn from their own covariance measure known lengths."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What moved since pictures of before: what was wrong already is no change."""
+"""Changes since earlier pictures: errors that were already there are no change."""
 
 from __future__ import annotations
 

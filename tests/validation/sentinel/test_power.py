@@ -1,4 +1,4 @@
-"""Pictures to check a lens or a rig with: what they promise is what the check then says, and others tell less."""
+"""Pictures planned for a check: the check has the promised power, and other pictures have less."""
 
 from __future__ import annotations
 

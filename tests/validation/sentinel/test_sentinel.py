@@ -1,4 +1,4 @@
-"""The sentinel: quiet where nothing moved, alarmed where something did, and right about what."""
+"""The sentinel: no false alarms, alarms after changes, and the right name of the change."""
 
 from __future__ import annotations
 

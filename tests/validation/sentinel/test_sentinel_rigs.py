@@ -1,4 +1,4 @@
-"""The sentinel of rigs: mounts that moved, from boards and from scenes without any."""
+"""The sentinel of rigs: changed mounts, from boards and from scenes without boards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The frames that would improve a rig most: what they are chosen for, and whether they bring what was promised."""
+"""The most informative next frames of a rig: their goal, and the gain that they promise."""
 
 from __future__ import annotations
 

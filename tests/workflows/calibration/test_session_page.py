@@ -1,4 +1,4 @@
-"""The page of a session: which of many images it shows."""
+"""The page of a session with many images shows the worst of them."""
 
 from __future__ import annotations
 

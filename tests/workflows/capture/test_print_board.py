@@ -1,4 +1,4 @@
-"""`rigkit board`: names of what is written, and what is said of a board whose scale no image shows."""
+"""Names of the files of `rigkit board`, and boards whose scale no image shows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of two cameras does not contradict its own figures."""
+"""The words of `rigkit diff` agree with its figures."""
 
 from __future__ import annotations
 

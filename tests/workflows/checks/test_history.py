@@ -1,4 +1,4 @@
-"""The register of calibrations and checks: months of them, drawn with their limits."""
+"""The register of calibrations and checks over months, and its control limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sessions with images of several sizes: what is said of them helps whoever gave a folder, too."""
+"""Sessions with images of several sizes: messages that name the cause, for folders too."""
 
 from __future__ import annotations
 

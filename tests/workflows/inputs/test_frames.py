@@ -1,4 +1,4 @@
-"""From a video to the frames worth keeping."""
+"""Frames are chosen from videos: sharp, different, and of one moment for several cameras."""
 
 from __future__ import annotations
 

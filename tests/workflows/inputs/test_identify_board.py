@@ -1,4 +1,4 @@
-"""What `identify_board` says beside the board."""
+"""Notes of `identify_board` besides the identified board."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A board of marks that is declared wrongly is named where the calibration comes to nothing."""
+"""A wrongly declared board with markers is named when the calibration fails."""
 
 from __future__ import annotations
 

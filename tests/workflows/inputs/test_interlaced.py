@@ -1,4 +1,4 @@
-"""Two moments in one picture, line by line: seen in the pixels, and never where one moment is."""
+"""Interlaced images (two moments, line by line) are recognised, others never."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the verbs on a data set share: boards found with the help of the calibrated cameras."""
+"""Boards of a data set's pairs are detected with the calibrated cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What rivals of a lens add to a rig: as much as the rig differs when it is calibrated with them."""
+"""Rival lens models widen a rig's uncertainty by the difference of its calibrations with them."""
 
 from __future__ import annotations
 

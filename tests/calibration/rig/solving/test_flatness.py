@@ -1,4 +1,4 @@
-"""Boards taken for flat that are not: an error that all frames of a rig have in common, and no scatter shows."""
+"""Boards assumed flat that are not: an error common to all frames, which their scatter does not show."""
 
 from __future__ import annotations
 

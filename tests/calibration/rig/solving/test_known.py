@@ -1,4 +1,4 @@
-"""Lenses, and whole cameras of a rig, that are known before: they stay, and what is not sure of them goes through."""
+"""Known lenses, and known cameras of a rig, are held, and their covariance is propagated."""
 
 from __future__ import annotations
 

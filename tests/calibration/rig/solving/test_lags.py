@@ -1,4 +1,4 @@
-"""Cameras without a common trigger before a moving board: their lags are solved for where the frames tell them."""
+"""Cameras without a common trigger in front of a moving board: lags and row-by-row readout are solved for."""
 
 from __future__ import annotations
 

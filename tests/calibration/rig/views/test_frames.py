@@ -1,4 +1,4 @@
-"""Rigs whose boards look the same turned, and frames that were not taken at one moment."""
+"""Symmetric boards in rigs, and frames that were not taken at one moment."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.rig.test_calibrate import SIGMAS
-from helpers.rig_scenes import NOISE_PX, Views, mounts, rig_views, sizes
+from helpers.rig_scenes import NOISE_PX, SIGMAS, Views, mounts, rig_views, sizes
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration

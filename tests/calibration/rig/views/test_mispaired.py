@@ -1,4 +1,4 @@
-"""Frames that were put together wrongly are named as that, with the frames; what is right is left alone."""
+"""Frames put together from images of different moments are named; correct ones are not."""
 
 from __future__ import annotations
 
