@@ -22,6 +22,7 @@ from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import BAD, JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.known import KnownCameras
+from rigkit.calibration.rig.solving.lags import TIMINGS
 from rigkit.calibration.rig.verdicts import diagnose_rig
 from rigkit.calibration.rig.views.board_places import board_places
 from rigkit.calibration.rig.views.mispaired import put_together_wrongly, same_pictures, why_nothing_agrees
@@ -100,15 +101,15 @@ def calibrate_rig(
 def _predicting(
     every: RigViews, options: _Options, progress: Progress
 ) -> tuple[JointRig, tuple[float | None, tuple[float | None, ...]]]:
-    """Return the joint solution and its held-out errors, as `heldout_rms`. Rolling shutters are a part of it unless
-    held-out frames are predicted better without them."""
+    """Return the joint solution and its held-out errors, as `heldout_rms`. Rolling shutters, and then lags, are a part
+    of it unless held-out frames are predicted better without them."""
     joint = solve_jointly(every, progress, options.known)
     heldout = heldout_rms(joint, options.folds)
-    if joint.has_readouts and heldout[0] is not None:
-        global_shutter = solve_jointly(every, progress, options.known, readouts=False)
-        rms, each = heldout_rms(global_shutter, options.folds)
-        if rms is not None and rms < heldout[0]:
-            return global_shutter, (rms, each)
+    for timing in TIMINGS[: TIMINGS.index(joint.timing)][::-1]:
+        simpler = solve_jointly(every, progress, options.known, timing=timing)
+        rms, each = heldout_rms(simpler, options.folds)
+        if rms is not None and heldout[0] is not None and rms < heldout[0]:
+            joint, heldout = simpler, (rms, each)
     return joint, heldout
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from rigkit.calibration.choosing.heldout import MIN_IMAGES_OF_FIT
 from rigkit.calibration.rig.joint import JointRig
+from rigkit.calibration.rig.solving.shutters import read_on, readout_steps
 from rigkit.calibration.rig.solving.solver import refine_frames, solve_rig
 from rigkit.calibration.rig.solving.state import RigObservations
 from rigkit.calibration.solving.solver import FROM_OPTIMUM
@@ -14,9 +15,10 @@ from rigkit.calibration.solving.state import weighted_squares
 
 def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float | None, ...]]:
     """Return the 2-D RMS over held-out frames, of all cameras together and of each: cameras, mounts, places and shapes
-    of boards are from the other folds, only one pose for each target is fitted, jointly to all cameras. With fewer
-    frames than folds each is a fold. None with less than MIN_IMAGES_OF_FIT frames, or where a camera's mount is
-    determined by the frames of one fold alone.
+    of boards are from the other folds, only one pose for each target is fitted, jointly to all cameras. Readouts of
+    rolling shutters, too, are corrected to first order to those of the other folds; the images' times are those of the
+    solution. With fewer frames than folds each is a fold. None with less than MIN_IMAGES_OF_FIT frames, or where a
+    camera's mount is determined by the frames of one fold alone.
 
     Unlike the held-out errors of single cameras it includes disagreement between cameras. Residuals are weighted as in
     the solution.
@@ -33,8 +35,10 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
         if not _is_connected(train):
             return nothing
         solved = solve_rig(train, state, joint.sigma_px, FROM_OPTIMUM).state
-        part = observations.subset(test)
-        found = refine_frames(part, solved.with_frames(state))
+        part, start = observations.subset(test), solved.with_frames(state)
+        if joint.timing == "readouts":
+            part = read_on(part, start, readout_steps(train, solved)[0])
+        found = refine_frames(part, start)
         for c, (own, weight) in enumerate(zip(part.cameras, part.weights, strict=True)):
             squared[c] += float(weighted_squares(found.of_camera(c, part), own, weight).sum())
             count[c] += float((weight > 0.0).sum())

@@ -10,7 +10,7 @@ import numpy as np
 
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.solving.known import KnownCameras
-from rigkit.calibration.rig.solving.lags import times_of, with_lags
+from rigkit.calibration.rig.solving.lags import Timing, times_of, with_lags
 from rigkit.calibration.rig.solving.shape import common_shape
 from rigkit.calibration.rig.solving.solver import solve_rig
 from rigkit.calibration.rig.solving.state import Key, RigObservations, RigState
@@ -95,10 +95,12 @@ class JointRig:
         return folds_of(pixels, frame, count)[self.frames]
 
     @property
-    def has_readouts(self) -> bool:
-        """Whether rolling shutters were estimated."""
+    def timing(self) -> Timing:
+        """What was estimated of the times at which images were taken."""
         moments = self.solution.state.moments
-        return moments is not None and bool(moments.readouts.any())
+        if moments is None:
+            return "trigger"
+        return "readouts" if moments.readouts.any() else "lags"
 
     @property
     def shared_count(self) -> int:
@@ -122,10 +124,10 @@ def frame_numbers(views: RigViews, observations: RigObservations) -> IntArray:
 
 
 def solve_jointly(
-    views: RigViews, progress: Progress, known: KnownCameras | None = None, *, readouts: bool = True
+    views: RigViews, progress: Progress, known: KnownCameras | None = None, *, timing: Timing = "readouts"
 ) -> JointRig:
-    """Return the joint solution, without targets on which the cameras (or the target's boards) disagree; with
-    `readouts` of rolling shutters if these are significant.
+    """Return the joint solution, without targets on which the cameras (or the target's boards) disagree; with lags of
+    cameras and readouts of rolling shutters if these are significant, and no more of them than `timing` says.
 
     Raises InputError where a camera shares no target with the others, DegenerateError where too few are left.
     """
@@ -141,7 +143,7 @@ def solve_jointly(
         progress("rig", i, MAX_ROUNDS)
         _require_agreement(views, len(left_out), shared)
         observations, solution = _solved(views, mounts, sigma, known)
-        observations, solution = _with_lags(views, observations, solution, sigma, readouts)
+        observations, solution = _with_lags(views, observations, solution, sigma, timing)
         cost = cost_of_sharing(observations, solution, seen)
         typical = typical_cost(cost, sigma)
         worse = bad_ones(cost, typical)
@@ -204,11 +206,11 @@ def _solved(
 
 
 def _with_lags(
-    views: RigViews, observations: RigObservations, solution: Solution[RigState], sigma: float, readouts: bool
+    views: RigViews, observations: RigObservations, solution: Solution[RigState], sigma: float, timing: Timing
 ) -> tuple[RigObservations, Solution[RigState]]:
     """Return the observations and the solution, with the lags of cameras if they are significant."""
     times = times_of(observations.keys, {entry.key: entry.frame for own in views.seen for entry in own.values()})
-    return with_lags(observations, solution, sigma, times, frame_numbers(views, observations), readouts=readouts)
+    return with_lags(observations, solution, sigma, times, frame_numbers(views, observations), timing=timing)
 
 
 def _boards_px(seen: Sequence[FrameObservations]) -> float:

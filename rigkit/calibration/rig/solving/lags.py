@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -33,6 +34,10 @@ from rigkit.calibration.solving.solver import FROM_OPTIMUM, Solution
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.identifiers import last_number, natural_key
 
+Timing = Literal["trigger", "lags", "readouts"]
+TIMINGS: tuple[Timing, ...] = ("trigger", "lags", "readouts")
+"""What is estimated of the times at which images were taken: nothing, lags and times of images, and also the readout
+times of rolling shutters."""
 CHANCE = 0.01
 """Significance level: the part of triggered rigs that get lags by mistake, which are then consistent with zero."""
 MAX_ROUNDS, SETTLED = 8, 0.01
@@ -66,19 +71,24 @@ def with_lags(
     times: FloatArray,
     frames: IntArray,
     *,
-    readouts: bool,
+    timing: Timing,
 ) -> tuple[RigObservations, Solution[RigState]]:
     """Return the observations corrected for rolling shutters, and the solution with lags and times of images; or both
     unchanged where the lags are not significant.
 
-    `times` (F,) of the keys, `sigma_px` as for `solve_rig`, `frames` as for `frame_covariance`, `readouts`: whether
-    rolling shutters are looked for.
+    `times` (F,) of the keys, `sigma_px` as for `solve_rig`, `frames` as for `frame_covariance`, `timing`: what is
+    looked for.
     """
     cameras, keys = len(observations.cameras), len(observations.keys)
     none = np.zeros((cameras, keys))
     start = Moments(none[:, 0], np.zeros((keys, 0, 6)), none, np.full_like(none, np.inf), none[:, 0])
     start = _through(start, solution.state, observations, times)
-    if cameras < 2 or not start.ways.any() or not _asked(observations, solution.state, start, sigma_px):
+    if (
+        timing == "trigger"
+        or cameras < 2
+        or not start.ways.any()
+        or not _asked(observations, solution.state, start, sigma_px)
+    ):
         return observations, solution
     lagging = replace(solution, state=replace(solution.state, moments=start))
     for own_times in (False, True):
@@ -91,7 +101,9 @@ def with_lags(
             sigma = residual_sigma(observations, solution, sigma_px)
             if _chance_of_scatter(solution.state, observations, start, sigma) > CHANCE:
                 return observations, solution
-    return _with_readouts(observations, lagging, sigma_px, times) if readouts else (observations, lagging)
+    if timing == "lags":
+        return observations, lagging
+    return _with_readouts(observations, lagging, sigma_px, times)
 
 
 def _solved_again(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,9 +13,11 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.rig.solving.lags import times_of
+from rigkit.calibration.rig.solving.lags import Timing, times_of
+from rigkit.calibration.rig.solving.shutters import read_on
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
@@ -114,14 +117,45 @@ def test_images_are_read_row_by_row(tmp_path: Path) -> None:
     assert list(load_saved_rig(tmp_path / "rig.json").cameras) == ["left", "right"]
 
 
-def test_rolling_shutters_that_predict_worse_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    def worse_with_readouts(joint: JointRig, folds: int) -> tuple[float, tuple[float, ...]]:
-        return (0.3 if joint.has_readouts else 0.2), (0.1, 0.1)
+@pytest.mark.parametrize("best", ["lags", "trigger"])
+def test_timing_that_predicts_worse_is_left_out(best: Timing, monkeypatch: pytest.MonkeyPatch) -> None:
+    def heldout(joint: JointRig, folds: int) -> tuple[float, tuple[float, ...]]:
+        return (0.2 if joint.timing == best else 0.3), (0.1, 0.1)
 
-    monkeypatch.setattr("rigkit.calibration.rig.calibrate.heldout_rms", worse_with_readouts)
+    monkeypatch.setattr("rigkit.calibration.rig.calibrate.heldout_rms", heldout)
     rig = rig_of(0.05, 0, readout=0.05, time=lambda k: 0.5 * k)
-    assert rig.lags and not rig.readouts
+    assert not rig.readouts
+    assert bool(rig.lags) == (best == "lags")
     assert rig.heldout_rms_px == 0.2
+
+
+def test_heldout_frames_do_not_choose_their_readouts() -> None:
+    """Readouts of each fold are those of the other frames: one that a single frame asks for predicts it badly."""
+    joints = list[JointRig]()
+
+    def kept(joint: JointRig, folds: int) -> tuple[None, tuple[None, None]]:
+        joints.append(joint)
+        return None, (None, None)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rigkit.calibration.rig.calibrate.heldout_rms", kept)
+        rig_of(0.05, 0, readout=0.05, time=lambda k: 0.5 * k)
+    joint = joints[0]
+    assert joint.timing == "readouts"
+    found, _ = heldout_rms(joint, 5)
+    state = joint.solution.state
+    assert state.moments is not None
+    # Corners, and the readouts known for them, that are wrong alike in all frames: the other frames set them right.
+    wrong = np.full(2, 0.02)
+    moments = replace(state.moments, readouts=state.moments.readouts + wrong)
+    moved = replace(
+        joint,
+        observations=read_on(joint.observations, state, wrong),
+        solution=replace(joint.solution, state=replace(state, moments=moments)),
+    )
+    again, _ = heldout_rms(moved, 5)
+    assert found is not None and again is not None
+    assert again < 1.3 * found
 
 
 def test_cameras_of_one_moment_have_no_lag() -> None:
