@@ -115,7 +115,7 @@ def _heat_tables(kept: Sequence[Edition]) -> tuple[Table, ...]:
                 rows.append(
                     cells(f"{edition.name}: {what}" if len(kept) > 1 else what)
                     + cells(Cell(message, best=heat.chance < ALARM_CHANCE), f"{heat.chance:.2g}")
-                    + cells(f"{low:g} to {high:g}", len(own))
+                    + cells(f"{low:.3g} to {high:.3g}", len(own))
                 )
     heads = columns("amount | with the temperature | chance if it does nothing | from, to [°C] | entries .0")
     return (Table("heat", "Over the temperature", heads, tuple(rows)),) if rows else ()
@@ -159,7 +159,7 @@ def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str
             f'<path d="{ends}" stroke="{stroke}"/>{svg.words(LEFT_MARGIN - 5, height + 4, f"{amount:.2g}", "end")}'
         )
     out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{INK}" stroke-opacity="0.6"/>')
-    labels = [f"{c:g} °C" for c in celsius]
+    labels = [f"{c:.3g} °C" for c in celsius]
     return "".join([*out, *_points(entries, name, x, top), *_x_labels(x, labels), "</svg>"])
 
 
