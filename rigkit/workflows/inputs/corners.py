@@ -25,6 +25,7 @@ from rigkit.io.corners.corners_file import read_corners
 from rigkit.io.manifests.session import Session
 from rigkit.io.media.images import read_image
 from rigkit.workflows.inputs.identify_board import explained
+from rigkit.workflows.inputs.side_by_side import two_pictures
 
 ODD_SIZES = 3
 """A few images of another size are left out; if they are one in three or more, the session is ambiguous."""
@@ -66,10 +67,13 @@ def session_views(
 ) -> tuple[list[BoardView], tuple[int, int], list[tuple[str, str]]]:
     """Return the views of the detected boards, the image size, and (image, reason) for what is left out.
 
-    Raises InputError if there is no view, or if the boards clearly have another size than declared.
+    Raises InputError if there is no view, if the boards clearly have another size than declared, or if images hold the
+    pictures of two cameras.
     """
     found = corners.found
     size_px = _common_size(session, found)
+    if (halves := two_pictures(found, session.boards)) is not None:
+        raise InputError(f"{session.path}: {halves}")
     views, dropped = [], list(corners.unreadable.items())
     boards = without_lookalikes({name: item.detections for name, item in found.items()}, session.boards)
     for name, item in found.items():
