@@ -8,6 +8,7 @@ not every model alike: models are compared with flat boards first, and again wit
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 from rigkit.calibration.assemble import assemble, require_determined
@@ -155,40 +156,41 @@ def _result(
     likely: Mapping[str, float],
 ) -> Calibration:
     """Return the result of a camera with its verdicts, with a moving pupil where that is asked for or confirmed."""
-    central, request = _with_verdicts(begun, found, tried, rivals, likely), begun.request
+    (central, far), request = _assembled(begun, found, tried, rivals, likely), begun.request
     if request.pupil == "central" or (request.pupil == "auto" and not may_move(central)):
-        return central
+        return _with_verdicts(begun, found, central, far)
     moving = solved_with_pupil(found, begun.observations, request)
+    compared: list[Candidate] = []
     if moving is not None:
         if len(models_of(tried)) == 1:
             rivals, likely = moving.sizes, HeldOut.of([moving.sizes]).likely()
         better, candidates = against_central(found, moving, request)
-        moving = replace(moving, candidates=[*candidates, *moving.candidates])
-        try:
-            result = _with_verdicts(begun, moving, tried, rivals, likely)
-        except DegenerateError:
-            result = central
-        if result.pupil is not None and (request.pupil == "moving" or (better and pupil_moves_significantly(result))):
-            return result
-        central = replace(central, candidates=(*central.candidates, *kept_central(candidates)))
+        moving, compared = replace(moving, candidates=[*candidates, *moving.candidates]), kept_central(candidates)
+        with suppress(DegenerateError):
+            result, far_of_moving = _assembled(begun, moving, tried, rivals, likely)
+            if result.pupil is not None and (
+                request.pupil == "moving" or (better and pupil_moves_significantly(result))
+            ):
+                return _with_verdicts(begun, moving, result, far_of_moving)
     if request.pupil == "moving":
         raise DegenerateError(
             "calibration: the images do not tell how the entrance pupil moves; take boards near and far, up to the "
             'rim of the image, or pupil = "auto"'
         )
-    return central
+    central = _with_verdicts(begun, found, central, far)
+    return replace(central, candidates=(*central.candidates, *compared))
 
 
-def _with_verdicts(
+def _assembled(
     begun: BegunCalibration,
     found: ModelOutcome,
     tried: Sequence[FittedModel],
     rivals: Sequence[FittedModel],
     likely: Mapping[str, float],
-) -> Calibration:
-    """Return the result of one solution with its verdicts; raises DegenerateError where the views do not determine
-    it."""
-    request, fit = begun.request, found.chosen.fit
+) -> tuple[Calibration, FarProjection]:
+    """Return the result of one solution, without verdicts, and how sure it is of far points; raises DegenerateError
+    where the views do not determine it."""
+    fit = found.chosen.fit
     others = _others(tried, far_camera(fit.state.camera).model) if len(models_of(tried)) > 1 else []
     close = rival_fits(found.observations, fit, rivals, likely)
     if not begun.name:
@@ -202,10 +204,18 @@ def _with_verdicts(
         with_rivals([*others, *found.candidates], [one.rival for one in close]),
         close,
     )
-    in_force = [name for name, value in (("model", request.model), ("board_shape", request.board)) if value == "auto"]
-    moved = moved_lens(found.observations, fit) if request.folds else ()
     far = FarProjection.of(result, from_boards=True)
     require_determined(result, far.of_parameters_px)
+    return result, far
+
+
+def _with_verdicts(
+    begun: BegunCalibration, found: ModelOutcome, result: Calibration, far: FarProjection
+) -> Calibration:
+    """Return what `_assembled` returns of a solution with its verdicts."""
+    request, fit = begun.request, found.chosen.fit
+    in_force = [name for name, value in (("model", request.model), ("board_shape", request.board)) if value == "auto"]
+    moved = moved_lens(found.observations, fit) if request.folds else ()
     verdicts = judge(
         result,
         [*moved, *_largest_size_chosen(found.beyond, result, in_force)],

@@ -74,7 +74,7 @@ def flipped_pictures(
     """
     before = float(weighted_squares(fit.state, observations, fit.weight(observations)).sum())
     tried = [
-        _put_back_in_turn(way, at, turns, observations, fit)
+        _put_back_in_turn(way, at, turns, observations, fit, before)
         for way in WAYS
         for at, turns in _first_guesses(way, evidence if shifted else None, observations, fit)
     ]
@@ -105,12 +105,17 @@ def _first_guesses(
         yield at, turns
 
 
-def _put_back_in_turn(way: str, at: BoolArray, turns: IntArray, observations: Observations, fit: Fit) -> _Back:
-    """Return the solution from a first guess of which views are flipped, by alternating solution and test."""
+def _put_back_in_turn(
+    way: str, at: BoolArray, turns: IntArray, observations: Observations, fit: Fit, before: float
+) -> _Back:
+    """Return the solution from a first guess of which views are flipped, by alternating solution and test. A guess that
+    explains nothing of the sum of squares `before` is not improved: as many views are wrong in it as right."""
     begun, state = _put_back(way, at, turns, observations, fit.state)
     state, _ = refine_poses(begun, state, fit.weight(observations), tolerance=START_TOLERANCE)
     for _ in range(ROUNDS):
         found = _solved(way, at, begun, state, fit)
+        if found.squares >= before:
+            break
         wrong, _, turns = _better_put_back(way, found.observations, found.state, fit)
         at = at ^ wrong
         if not wrong.any() or at.all() or not at.any():

@@ -15,8 +15,8 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.detections import BoardView, grid_turned
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.validation.sentinel.evidence import FreshView, Monitored
-from rigkit.validation.sentinel.judge import check_views
+from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_of
+from rigkit.validation.sentinel.judge import check_views, exceeds_expected, unchanged_px
 
 FLIP_SIGNS = {
     "turned by half a turn": (-1.0, -1.0),
@@ -108,7 +108,10 @@ def counted_alike(monitored: Monitored, fresh: FreshView, before: Sequence[Fresh
 
 def _fits(monitored: Monitored, views: Sequence[FreshView]) -> bool:
     try:
-        return check_views(monitored, views).holds
+        evidence = evidence_of(monitored, views)
+        # No change is looked for in views that do not fit as they are: that takes most of the time.
+        fit = not exceeds_expected(evidence.rms_px, unchanged_px(monitored, evidence))
+        return fit and check_views(monitored, views).holds
     except (DegenerateError, InputError):
         return False
 
