@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.cameras.base import Camera
@@ -117,7 +118,7 @@ def calibration_difference_px(camera: Camera, truth: Mapping[str, Any]) -> tuple
     step = 16
     u, v = np.meshgrid(np.arange(step / 2, width, step), np.arange(step / 2, height, step))
     grid = np.stack([u.ravel(), v.ravel()], axis=1)
-    near = np.array([np.linalg.norm(seen - g, axis=1).min() < 2.0 * step for g in grid])
+    near = cKDTree(seen).query(grid)[0] < 2.0 * step
     pixels = grid[near]
     rays = true_rays(truth["lens_truth"], pixels)
     ours, _ = camera.unproject(pixels)

@@ -188,11 +188,12 @@ def place_of(path: Path, name: str) -> str:
 
 @functools.cache
 def tree_of(path: Path) -> ast.Module:
-    # Trees hold no circles, and are kept: to look for some while they are made takes two thirds of the time.
+    # Trees hold no circles, and are kept: to look for some, now or later, takes two thirds of the time.
     gc.disable()
     try:
         return ast.parse(path.read_text(encoding="utf-8"))
     finally:
+        gc.freeze()
         gc.enable()
 
 

@@ -74,16 +74,17 @@ for (const width of widths) {
     const size = (e) => parseFloat(frame.contentWindow.getComputedStyle(e).fontSize) * scale(e);
     const small = Math.min(...words.map(size));
     told.push([width, page.documentElement.scrollWidth, small.toFixed(2)].join(" "));
-    if (--left === 0) document.body.dataset.probe = told.join("|");
+    if (--left === 0) document.body.dataset.probe = [...told, page.body.dataset.probe].join("|");
   });
   document.body.append(frame);
 }
 </script></body>"""
 
 
-def measured_at_widths(page: str, folder: Path) -> dict[int, tuple[int, float]]:
-    """Return by width of the window how wide the page gets, and its smallest words, px."""
+def probed_at_widths(page: str, folder: Path) -> tuple[dict[int, tuple[int, float]], list[str]]:
+    """Return by width of the window how wide the page gets, and its smallest words, px; and the results of its own
+    probe."""
     coded = base64.b64encode(page.encode()).decode()
     found_words = probed(FRAMES.replace("%PAGE%", coded).replace("%WIDTHS%", str(list(WIDTHS))), folder)
-    rows = [text.split() for text in found_words]
-    return {int(width): (int(wide), float(small)) for width, wide, small in rows}
+    rows = [text.split() for text in found_words[: len(WIDTHS)]]
+    return {int(width): (int(wide), float(small)) for width, wide, small in rows}, found_words[len(WIDTHS) :]

@@ -133,7 +133,9 @@ def test_camodocal_fisheye_uses_every_image() -> None:
     assert np.abs(_centre(result.camera) - [638.4, 477.6]).max() < 2.0
 
 
+@pytest.mark.thorough
 def test_stereo_baseline() -> None:
+    """The quick run holds the same of the same images by the command line (test_rig_session.py)."""
     folder, board = shared_data("real/bouguet-stereo"), Board("b", 9, 6, 30.0, 30.0)
     left, size = detected(folder, "left*.jpg", board)
     right, _ = detected(folder, "right*.jpg", board)

@@ -22,6 +22,8 @@ pytestmark = pytest.mark.real
 
 BASELINE_MM = (99.81, 0.25)
 """Published with the capture, and its uncertainty."""
+PUBLISHED = (("left", 533.5, (341.6, 235.2)), ("right", 536.7, (326.3, 250.1)))
+"""Focal lengths and principal points, px."""
 SESSION = """schema = "rigkit.session/1"
 board = "board.toml"
 model = "brown"
@@ -69,6 +71,10 @@ def test_stereo_session(stereo: Path, capsys: pytest.CaptureFixture[str]) -> Non
     rig = load_rig(stereo / "rig.json")
     assert list(rig) == ["left", "right"]
     assert (load_camera(stereo / "rig-left.json").parameters == rig["left"][0].parameters).all()
+    for name, focal_px, centre in PUBLISHED:
+        camera = rig[name][0]
+        assert np.abs(camera.parameters[:2] - focal_px).max() < 2.0
+        assert np.abs(camera.project(np.array([0.0, 0.0, 1.0]))[0] - centre).max() < 5.0
     page = (stereo / "rig.html").read_text()
     assert page.count("data:image/jpeg") == 28 and len(page) < 5e6
 

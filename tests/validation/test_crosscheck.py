@@ -33,6 +33,8 @@ SIGMA_RATIO = (0.8, 1.2)
 """Observed over predicted spread of 100 draws: its own standard deviation is 1 / sqrt(200) = 7 %."""
 PNP_DRAWS = 50
 PNP_SIGMA_RATIO = (0.7, 1.3)
+FIRST_ORDER_REL = 0.05
+"""Of how far a calibration that is off by one sigma moves an angle: what higher orders may add."""
 """50 draws: 10 %."""
 POSE_COVARIANCE = np.diag([1e-5] * 3 + [0.02] * 3) ** 2
 
@@ -221,8 +223,8 @@ def test_relative_covariance_is_the_sampled_one(rng: np.random.Generator) -> Non
     assert np.std(samples, axis=0) == pytest.approx(np.sqrt(np.diag(predicted)), rel=0.05)
 
 
-def test_calibrations_move_only_the_boards_own_poses_apart(rng: np.random.Generator) -> None:
-    """The share in the sigmas of the angles is what calibrations drawn from their covariance show."""
+def test_calibrations_move_only_the_boards_own_poses_apart() -> None:
+    """The share in the sigmas of the angles is what calibrations show of which one parameter is off by its sigma."""
     exact = made(CAMERAS["kannala_brandt"])
     axes = np.diag(np.where(np.abs(exact.camera1.parameters) > 1.0, 0.3, 3e-4))
     known = UncertainCamera(exact.camera1, axes**2)
@@ -234,15 +236,12 @@ def test_calibrations_move_only_the_boards_own_poses_apart(rng: np.random.Genera
         if before.how == PNP and before.kind == "angle":
             share[before.name] = np.sqrt(added)
     apart = []
-    for _ in range(20):
-        drawn = rng.normal(size=len(axes)) @ axes
-        (moved,) = calibration_shifts(exact, replace(known, covariance=np.outer(drawn, drawn))).moved
+    for axis in axes:
+        (moved,) = calibration_shifts(exact, replace(known, covariance=np.outer(axis, axis))).moved
         ours = measure(moved)
         apart.append([ours.angle_deg(*two)[0] - value for two, (value, _) in planar_pnp(moved).angles_deg.items()])
-    ratio = np.sqrt(np.mean(np.square(apart), axis=0)) / list(share.values())
-    # The spread of 20 draws is itself uncertain by 16 %.
-    assert (ratio > 0.55).all(), ratio
-    assert (ratio < 1.5).all(), ratio
+    # To first order variances of independent causes add up.
+    np.testing.assert_allclose(np.sqrt(np.square(apart).sum(axis=0)), list(share.values()), rtol=FIRST_ORDER_REL)
 
 
 def test_one_board_is_no_case_for_pycolmap() -> None:

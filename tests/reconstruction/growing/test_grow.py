@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.epipolar_scenes import pose_errors_deg
-from helpers.textured_scene import CAM2_FROM_CAM1, LENSES, Corner
+from helpers.textured_scene import CAM2_FROM_CAM1, LENSES, SMALL_LENSES, Corner
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import TILTS, match_affine_features
@@ -27,12 +27,14 @@ from rigkit.workflows.reconstruction.reconstruct_scene import _grown
 BASELINE_MM = float(np.linalg.norm(CAM2_FROM_CAM1.translation_mm))
 SEAM_PX = 12.0
 """Nodes nearer to where two walls meet have them both in their patches."""
+LENS_OF = LENSES | {"small": SMALL_LENSES["pinhole"]}
+"""The last has less than half of the pixels, for tests of the quick run."""
 
 
 @cache
 def matched_corner(lens: str) -> tuple[Corner, list[np.ndarray], Correspondences]:
     rng, corner = np.random.default_rng(5), Corner.of_a_room()
-    images = [corner.image(LENSES[lens], pose, rng) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)]
+    images = [corner.image(LENS_OF[lens], pose, rng) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)]
     return corner, images, match_affine_features(*images, tilts=TILTS)
 
 
@@ -146,8 +148,8 @@ def test_no_place_of_image_2_is_grown_from_two_places_of_image_1() -> None:
 
 def test_calibration_uncertainty_is_in_the_sigmas() -> None:
     """A camera whose focal length and centre are one standard deviation off, of its covariance."""
-    corner, images, seeds = matched_corner("pinhole")
-    true = LENSES["pinhole"]
+    corner, images, seeds = matched_corner("small")
+    true = LENS_OF["small"]
     sigmas = np.array([4.0, 4.0, 3.0, 3.0])
     camera = true.with_parameters(true.parameters + np.array([1.0, 1.0, -1.0, 1.0]) * sigmas)
     sparse = reconstruct_scene(seeds, camera, camera, baseline_mm=BASELINE_MM)
@@ -168,8 +170,8 @@ def test_calibration_uncertainty_is_in_the_sigmas() -> None:
 
 
 def test_where_nothing_grows_the_sparse_cloud_stays_and_says_why() -> None:
-    _, images, seeds = matched_corner("pinhole")
-    camera = LENSES["pinhole"]
+    _, images, seeds = matched_corner("small")
+    camera = LENS_OF["small"]
     sparse = reconstruct_scene(seeds, camera, camera, baseline_mm=BASELINE_MM, image1=images[0])
     flat = [np.full(images[0].shape[:2], 90, dtype=np.uint8)] * 2
     scene, left, maps = _grown(sparse, seeds, (flat[0], flat[1]), silent, pose_is_known=False, of=None)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.browser import MIN_FONT_PX, measured_at_widths, probed
+from helpers.browser import MIN_FONT_PX, probed, probed_at_widths
 from helpers.calibration_scenes import BOARD, lens, random_views, with_outliers
 
 from rigkit.calibration.calibrate import calibrate
@@ -91,7 +91,7 @@ def test_works_without_network(text: str, found_words: list[str]) -> None:
 
 @pytest.mark.thorough
 def test_fits_a_phone_a_tablet_and_a_screen(calibration: Calibration, tmp_path: Path) -> None:
-    for width, (wide, small) in measured_at_widths(page(calibration), tmp_path).items():
+    for width, (wide, small) in probed_at_widths(page(calibration), tmp_path)[0].items():
         assert wide <= width
         assert small >= MIN_FONT_PX
 

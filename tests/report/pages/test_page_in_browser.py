@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import numpy as np
-from helpers.browser import MIN_FONT_PX, measured_at_widths, probed
+from helpers.browser import MIN_FONT_PX, WIDTHS, probed_at_widths
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.core.truth import MeasuredAngle, PairTruth
@@ -32,32 +32,23 @@ document.body.dataset.probe = [before, canvas.dataset.view, painted, cut, fits].
 </script></body>"""
 
 
-def test_the_page_works_without_network(tmp_path: Path) -> None:
+def test_the_page_works_without_network_and_fits_a_phone_a_tablet_and_a_screen(tmp_path: Path) -> None:
     reconstruction = make_reconstruction()
     truth = PairTruth(angles=(MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set <square>"),))
     report = validate(reconstruction, truth)
     picture = ("The cloud", "image/png", as_png(cloud_figure(reconstruction)))
     section = pair_section(reconstruction, [report], [picture])
     page = build_page(
-        "A & B", "lead", verdict_of([report], [report]), [summary_table([report])], [section], {"rigkit": "x"}
+        "A & B", "lead", verdict_of([report], [report]), [summary_table([report])], [section], {"rigkit": "x" * 200}
     )
     assert not re.search(r"""(src|href)=["']?https?:""", page)
     assert "set &lt;square&gt;" in page
-    before, after, painted, cut, fits = probed(page.replace("</body>", PROBE), tmp_path)
+    at_widths, (before, after, painted, cut, fits) = probed_at_widths(page.replace("</body>", PROBE), tmp_path)
+    assert len(at_widths) == len(WIDTHS)
+    for width, (wide, small) in at_widths.items():
+        assert wide <= width
+        assert small >= MIN_FONT_PX
     assert painted == "true" and cut == "false"
     assert fits == "true"
     first, second = (np.array([float(v) for v in text.split()]) for text in (before, after))
     assert abs(first[0] - second[0]) > 0.1
-
-
-def test_the_page_fits_a_phone_a_tablet_and_a_screen(tmp_path: Path) -> None:
-    reconstruction = make_reconstruction()
-    report = validate(reconstruction, PairTruth(angles=(MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set square"),)))
-    picture = ("The cloud", "image/png", as_png(cloud_figure(reconstruction)))
-    section = pair_section(reconstruction, [report], [picture])
-    page = build_page(
-        "title", "lead", verdict_of([report], [report]), [summary_table([report])], [section], {"rigkit": "x" * 200}
-    )
-    for width, (wide, small) in measured_at_widths(page, tmp_path).items():
-        assert wide <= width
-        assert small >= MIN_FONT_PX
