@@ -123,17 +123,23 @@ class _SheetParameters:
     light: FloatArray
 
 
+def has_small_squares(item: RefinedLattice) -> bool:
+    """Return whether the squares of `item` are so small relative to the blur that it is fitted as a whole."""
+    known = item.lattice.known
+    few = min(known.shape) < MIN_ROWS or np.count_nonzero(~known) > MAX_HOLES * known.size
+    blur = known_median(item.blur_px[known])
+    if few or blur < MIN_BLUR_PX:
+        return False
+    return float(np.median(fit_cells(item.lattice.pixels, known).gaps())) <= SMALL_SQUARES * blur
+
+
 def placed_together(image: GreyImage, item: RefinedLattice) -> RefinedLattice:
     """Return `item` with jointly fitted corners if its squares are small relative to the blur and the model fits; else
     unchanged."""
+    if not has_small_squares(item):
+        return item
     lattice, known = item.lattice, item.lattice.known
-    start, blur = lattice.pixels, known_median(item.blur_px[known])
-    few = min(known.shape) < MIN_ROWS or np.count_nonzero(~known) > MAX_HOLES * known.size
-    if few or blur < MIN_BLUR_PX:
-        return item
-    shape = fit_cells(start, known)
-    if float(np.median(shape.gaps())) > SMALL_SQUARES * blur:
-        return item
+    start, blur, shape = lattice.pixels, known_median(item.blur_px[known]), fit_cells(lattice.pixels, known)
     geometry = Geometry(shape.sides, np.zeros((lattice.count, 2)), shape.gaps(), ends_of(known, known))
     outer = np.full((*known.shape, 4), np.nan)
     fitted = start[known], lattice.contrast[known], item.blur_px[known], lattice.signs()[known]
