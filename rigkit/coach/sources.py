@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
 from rigkit.io.manifests.rig_session import frames_of_images
-from rigkit.io.media.images import IMAGE_ENDINGS, read_image
+from rigkit.io.media.images import is_image, read_image
 
 POLL_S = 0.3
 SETTLED_S = 0.2
@@ -80,7 +80,7 @@ def _settled(paths: Sequence[Path]) -> tuple[tuple[int, int], ...] | None:
 
 def _pictures(folder: Path) -> list[Path]:
     try:
-        return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS)
+        return sorted(path for path in folder.iterdir() if is_image(path))
     except OSError as error:
         raise InputError(f"coach: '{folder}' cannot be read any more: {error.strerror}; start again") from error
 

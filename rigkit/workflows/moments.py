@@ -9,7 +9,7 @@ from pathlib import Path
 from rigkit.core.errors import InputError
 from rigkit.io.manifests.rig_session import frames_of_images
 from rigkit.workflows.detect import images_in
-from rigkit.workflows.inputs.folder_session import cameras_in
+from rigkit.workflows.inputs.folder_session import cameras_in, images_of_camera
 
 ImagesByMoment = list[list[Path]]
 """The images of every moment, one per camera."""
@@ -28,10 +28,7 @@ def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[ImagesByM
         images = list(images_in(sources))
         return _by_names(names, images) or _in_order(names, images), []
     if len(sources) == 1:
-        found = {
-            name: sorted(path for folder, pattern in own for path in folder.glob(pattern))
-            for name, own in cameras_in(sources).items()
-        }
+        found = {name: images_of_camera(own) for name, own in cameras_in(sources).items()}
     else:
         found = {f"{k}": list(images_in([source])) for k, source in enumerate(sources)}
         if {source.name for source in sources} == set(names):

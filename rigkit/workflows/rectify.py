@@ -27,7 +27,7 @@ from rigkit.rectification.stereo import StereoRectification, rectify_pair
 from rigkit.rectification.targets import target_camera
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_camera, import_pair
-from rigkit.workflows.inputs.folder_session import cameras_in
+from rigkit.workflows.inputs.folder_session import cameras_in, images_of_camera
 from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.moments import together
 
@@ -212,7 +212,7 @@ def _pairs(
                 f"rectify: in '{images}' no images are named after the rig's camera '{missing[0]}': there are {there}; "
                 f"give two folders, that of '{names[0]}' first"
             )
-        found = [sorted(p for folder, one in cameras[n] for p in folder.glob(one)) for n in names]
+        found = [images_of_camera(cameras[n]) for n in names]
     elif not all(Path(image).is_dir() for image in images):
         one, two = images
         if is_video(one) != is_video(two) or Path(one).is_dir() != Path(two).is_dir():

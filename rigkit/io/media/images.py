@@ -13,6 +13,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, cast
 
@@ -137,15 +138,23 @@ def announced_sizes(data: bytes) -> list[tuple[int, int]]:
         Pillow.MAX_IMAGE_PIXELS = limit
 
 
-def images_of_folder(folder: Path) -> list[Path]:
-    """Return the images of a folder, sorted by name."""
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS and is_file_or_lost_link(p))
+def is_image(path: Path) -> bool:
+    """Return whether a file is an image by its name. Hidden ones are none: Macs write ._NAME beside NAME."""
+    return path.suffix.lower() in IMAGE_ENDINGS and not path.name.startswith(".")
+
+
+def images_of_folder(folder: Path, pattern: str = "*") -> list[Path]:
+    """Return the images of a folder whose names match `pattern`, sorted by name."""
+    return sorted(p for p in folder.iterdir() if is_image(p) and fnmatch(p.name, pattern) and is_file_or_lost_link(p))
 
 
 def images_below(folder: Path) -> list[Path]:
-    """Return the images of a folder and its subfolders, sorted; unreadable subfolders are skipped."""
-    files = (Path(place) / name for place, _, names in os.walk(folder) for name in names)
-    return sorted(p for p in files if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
+    """Return the images of a folder and its subfolders, sorted; unreadable subfolders and hidden ones are skipped."""
+    out: list[Path] = []
+    for place, inside, names in os.walk(folder):
+        inside[:] = [name for name in inside if not name.startswith(".")]
+        out += [path for name in names if is_image(path := Path(place) / name) and path.is_file()]
+    return sorted(out)
 
 
 def folder_of_images(folder: Path) -> Path:

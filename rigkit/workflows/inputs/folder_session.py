@@ -184,7 +184,7 @@ def _board_suggestion(places: Sequence[Path], progress: Progress = silent) -> Su
     if any(is_video(place) for place in places):
         return suggestion(places, progress)
     entries = [entry for found in cameras_in(places).values() for entry in found]
-    return suggestion(sorted(image for folder, pattern in entries for image in folder.glob(pattern)), progress)
+    return suggestion(images_of_camera(entries), progress)
 
 
 def _missing_board_message(folders: Sequence[Path]) -> str:
@@ -216,6 +216,11 @@ def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
     if images:
         return _by_names(folder, images)
     return _cameras_below(folder)
+
+
+def images_of_camera(patterns: Iterable[tuple[Path, str]]) -> list[Path]:
+    """Return the images of a camera of `cameras_in`, sorted."""
+    return sorted(image for folder, pattern in patterns for image in images_of_folder(folder, pattern))
 
 
 def _cameras_below(folder: Path) -> dict[str, list[tuple[Path, str]]]:

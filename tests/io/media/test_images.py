@@ -11,8 +11,17 @@ import PIL.Image
 import pytest
 
 from rigkit.core.errors import InputError
-from rigkit.io.media.images import folder_of_images, no_images, quiet_opencv, read_image, to_grey
+from rigkit.io.media.images import (
+    folder_of_images,
+    images_below,
+    images_of_folder,
+    no_images,
+    quiet_opencv,
+    read_image,
+    to_grey,
+)
 from rigkit.workflows.detect import images_in
+from rigkit.workflows.inputs.folder_session import images_of_camera
 
 
 @pytest.fixture
@@ -217,6 +226,16 @@ def test_a_folder_without_images_says_what_it_holds_instead(tmp_path: Path) -> N
     (tmp_path / "tuesday" / "a.PNG").unlink()
     with pytest.raises(InputError, match="formats that are not read"):
         folder_of_images(tmp_path)
+
+
+def test_hidden_files_are_no_images(tmp_path: Path) -> None:
+    """A Mac writes ._a.jpg beside a.jpg on disks that cannot hold its attributes, and programs keep thumbnails."""
+    for name in ("a.jpg", "._a.jpg", ".thumbnails/a.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    own = [tmp_path / "a.jpg"]
+    assert images_of_folder(tmp_path) == images_below(tmp_path) == list(images_in([tmp_path])) == own
+    assert images_of_camera([(tmp_path, "*.jpg")]) == own
 
 
 def test_an_unreadable_subfolder_does_not_end_the_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
