@@ -132,8 +132,10 @@ def test_layouts_of_well_known_datasets(first: str, second: str, cameras: list[s
     assert [sorted(p for folder, one in found[name] for p in folder.glob(one)) for name in cameras] == own
 
 
-def test_one_letter_is_a_side_only_where_both_sides_have_the_same_images(tmp_path: Path) -> None:
-    _images(tmp_path, "L1", "L2", "R3", "R4", "R5")
+@pytest.mark.parametrize("form", ["{}", "board_{}_"])
+def test_a_letter_or_a_word_within_is_a_side_only_where_both_have_the_same_images(form: str, tmp_path: Path) -> None:
+    sides = ("L", "R") if form == "{}" else ("left", "right")
+    _images(tmp_path, *(f"{form.format(sides[k > 2])}{k}" for k in range(1, 6)))
     assert list(cameras_in([tmp_path])) == [""]
 
 

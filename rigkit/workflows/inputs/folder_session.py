@@ -276,7 +276,8 @@ def _by_names(folder: Path, images: Sequence[Path]) -> dict[str, list[tuple[Path
     named = [name.groupdict("") for name in found if name is not None]
     rests = Counter((name.get("before", ""), name["rest"]) for name in named)
     numbered = all(rest.isdigit() for _, rest in rests)
-    sure = numbered and all(len(name["side"]) > 1 for name in named)
+    # "board_left_1" and "L1" may also say where the board was: then right has other numbers.
+    sure = numbered and all(len(name["side"]) > 1 and "before" not in name for name in named)
     shared = sum(count for count in rests.values() if count > 1)
     if len(named) == len(images) and (sure or shared >= MIN_IN_COMMON * len(images)):
         for image, name in zip(images, named, strict=True):
