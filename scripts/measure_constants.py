@@ -136,10 +136,10 @@ def rendered(seeds: int) -> Iterator[Look]:
         for board in BOARDS:
             for k, lens in enumerate(LENSES):
                 rng = np.random.default_rng(seed)
-                image = grey_image(one_board(rng, lens=lens, board=board).render(noise_levels=2.0, rng=rng))
+                image = one_board(rng, lens=lens, board=board).render(noise_levels=2.0, rng=rng).astype(np.uint8)
                 for what, amount in CONDITIONS[k::2]:
                     worse = degraded(what, amount, image, rng)[0] if amount else image
-                    yield Look(worse, (board,), True)
+                    yield Look(grey_image(worse), (board,), True)
         for name in BLANKS:
             if name not in COUNTED_PATTERNS:
                 yield Look(grey_image(blank(name, np.random.default_rng(seed))), BOARDS, False)

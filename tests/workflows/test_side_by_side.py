@@ -18,7 +18,10 @@ BOARD = Board("b", 4, 3, 30.0, 30.0)
 def _seen(*places: tuple[float, float]) -> FoundCorners:
     """Corners of boards of 60 x 40 px whose first corners are at `places`, in an image of 800 x 600 px."""
     grid = np.argwhere(np.ones((3, 4)))[:, ::-1]
-    found = [BoardDetection("b", 4, 3, grid, 20.0 * grid + place, np.full(12, 0.1)) for place in places]
+    found = [
+        BoardDetection("b", 4, 3, grid, np.asarray(20.0 * grid + place, np.float64), np.full(12, 0.1))
+        for place in places
+    ]
     return FoundCorners((800, 600), tuple(found))
 
 

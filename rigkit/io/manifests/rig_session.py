@@ -236,13 +236,14 @@ def _frames_by_time(images: Mapping[str, Sequence[str]]) -> dict[str, dict[str, 
     near = MAX_PART_OF_GAP * min(gaps, default=Decimal(0))
     moments: list[Decimal] = []
     frames: dict[str, dict[str, str]] = {}
-    for name, own in times.items():
+    for name, time_of in times.items():
         frames[name] = {}
         known = list(moments)
-        for image, time in own.items():
+        for image, time in time_of.items():
             place = bisect(known, time)
-            moment = min(known[max(place - 1, 0) : place + 1], key=lambda one, time=time: abs(one - time), default=None)
-            if moment is None or abs(moment - time) > near:
+            neighbours = [(abs(one - time), one) for one in known[max(place - 1, 0) : place + 1]]
+            gap, moment = min(neighbours, default=(near + 1, time))
+            if gap > near:
                 moment = time
                 insort(moments, time)
             frames[name][image] = str(moment)
