@@ -12,7 +12,7 @@ from helpers.schemas import faults
 
 from rigkit.io.disk import writing
 
-SHOWN = 6
+SHOWN, NUMBERS_SHOWN = 6, 2
 """Of a long list so many of its first and last: there is more of the same between, which takes a checker seconds."""
 
 
@@ -35,7 +35,10 @@ def _shortened(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _shortened(one) for key, one in value.items()}
     if isinstance(value, list):
-        return [_shortened(one) for one in (value if len(value) <= 2 * SHOWN else value[:SHOWN] + value[-SHOWN:])]
+        if len(value) > 2 * SHOWN:
+            shown = NUMBERS_SHOWN if all(isinstance(one, float) for one in value) else SHOWN
+            value = value[:shown] + value[-shown:]
+        return [_shortened(one) for one in value]
     return value
 
 
