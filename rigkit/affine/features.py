@@ -78,7 +78,7 @@ def match_affine_features(
         if len(pairs) >= ENOUGH_PLAIN:
             break
     if not len(pairs):
-        what = f"none of {tried} matches could be aligned" if tried else "nothing looks alike in both images"
+        what = f"none of {tried} matches could be aligned" if tried else "no feature matches in both images"
         raise DegenerateError(
             f"affine features: {what}; check that they show one textured scene, from places not too far apart"
         )

@@ -103,8 +103,8 @@ def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:
         sigma *= max(result.sigma_px, MIN_RESULT_SIGMA_PX) / result.sigma_px
     if not sigma < UNKNOWN_SHARE * result.camera.size_px[0]:
         raise DegenerateError(
-            "calibration: the views leave the focal length open (all boards nearly parallel to the image, or too few "
-            "corners); take views in which the board is tilted by 20 to 50 degrees in several directions"
+            "calibration: the views do not determine the focal length (all boards nearly parallel to the image, or too "
+            "few corners); take views with the board tilted by 20 to 50 degrees about different axes"
         )
 
 

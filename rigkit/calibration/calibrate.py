@@ -174,7 +174,8 @@ def _result(
                 return _with_verdicts(begun, moving, result, far_of_moving)
     if request.pupil == "moving":
         raise DegenerateError(
-            "calibration: the images do not tell how the entrance pupil moves; take boards near and far, up to the "
+            "calibration: the images do not determine how the entrance pupil moves; take boards near and far, up to "
+            "the "
             'rim of the image, or pupil = "auto"'
         )
     central = _with_verdicts(begun, found, central, far)
@@ -245,8 +246,8 @@ def _largest_size_chosen(
         return []
     return [
         Finding.look(
-            f"{beyond[-1][0]} is the largest there is of its kind, and the best: the lens may ask for more, "
-            "most towards its rim",
+            f"{beyond[-1][0]}, the largest size of this model, was chosen: the lens may need more parameters, mostly "
+            "near the image border",
             'try model = "auto"',
         )
     ]

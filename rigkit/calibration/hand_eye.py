@@ -99,8 +99,8 @@ def hand_eye(camera: Camera, views: Sequence[BoardView], mount_from_stand: Seque
     if len(use) < max(MIN_POSES, len(views) // 2 + 1):
         worst = float(np.degrees(np.median(mismatch)))
         raise InputError(
-            f"hand-eye: the camera turned otherwise than the robot from image to image (by {worst:.1f} degrees in the "
-            "median); are images and poses in the same order, and angles in the right unit?"
+            f"hand-eye: rotations of camera and robot between images differ (by {worst:.1f} degrees, median); check "
+            "that images and poses are in the same order, and the unit of the angles"
         )
     problem = _AllCorners(camera, [views[i] for i in use], [mount_from_stand[i] for i in use])
     start = _linear([seen[i] for i in use], problem.robot)
@@ -180,7 +180,8 @@ def _pose(camera: Camera, view: BoardView) -> Rigid3:
         return cam_from_seen_board(camera, view.pixels, view.points())
     except DegenerateError as error:
         raise InputError(
-            f"hand-eye: image '{view.image}' has no four corners that the camera sees, not all in line; leave it out"
+            f"hand-eye: image '{view.image}' has fewer than four non-collinear corners in the camera's field of "
+            "view; leave it out"
         ) from error
 
 
@@ -204,8 +205,8 @@ def _refuse_open(covariance: FloatArray, seen: Sequence[Rigid3]) -> None:
     if not worst <= MAX_SIGMA_OF_DISTANCE * distance:
         known = f", known to {worst:.0f} mm only" if np.isfinite(worst) else ""
         raise DegenerateError(
-            "hand-eye: the hand turned about one axis only, which leaves the place along it open"
-            f"{known}; turn it about two"
+            "hand-eye: the hand rotated about one axis only, which does not determine the translation along it"
+            f"{known}; rotate it about two axes"
         )
 
 
@@ -236,8 +237,8 @@ def _refuse_inverse(problem: _AllCorners, seen: Sequence[Rigid3], cost: float) -
     found = minimise(start, other.at, _moved, HAND_EYE_DAMPING, HAND_EYE_STOP)
     if np.isfinite(found.problem.cost) and found.problem.cost * INVERSE_FITS_BETTER**2 < cost:
         raise InputError(
-            "hand-eye: the robot's poses fit far better the other way round; they may be hand_from_base (then say "
-            "--inverse), or the board may be on the hand (--board-on-hand)"
+            "hand-eye: the inverse robot poses fit far better: they may be hand_from_base (add --inverse), or the "
+            "board may be on the hand (add --board-on-hand)"
         )
 
 

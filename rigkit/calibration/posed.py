@@ -86,7 +86,9 @@ def _on_flat_boards(
     state, kept = posed(observations, camera)
     fits = enough_agree(kept.sum(axis=1), observations.present.sum(axis=1))
     if not fits.any():
-        raise DegenerateError("no view fits the known lens; is it that of another camera, image size or focus?")
+        raise DegenerateError(
+            "no view fits the known lens: is it of another camera, image size or focus? calibrate the lens again"
+        )
     dropped += tuple(
         (view.image, "fewer than half of its corners fit the known lens; retake it")
         for view, ok in zip(used, fits, strict=True)
@@ -97,7 +99,7 @@ def _on_flat_boards(
     data = normal_equations(observations, state, np.where(kept, observations.weight, 0.0))
     freedom = 2 * int(kept.sum()) - 6 * len(chosen)
     if freedom <= 0:
-        raise DegenerateError("as many unknowns as corners; take views with more corners")
+        raise DegenerateError("no more corners than unknowns; take views with more corners")
     sigma = float(np.sqrt(data.costs.sum() / freedom))
     return observations, Fit(state, data, kept, sigma, Convergence(0, True, "only poses were solved for")), dropped
 
@@ -120,8 +122,8 @@ def _shaped(
 def _large_residual(result: Calibration) -> tuple[Finding, ...]:
     if result.rms_px <= MAX_LENS_RESIDUAL_PX:
         return ()
-    message = f"the known lens leaves {result.rms_px:.2f} px: the lens of another camera, image size or focus?"
-    return (Finding.bad(message, "calibrate it anew"),)
+    message = f"the known lens leaves {result.rms_px:.2f} px RMS: is it of another camera, image size or focus?"
+    return (Finding.bad(message, "calibrate the lens again from these images"),)
 
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)

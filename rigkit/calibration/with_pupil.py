@@ -108,7 +108,7 @@ def kept_central(candidates: Sequence[Candidate]) -> list[Candidate]:
     """Return the candidates of `against_central` with the central lens as the chosen one."""
     if not any(c.chosen and c.name == MOVING for c in candidates):
         return list(candidates)
-    reasons = {CENTRAL: "images do not surely agree that the pupil moves", MOVING: "by how much it moves may be chance"}
+    reasons = {CENTRAL: "a moving pupil is not significant", MOVING: "movement not significant"}
     return [replace(c, chosen=c.name == CENTRAL, reason=reasons[c.name]) for c in candidates]
 
 

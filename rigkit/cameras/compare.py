@@ -116,8 +116,8 @@ def compare_cameras(
     covered = covered & seen
     if covered.sum() < MIN_PIXELS:
         raise DegenerateError(
-            f"the cameras share {covered.sum()} of {covered.size} pixels; they look elsewhere; "
-            "compare cameras of one view"
+            f"the cameras share {covered.sum()} of {covered.size} pixels; their fields of view differ; compare "
+            "calibrations of one camera"
         )
     difference = np.where(covered[..., None], projected - pixels, np.nan)
     return CameraDifference(pixels, difference, covered, b_from_a)

@@ -71,12 +71,12 @@ def convert_camera(
     rays, valid = camera.unproject(pixels)
     pixels, rays = pixels[valid], rays[valid]
     if len(pixels) < MIN_COVERED_SAMPLES:
-        raise InputError("camera conversion: the source sees next to nothing of its own image; calibrate it again")
+        raise InputError("camera conversion: the camera has hardly any valid rays in its own image; calibrate it again")
     theta = _off_axis_rad(rays)
     centre = camera.axis_px
     inside = np.ones(len(pixels), dtype=bool) if outline is None else _inside(outline, pixels)
     if not inside.any():
-        raise InputError("camera conversion: nothing was seen where the camera looks; calibrate it again")
+        raise InputError("camera conversion: no corner was seen in the camera's field of view; calibrate it again")
     weight, to = np.where(inside, 1.0, OUTSIDE_WEIGHT), camera_model(model)
     found: Conversion | None = None
     for limit in LIMITS_RAD:

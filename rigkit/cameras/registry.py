@@ -34,7 +34,7 @@ def check_order(name: str, order: int) -> None:
         )
     if not camera_model(name).orders:
         raise InputError(
-            f"degree {order} for {name}, which comes in one size; remove it. Models that have one: {known}"
+            f"degree {order} for {name}, which has one size only; remove it. Models that have one: {known}"
         )
     if order not in sizes[name]:
         raise InputError(f"{name} has no degree {order}; choose {', '.join(map(str, sizes[name]))}, or leave it out")

@@ -14,9 +14,11 @@ if TYPE_CHECKING:
 
 def add_reach_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the limits of the positions of boards."""
-    parser.add_argument("--near", type=float, default=0.0, metavar="MM", help="the board is not sharp nearer than this")
-    parser.add_argument("--far", type=float, default=float("inf"), metavar="MM", help="nor held farther than this")
-    parser.add_argument("--field", type=float, metavar="DEG", help="the lens sees no more than this full angle")
+    parser.add_argument("--near", type=float, default=0.0, metavar="MM", help="smallest distance of the board")
+    parser.add_argument("--far", type=float, default=float("inf"), metavar="MM", help="largest distance of the board")
+    parser.add_argument(
+        "--field", type=float, metavar="DEG", help="full field of view of the lens, where boards can be seen"
+    )
 
 
 def reach_of(args: argparse.Namespace) -> Reach:

@@ -1,4 +1,4 @@
-"""`rigkit board`: a board to print, true to scale (PDF and SVG), and its measured size back into its file."""
+"""`rigkit board`: print a calibration target true to scale (PDF, SVG), then record the measured size of the print."""
 
 from __future__ import annotations
 
@@ -23,26 +23,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "size",
         metavar="BOARD",
-        help="9x6 (inner corners), aprilgrid:6x6x88,spacing=0.3 (tags, mm, keys of board files), a file, or identify",
+        help="9x6 (inner corners), aprilgrid:6x6x88,spacing=0.3 (tags, mm, keys of board files), a board file, or "
+        "identify",
     )
     parser.add_argument(
-        "images", nargs="*", type=Path, metavar="IMAGE|FOLDER", help="with BOARD identify: images, or folders of images"
+        "images",
+        nargs="*",
+        type=Path,
+        metavar="IMAGE|FOLDER",
+        help="only with BOARD = identify: images or folders that show the board",
     )
     parser.add_argument("--square-mm", type=float, metavar="MM", help="side of a square (with COLUMNSxROWS)")
     parser.add_argument("--paper", default="a4", help="a4 (default), a3, a2, a1, a0, letter or tabloid")
     parser.add_argument("-o", "--output", metavar="NAME", help="write NAME.pdf, NAME.svg and NAME.toml")
     parser.add_argument("--force", action="store_true", help="replace existing files")
     charuco = parser.add_argument_group("ChArUco", "markers in the white squares (with COLUMNSxROWS)")
-    charuco.add_argument("--charuco", metavar="DICTIONARY", help="OpenCV's name, such as DICT_5X5_100")
-    charuco.add_argument("--marker-mm", type=float, metavar="MM", help="side of a marker (three quarters of a square)")
-    charuco.add_argument("--first-marker", type=int, default=0, metavar="N", help="number of the first marker (0)")
-    charuco.add_argument("--legacy", action="store_true", help="pattern of OpenCV before 4.6")
+    charuco.add_argument("--charuco", metavar="DICTIONARY", help="name of an OpenCV dictionary, such as DICT_5X5_100")
+    charuco.add_argument("--marker-mm", type=float, metavar="MM", help="side of a marker (default: 3/4 of a square)")
+    charuco.add_argument("--first-marker", type=int, default=0, metavar="N", help="id of the first marker (default: 0)")
+    charuco.add_argument("--legacy", action="store_true", help="ChArUco pattern of OpenCV before 4.6")
     measured = parser.add_argument_group(
-        "measured print", "what a rule shows on the print's two rulers; the board file gets the true square size"
+        "measured print",
+        "printers scale: measure the two rulers on the sheet, and BOARD.toml gets the true square size",
     )
     measured.add_argument("--ruler-x-mm", type=float, metavar="MM", help="measured length of the lower ruler")
     measured.add_argument("--ruler-y-mm", type=float, metavar="MM", help="measured length of the right ruler")
-    measured.add_argument("--sigma-mm", type=float, metavar="MM", help="how well you could read the rule")
+    measured.add_argument("--sigma-mm", type=float, metavar="MM", help="standard deviation of these two readings")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -53,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     if args.size == "identify":
         return identify(args)
     if args.images:
-        raise InputError(f"board: '{args.images[0]}' after the board; give images to rigkit board identify alone")
+        raise InputError(f"board: unexpected '{args.images[0]}'; only `rigkit board identify` takes images")
     size = BOARD_SIZE.match(args.size)
     measured = args.ruler_x_mm is not None or args.ruler_y_mm is not None
     board: Board | Path = board_in_words(args.size) or Path(args.size)
@@ -61,10 +67,12 @@ def run(args: argparse.Namespace) -> int:
         if args.square_mm is None:
             raise InputError("board: --square-mm is missing; give the side of a square, such as --square-mm 30")
         if measured:
-            raise InputError("board: a measured print belongs to a board file; give BOARD.toml instead of a size")
+            raise InputError(
+                "board: --ruler-x-mm and --ruler-y-mm update a board file; give BOARD.toml instead of a size"
+            )
         board = Board("board", int(size[1]), int(size[2]), args.square_mm, args.square_mm, pattern=_pattern(args))
     elif args.charuco or args.marker_mm is not None or args.first_marker or args.legacy:
-        raise InputError("board: --charuco needs a size such as 9x6; a board file states its markers already")
+        raise InputError("board: --charuco goes with a size such as 9x6; a board file already states its markers")
     elif measured:
         return _store_measured(args)
     if args.output is None:
@@ -78,7 +86,9 @@ def _store_measured(args: argparse.Namespace) -> int:
     from rigkit.workflows.capture.print_board import MeasuredPrint, store_measured_print
 
     if args.ruler_x_mm is None or args.ruler_y_mm is None:
-        raise InputError("board: measure both rulers; printers stretch the two directions differently")
+        raise InputError(
+            "board: give both --ruler-x-mm and --ruler-y-mm; printers scale the two directions differently"
+        )
     read = MeasuredPrint(
         ruler_x_mm=args.ruler_x_mm, ruler_y_mm=args.ruler_y_mm, sigma_mm=args.sigma_mm, paper=args.paper
     )

@@ -31,7 +31,7 @@ def identify(args: argparse.Namespace) -> int:
     board = found.board
     print(f"{board.pattern.type}: {without_scale(board.describe())}")
     print(f"seen in {len(found.seen)} of {len(found.looked_at)} images")
-    print(f"--board {found.words}   (MM: {board.pattern.size_meaning}, measured with a rule)")
+    print(f"--board {found.words}   (replace MM by {board.pattern.size_meaning}, measured with a ruler)")
     if found.beside:
         seen = "" if board.identified else "   (as far as it is seen)"
         print(f"beside it: {', '.join(f'--board {words}' for words in found.beside)}{seen}")
@@ -47,8 +47,8 @@ def identify(args: argparse.Namespace) -> int:
         note(f"two boards alike in {seen}: detect and calibrate find only one of them; {DUPLICATES_REMEDY}")
     if found.either_pattern:
         note(
-            "the pattern of OpenCV before 4.6 and the one of today differ in one column, which no image shows well: if "
-            "OpenCV made the board, set legacy_pattern by its version"
+            "the pattern of OpenCV before 4.6 and the one of today differ in one column, which no image shows "
+            "clearly: if OpenCV made the board, set legacy_pattern by its version"
         )
     for error in found.unreadable:
         note(f"left out: {error}")

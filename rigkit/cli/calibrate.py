@@ -1,4 +1,4 @@
-"""`rigkit calibrate`: one camera, or several on one mount, from a session or folders of images of boards."""
+"""`rigkit calibrate`: calibrate one camera, or a rig, from a session file or folders of images of boards."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ def _many(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note
 
     if args.output is not None or args.report or args.corners is not None:
-        raise InputError("calibrate: -o, --corners and a name for -r are of one session; results go beside each")
+        raise InputError(
+            "calibrate: -o, --corners and -r FILE.html take one session; with several, results go beside each session"
+        )
     codes = []
     for source in args.source:
         if not args.json:
@@ -39,7 +41,7 @@ def _many(args: argparse.Namespace) -> int:
             codes.append(error.exit_code)
     failed = [str(source) for source, code in zip(args.source, codes, strict=True) if code]
     note(
-        f"{len(codes) - len(failed)} of {len(codes)} sessions are well"
+        f"{len(codes) - len(failed)} of {len(codes)} sessions succeeded"
         + (f"; not: {', '.join(failed)}" if failed else "")
     )
     return max(codes)

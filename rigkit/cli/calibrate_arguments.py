@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="SESSION.toml|FOLDER|VIDEO",
-        help="a session, folders of images, videos, camera:0",
+        help="a session file; or one folder of images (or video, or camera:0) per camera",
     )
     parser.add_argument("-o", "--output", type=Path, help="default: calibration.json (rig.json) beside the session")
     parser.add_argument(
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const="",
         metavar="FILE.html",
-        help="write a page to look at; without a name beside the output",
+        help="write an HTML report (default name: that of the output)",
     )
     parser.add_argument(
         "--export",
@@ -44,45 +44,54 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         choices=sorted(FOREIGN_ENDINGS),
         metavar="FORMAT",
-        help=f"also for other tools, beside it: {', '.join(sorted(FOREIGN_ENDINGS))}",
+        help=f"also write these formats, beside the output: {', '.join(sorted(FOREIGN_ENDINGS))}",
     )
     parser.add_argument(
         "--pupil",
         choices=PUPILS,
         default="auto",
-        help="whether lenses look from one point (central), or their entrance pupils move; default: auto, moving where "
-        "images show it",
+        help="entrance pupil fixed (a central camera), or moving with the angle of view (default: auto, moving where "
+        "images show it)",
     )
-    parser.add_argument("--corners", type=Path, metavar="FILE", help="use these: corners.csv, corners.json, .vnl")
     parser.add_argument(
-        "--no-cache", action="store_true", help="find all corners anew, and keep none beside the session"
+        "--corners",
+        type=Path,
+        metavar="FILE",
+        help="use these corners instead of detecting them: corners.csv, corners.json, .vnl (mrcal)",
+    )
+    parser.add_argument(
+        "--no-cache", action="store_true", help="detect all corners again, and keep none beside the session"
     )
     parser.add_argument("--force", action="store_true", help="replace existing results")
-    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
     _add_known(parser)
     _add_of_folders(parser)
 
 
 def _add_known(parser: argparse.ArgumentParser) -> None:
-    rigs = parser.add_argument_group("rigs", "what is known stays; how unsure it is counts in all results")
+    rigs = parser.add_argument_group(
+        "rigs", "cameras already known stay fixed; their covariance is propagated into all results"
+    )
     rigs.add_argument(
         "--only-extrinsics",
         nargs="+",
         type=Path,
         default=[],
         metavar="CALIB",
-        help="lenses stay as these files have them (one a camera, or one rig): only the mounts are found",
+        help="keep the intrinsics of these files (one per camera, or one rig); solve for the extrinsics only",
     )
     rigs.add_argument(
         "--add-camera",
         type=Path,
         metavar="RIG",
-        help="cameras of this rig stay, lens and mount: the others are added to it",
+        help="keep intrinsics and extrinsics of this rig; add the other cameras to it",
     )
 
 
 def _add_of_folders(parser: argparse.ArgumentParser) -> None:
-    folders = parser.add_argument_group("folders", "the session used is kept as session.toml for the next time")
+    folders = parser.add_argument_group(
+        "folders", "the calibration is repeated by the session file that results, session.toml"
+    )
     folders.add_argument(
         "--board",
         action="append",
@@ -94,10 +103,12 @@ def _add_of_folders(parser: argparse.ArgumentParser) -> None:
         "--square-mm",
         type=float,
         metavar="MM",
-        help="instead: the board is what the images show, with squares (tags, distances of circles) of so many mm",
+        help="instead of --board: side of a square (tag; distance of circles); the images say which board it is",
     )
-    folders.add_argument("--timestamps", type=Path, metavar="FILE.csv", help="which frames of videos are of one moment")
-    folders.add_argument("--model", help=f"{', '.join(MODEL_NAMES)} (default: auto, the one that predicts best)")
+    folders.add_argument(
+        "--timestamps", type=Path, metavar="FILE.csv", help="which frames of the videos were taken together"
+    )
+    folders.add_argument("--model", help=f"{', '.join(MODEL_NAMES)} (default: auto, the lowest held-out error)")
 
 
 def calibrate_options(args: argparse.Namespace) -> CalibrateOptions:

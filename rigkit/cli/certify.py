@@ -1,6 +1,6 @@
-"""`rigkit certify`: how wrong a length, depth, plane or angle may be that is measured with a calibration or a rig.
+"""`rigkit certify`: bound the error of a length, depth, plane or angle measured with a calibration or rig.
 
-Exit code 1 above --limit, and with a calibration that was called bad.
+Exit code 1 where the bound exceeds --limit, or the calibration's verdict is bad.
 """
 
 from __future__ import annotations
@@ -14,22 +14,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--length", type=float, metavar="MM", help="a length across the line of sight")
     what.add_argument("--depth", type=float, metavar="MM", help="a length along the line of sight (rigs)")
-    what.add_argument("--plane", type=float, metavar="MM", help="how flat a plane with such sides looks (rigs)")
-    what.add_argument("--angle", type=float, metavar="MM", help="a right angle between edges so long (rigs)")
-    parser.add_argument("--distance", type=float, required=True, metavar="MM", help="from the first camera")
+    what.add_argument("--plane", type=float, metavar="MM", help="flatness of a square plane with such a side (rigs)")
+    what.add_argument("--angle", type=float, metavar="MM", help="a right angle between edges of this length (rigs)")
     parser.add_argument(
-        "--distance-sigma", type=float, default=0.0, metavar="MM", help="one camera: how well the distance is known"
+        "--distance", type=float, required=True, metavar="MM", help="distance of the object from the first camera"
     )
     parser.add_argument(
-        "--limit", type=float, metavar="X", help="largest error allowed, mm (deg for angles); exit 1 above"
+        "--distance-sigma", type=float, default=0.0, metavar="MM", help="one camera: standard deviation of the distance"
     )
-    parser.add_argument("--confidence", type=float, default=95.0, metavar="PERCENT", help="default: 95")
-    parser.add_argument("--sigma-px", type=float, metavar="PX", help="of the corners to be measured, per coordinate")
+    parser.add_argument("--limit", type=float, metavar="X", help="largest error allowed, mm (deg for angles)")
+    parser.add_argument(
+        "--confidence", type=float, default=95.0, metavar="PERCENT", help="confidence level of the bound (default: 95)"
+    )
+    parser.add_argument(
+        "--sigma-px",
+        type=float,
+        metavar="PX",
+        help="standard deviation of the image points to be measured, per coordinate",
+    )
     parser.add_argument("--cameras", nargs=2, metavar="NAME", help="two cameras of the rig (default: the first two)")
-    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write a page to look at")
-    parser.add_argument("--pdf", type=Path, metavar="FILE.pdf", help="write a sheet of A4 to sign")
+    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write an HTML report")
+    parser.add_argument("--pdf", type=Path, metavar="FILE.pdf", help="write a certificate to sign (A4)")
     parser.add_argument("--force", action="store_true", help="replace existing files")
-    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

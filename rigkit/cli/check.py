@@ -1,6 +1,6 @@
-"""`rigkit check`: fresh pictures against a calibration or a rig: still holds, or what moved and by how much.
+"""`rigkit check`: test a calibration or rig with one or a few new images: it still holds, or what changed by how much.
 
-Exit code 1 where it does not hold, 2 where it does, but an image could not be read.
+Exit code 1 if it does not hold, 2 if it holds, but an image could not be read.
 """
 
 from __future__ import annotations
@@ -19,28 +19,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="IMAGE|FOLDER",
-        help="a rig: a folder a camera, one with all of them, or images",
+        help="new images; of a rig one folder per camera, one folder with all, or images",
     )
     parser.add_argument(
-        "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="default: those of the calibration"
+        "--board",
+        action="append",
+        default=[],
+        metavar="CxRxMM|BOARD.toml",
+        help="board in the images (default: those of the calibration)",
     )
-    parser.add_argument("--scene", action="store_true", help="no board: matches of any textured scene (rigs)")
+    parser.add_argument(
+        "--scene", action="store_true", help="without a board: match features of any textured scene (rigs)"
+    )
     parser.add_argument(
         "--before",
         nargs="+",
         default=[],
         type=Path,
         metavar="IMAGE|FOLDER",
-        help="pictures of when it was trusted: tell what moved since, not what was wrong already",
+        help="reference images of when it held: report changes since then only",
     )
-    parser.add_argument("--length", type=float, metavar="MM", help="tell what it costs in a length so long,")
-    parser.add_argument("--distance", type=float, metavar="MM", help="at this distance")
-    parser.add_argument("--fix", type=Path, metavar="FILE.json", help="where it does not hold: write it corrected")
-    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write a page to look at")
-    parser.add_argument("--register", type=Path, metavar="FILE.jsonl", help="add the check to this register")
-    parser.add_argument("--temperature", type=float, metavar="C", help="when the pictures were taken, for the register")
+    parser.add_argument("--length", type=float, metavar="MM", help="also state the error of a length of MM")
+    parser.add_argument("--distance", type=float, metavar="MM", help="at this distance (with --length)")
+    parser.add_argument(
+        "--fix", type=Path, metavar="FILE.json", help="if it does not hold: write the corrected calibration"
+    )
+    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write an HTML report")
+    parser.add_argument(
+        "--register", type=Path, metavar="FILE.jsonl", help="append the check to this register (see rigkit history)"
+    )
+    parser.add_argument(
+        "--temperature", type=float, metavar="C", help="temperature during the capture, for the register"
+    )
     parser.add_argument("--force", action="store_true", help="replace existing files")
-    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -53,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
 
     length = length_of(args, "check")
     if args.temperature is not None and args.register is None:
-        raise InputError("check: --temperature goes into a register; give --register, too")
+        raise InputError("check: --temperature is only kept in a register; add --register FILE.jsonl")
     ensure_writable((args.fix, args.report), force=args.force, inputs=board_files(args.board))
     boards = tuple(board_of_words(words) for words in args.board)
     given = {"boards": boards, "length": length, "history": args.register, "temperature_c": args.temperature}
@@ -73,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         note(f"left out: {reason}")
     note_written(done.written)
     if args.fix is not None and args.fix not in done.written:
-        why = "the pictures were flipped" if check.flipped else "no change explains the pictures"
+        why = "the images were flipped" if check.flipped else "no change of camera or rig explains the images"
         note(f"{args.fix} not written: {'nothing changed' if check.holds else why}")
     if not check.holds:
         return ExitCode.CHECK_FAILED

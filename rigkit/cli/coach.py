@@ -1,4 +1,4 @@
-"""`rigkit coach`: a guided capture on a local page that says what to shoot next, takes it, and says when to stop."""
+"""`rigkit coach`: guide a capture live on a local web page: what to take next, and when there is enough."""
 
 from __future__ import annotations
 
@@ -13,34 +13,48 @@ MAX_CAMERAS = 8
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the session: new, or one to go on with")
+    parser.add_argument(
+        "folder", type=Path, metavar="FOLDER", help="folder of the session: a new one, or one to continue"
+    )
     parser.add_argument(
         "--board", action="append", required=True, metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)"
     )
-    parser.add_argument("--lens", type=float, default=70.0, metavar="DEG", help="rough field of view (default: 70)")
-    parser.add_argument("--goal", type=float, default=0.1, metavar="PX", help="rms error to reach (default: 0.1)")
-    add_reach_arguments(parser)
-    parser.add_argument("--length", type=float, metavar="MM", help="a length so long is to be measured,")
-    parser.add_argument("--distance", type=float, metavar="MM", help="at this distance,")
-    parser.add_argument("--goal-mm", type=float, metavar="MM", help="as well as this (standard error), beside --goal")
-    source = parser.add_mutually_exclusive_group()
-    source.add_argument(
-        "--cameras", type=int, default=1, metavar="N", help="of the browser, taken together (default: 1)"
-    )
-    each = "; once a camera for several taken together"
-    source.add_argument(
-        "--watch", type=Path, action="append", default=[], metavar="FOLDER", help=f"pictures appear in it{each}"
-    )
-    source.add_argument(
-        "--video", type=Path, action="append", default=[], metavar="FILE", help=f"the best frames of a recording{each}"
-    )
-    source.add_argument(
-        "--device", type=int, action="append", default=[], metavar="N", help=f"camera N of this machine{each}"
+    parser.add_argument(
+        "--lens", type=float, default=70.0, metavar="DEG", help="approximate horizontal field of view (default: 70)"
     )
     parser.add_argument(
-        "--lan", action="store_true", help="other machines in this network may use the page: unencrypted"
+        "--goal", type=float, default=0.1, metavar="PX", help="projection uncertainty to reach, rms (default: 0.1)"
     )
-    parser.add_argument("--port", type=int, default=8137, help="default: 8137")
+    add_reach_arguments(parser)
+    parser.add_argument("--length", type=float, metavar="MM", help="also reach --goal-mm for a length of MM")
+    parser.add_argument("--distance", type=float, metavar="MM", help="at this distance")
+    parser.add_argument("--goal-mm", type=float, metavar="MM", help="standard deviation to reach for that length")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument(
+        "--cameras", type=int, default=1, metavar="N", help="number of cameras of the browser (default: 1)"
+    )
+    each = "; repeat it for each camera of a rig"
+    source.add_argument(
+        "--watch",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FOLDER",
+        help=f"use images that another program writes into it{each}",
+    )
+    source.add_argument(
+        "--video",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help=f"choose the best frames of a recording{each}",
+    )
+    source.add_argument(
+        "--device", type=int, action="append", default=[], metavar="N", help=f"use camera N of this machine{each}"
+    )
+    parser.add_argument("--lan", action="store_true", help="serve the page to the local network, unencrypted")
+    parser.add_argument("--port", type=int, default=8137, help="port of the page (default: 8137)")
 
 
 def run(args: argparse.Namespace) -> int:

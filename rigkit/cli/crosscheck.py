@@ -1,6 +1,6 @@
-"""`rigkit crosscheck`: the same pairs through pycolmap, planar PnP and the other chain.
+"""`rigkit crosscheck`: compare pairs with pycolmap, planar PnP and the other chain (raw or rectified pixels).
 
-Exit code 1 where they disagree.
+Exit code 1 if they disagree.
 """
 
 from __future__ import annotations

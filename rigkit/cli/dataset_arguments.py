@@ -22,12 +22,15 @@ def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = F
     parser.add_argument("-p", "--pair", action="append", default=[], metavar="ID", help="only this pair (repeatable)")
     parser.add_argument("-o", "--output", metavar="DIR", help="folder for results (default: a new one, out/<data set>)")
     parser.add_argument("--force", action="store_true", help="replace existing results")
-    parser.add_argument("--recalibrate", action="store_true", help="calibrate from the images even if that was done")
+    parser.add_argument("--recalibrate", action="store_true", help="calibrate from the images again")
     parser.add_argument(
-        "--chain", choices=("raw", "rectified"), default="raw", help="captured pixels or perspective views"
+        "--chain",
+        choices=("raw", "rectified"),
+        default="raw",
+        help="work on raw pixels (default) or rectified perspective views",
     )
-    parser.add_argument("-j", "--jobs", type=int, metavar="N", help="processes (default: one a core)")
-    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    parser.add_argument("-j", "--jobs", type=int, metavar="N", help="number of processes (default: one per core)")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def add_direction_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +38,8 @@ def add_direction_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--directions",
         choices=("chord", "neighbours", "line", "patch"),
-        help="from the next corner, both neighbours, five corners of a line, or a patch of 5x5 (default)",
+        help="edge directions at a corner, from the next corner, both neighbours, a line of five or a patch of 5x5 "
+        "corners (default)",
     )
     parser.add_argument(
         "--det-scale",
@@ -49,8 +53,9 @@ def add_planes_argument(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument(
         "--planes",
         choices=("free", "coplanar", "lattice"),
-        help=f"{what}: each point by itself (free, unless the manifest says otherwise), the points of a board in one "
-        "plane, or on its known lattice; the latter two are fitted to both images at once",
+        help=f"{what}: free: every point triangulated by itself (default, unless the manifest says otherwise); "
+        "coplanar: all points of a board in one plane; lattice: on its known grid; the latter two are fitted to both "
+        "images",
     )
 
 

@@ -1,4 +1,4 @@
-"""`rigkit demo`: renders a small fisheye capture with known truth and runs the whole job on it; needs no data."""
+"""`rigkit demo`: render a small fisheye capture with ground truth and run every step on it; needs no data."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", default="rigkit-demo", metavar="DIR", help="new folder (default rigkit-demo)")
-    parser.add_argument("--seed", type=int, default=1, help="of the random scene (default 1)")
-    parser.add_argument("-j", "--jobs", type=int, metavar="N", help="processes (default: one a core)")
-    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the random scene (default 1)")
+    parser.add_argument("-j", "--jobs", type=int, metavar="N", help="number of processes (default: one per core)")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""`rigkit detect`: every board of every image, to a corners file and pictures."""
+"""`rigkit detect`: detect the corners of all boards in images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="CxRxMM|BOARD.toml",
-        help="a board that may be there, such as 9x6x25; repeat for more",
+        help="a board to look for, such as 9x6x25 (repeatable; default: chessboards of any size)",
     )
     parser.add_argument(
         "--camera",
@@ -27,15 +27,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the camera of all images: finds corners that were missed on the boards given, and places all more finely",
     )
     parser.add_argument("-o", "--output", metavar="CORNERS.csv", help="write the corners file")
-    parser.add_argument("--overlay", metavar="DIR", help="write a picture of each image with its corners")
+    parser.add_argument("--overlay", metavar="DIR", help="write each image with its corners drawn in")
     parser.add_argument(
         "--min-corners",
         type=int,
         default=12,
         metavar="N",
-        help="fewest corners of a board whose size is not given (12)",
+        help="without --board: fewest corners of a chessboard (default 12)",
     )
-    parser.add_argument("-j", "--jobs", type=int, metavar="N", help="processes (default: one a core)")
+    parser.add_argument("-j", "--jobs", type=int, metavar="N", help="number of processes (default: one per core)")
     parser.add_argument("--force", action="store_true", help="replace existing files")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

@@ -1,4 +1,4 @@
-"""`rigkit diff`: two calibrations over the image, two rigs, or boards on one mount, against their uncertainties."""
+"""`rigkit diff`: compare two calibrations, two rigs, or two mounts of boards, within their uncertainties."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from rigkit.core.errors import ExitCode
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("a", type=Path, metavar="A.json", help="calibration, rig, or boards on one mount")
-    parser.add_argument("b", type=Path, metavar="B.json", help="the same of another day")
-    parser.add_argument("-o", "--output", type=Path, metavar="MAP.png", help="map of the difference")
-    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write a page to look at")
+    parser.add_argument("a", type=Path, metavar="A.json", help="a calibration, a rig, or rigidly mounted boards")
+    parser.add_argument("b", type=Path, metavar="B.json", help="the other one, of the same camera, rig or boards")
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="MAP.png", help="write a map of the difference over the image"
+    )
+    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write an HTML report")
     parser.add_argument("--force", action="store_true", help="replace an existing map or page")
-    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

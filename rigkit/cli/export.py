@@ -1,4 +1,4 @@
-"""`rigkit export`: cameras to and from other tools' formats; clouds as PLY, LAS, npz or a COLMAP model."""
+"""`rigkit export`: convert cameras and rigs between formats; clouds to PLY, LAS, npz or a COLMAP model."""
 
 from __future__ import annotations
 
@@ -17,17 +17,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="file to write (a folder for a COLMAP model)")
     parser.add_argument(
-        "--to", choices=sorted({*CAMERA_FORMATS, *CLOUD_FORMATS}), help="format (default: by the ending)"
+        "--to", choices=sorted({*CAMERA_FORMATS, *CLOUD_FORMATS}), help="format of OUTPUT (default: by its ending)"
     )
     parser.add_argument(
-        "--from", dest="source_format", choices=READ_FORMATS, help="of a camera file (default: by its content)"
+        "--from",
+        dest="source_format",
+        choices=READ_FORMATS,
+        help="format of a camera file SOURCE (default: by its content)",
     )
-    parser.add_argument("--names", nargs="+", metavar="CAMERA", help="of a rig, in this order (default: all)")
-    parser.add_argument("--size", metavar="WxH", help="of the images, px, where a file does not say it")
+    parser.add_argument("--names", nargs="+", metavar="CAMERA", help="cameras of a rig, in this order (default: all)")
+    parser.add_argument("--size", metavar="WxH", help="image size, px, if SOURCE does not state it")
     parser.add_argument("-p", "--pair", help="pair of the data set whose cloud is exported")
     parser.add_argument("--method", default="3SDIR", help="affine estimator of the normals (default 3SDIR)")
     add_planes_argument(parser, "points and normals of a pair")
-    parser.add_argument("--float", action="store_true", help="of a PLY: 32-bit numbers (PCL reads no others)")
+    parser.add_argument("--float", action="store_true", help="write a PLY in single precision (PCL reads no other)")
     parser.add_argument("--force", action="store_true", help="replace existing files")
 
 
@@ -35,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     if args.source.is_dir() or args.source.suffix in (".toml", ".ply"):
         return _export_cloud(args)
     if args.float:
-        raise InputError("export: --float is of clouds; leave it out")
+        raise InputError("export: --float is for PLY clouds; leave it out")
     import numpy as np
 
     from rigkit.cli.console import options_of
@@ -48,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     options = options_of(ExportCameraOptions, args, **passed_on)
     if args.source_format is None and is_rig(args.source):
         rig = export_rig(args.source, options, tuple(args.names or ()))
-        print(f"{', '.join(map(str, rig.written))}: {rig.kind}, at most {rig.max_error_px:.4g} px from the rig given")
+        print(f"{', '.join(map(str, rig.written))}: {rig.kind}, at most {rig.max_error_px:.4g} px from the input")
         return 0
     done = export_camera(args.source, options)
     if done.kind == "rigkit":
@@ -56,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         width, height = done.camera.size_px
         print(f"{args.output}: {done.camera.model}, {width}x{height} px, sees {across:.1f} degrees across")
     else:
-        print(f"{args.output}: {done.kind}, at most {done.max_error_px:.4g} px from the camera given")
+        print(f"{args.output}: {done.kind}, at most {done.max_error_px:.4g} px from the input")
     return 0
 
 
@@ -74,7 +77,7 @@ def _export_cloud(args: argparse.Namespace) -> int:
     unused |= {"--float": args.float and kind != "ply"}
     unused |= {"--pair": is_ply and args.pair, "--planes": is_ply and args.planes}
     if (option := next((name for name, given in unused.items() if given), None)) is not None:
-        raise InputError(f"export: {option} says nothing of {'a PLY' if is_ply else 'a cloud'}; leave it out")
+        raise InputError(f"export: {option} does not apply to {'a PLY' if is_ply else 'a cloud'}; leave it out")
     options = options_of(ExportCloudOptions, args, kind=kind, single_precision=args.float)
     if is_ply:
         print(f"{args.output}: {len(export_ply(args.source, options))} points")

@@ -1,4 +1,4 @@
-"""`rigkit fetch`: public captures with measured truth: list them, or fetch some."""
+"""`rigkit fetch`: download public captures with measured ground truth, or list them."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from pathlib import Path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("names", nargs="*", metavar="NAME", help="of public captures; none: list them all")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="captures to download (default: list all)")
     parser.add_argument(
         "-o",
         "--output",
         type=Path,
         metavar="DIR",
-        help="folder of captures (default: RIGKIT_DATA, or this user's cache)",
+        help="where captures are kept (default: RIGKIT_DATA, or the user's cache)",
     )
     parser.add_argument(
         "--catalogue", type=Path, metavar="DIR", help="folder with their descriptions (default: datasets/public)"
     )
-    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

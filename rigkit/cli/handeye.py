@@ -1,4 +1,4 @@
-"""`rigkit handeye`: where a camera sits on a robot's hand, or before it, from its poses and images of a board."""
+"""`rigkit handeye`: hand-eye calibration: a camera on a robot hand, or fixed beside the robot, from board images."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "poses", metavar="POSES.csv", help="image (or timestamp_ns),x_mm,y_mm,z_mm,qx,qy,qz,qw: base_from_hand"
     )
-    parser.add_argument("images", metavar="IMAGES", nargs="+", help="images of the board, or their folder")
+    parser.add_argument("images", metavar="IMAGES", nargs="+", help="images of the board, or a folder of them")
     parser.add_argument("--camera", type=Path, required=True, metavar="CALIB", help="the camera's calibration")
     parser.add_argument("--board", type=Path, required=True, metavar="CxRxMM|BOARD.toml", help="such as 9x6x25")
-    parser.add_argument("--board-on-hand", action="store_true", help="the hand carries the board; the camera stands")
+    parser.add_argument("--board-on-hand", action="store_true", help="the hand carries the board, the camera is fixed")
     parser.add_argument("--inverse", action="store_true", help="the poses are hand_from_base")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE.json", help="write the result")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
-    parser.add_argument("--json", action="store_true", help="print the result for programs, as its file has it")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -42,10 +42,11 @@ def run(args: argparse.Namespace) -> int:
     print(pose_in_words(first, result.cam_from_mount, turns[0], moves[0]))
     print(pose_in_words(second, result.stand_from_board, turns[1], moves[1]))
     print(
-        f"{len(result.image_rms_px)} images, RMS {result.rms_px:.3f} px; boards as seen are "
+        f"{len(result.image_rms_px)} images, RMS {result.rms_px:.3f} px; medians over the images: "
         f"{np.median(result.translation_residuals_mm):.2f} mm and "
-        f"{np.degrees(np.median(result.rotation_residuals_rad)):.3f} deg (medians) from where the poses have them"
+        f"{np.degrees(np.median(result.rotation_residuals_rad)):.3f} deg between the board's pose in the image and by "
+        "the robot"
     )
     for image, mismatch in result.left_out.items():
-        print(f"left out: '{image}' turned otherwise than the robot, by {np.degrees(mismatch):.1f} degrees")
+        print(f"left out: '{image}' rotated differently from the robot, by {np.degrees(mismatch):.1f} degrees")
     return code

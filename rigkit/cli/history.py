@@ -1,4 +1,4 @@
-"""`rigkit history`: a register of checks over months as drift plots with control limits."""
+"""`rigkit history`: plot a register of checks as drift over time, with control limits."""
 
 from __future__ import annotations
 
@@ -9,13 +9,22 @@ from rigkit.core.errors import ExitCode, printable
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("register", type=Path, metavar="FILE.jsonl", help="as `rigkit check --register` wrote it")
-    parser.add_argument("--add", type=Path, metavar="NEW.json", help="a calibration made anew, added to the register,")
-    parser.add_argument("--to", type=Path, metavar="CALIBRATION.json", help="as a change of this one")
-    parser.add_argument("--temperature", type=float, metavar="C", help="of the calibration added")
-    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write a page to look at")
+    parser.add_argument(
+        "register", type=Path, metavar="FILE.jsonl", help="register written by `rigkit check --register`"
+    )
+    parser.add_argument(
+        "--add",
+        type=Path,
+        metavar="NEW.json",
+        help="append the change between the calibration CALIBRATION.json and this newer one",
+    )
+    parser.add_argument(
+        "--to", type=Path, metavar="CALIBRATION.json", help="the calibration that --add is compared with"
+    )
+    parser.add_argument("--temperature", type=float, metavar="C", help="temperature during the capture for --add")
+    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write an HTML report")
     parser.add_argument("--force", action="store_true", help="replace an existing page")
-    parser.add_argument("--json", action="store_true", help="print the entries for programs")
+    parser.add_argument("--json", action="store_true", help="print the entries as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -26,12 +35,12 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.checks.history import add_to_history, show_history
 
     if (args.add is None) != (args.to is None):
-        raise InputError("history: --add NEW.json needs --to CALIBRATION.json, the one that it is compared with")
+        raise InputError("history: --add NEW.json needs --to CALIBRATION.json, the calibration to compare it with")
     if args.temperature is not None and args.add is None:
-        raise InputError("history: --temperature is of a calibration that is added; give --add and --to, too")
+        raise InputError("history: --temperature belongs to --add and --to; give these, too")
     if args.add is not None:
         add_to_history(args.register, args.add, args.to, temperature_c=args.temperature)
-        note(f"{args.register} has one entry more")
+        note(f"1 entry appended to {args.register}")
     entries, written = show_history(args.register, report=args.report, force=args.force)
     if args.json:
         print_json([asdict(entry) for entry in entries])

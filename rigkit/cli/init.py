@@ -1,4 +1,4 @@
-"""`rigkit init`: a manifest or a session from a folder of images, asking only for what images cannot tell."""
+"""`rigkit init`: write a data set manifest or a session for a folder of images, asking for what images cannot show."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--calibration",
         **repeatable,
         metavar="[CAMERA=]FILE",
-        help="calibration of the camera; of two, give that of the first image, then that of the second; of more, name "
-        "each; a rig.json stands for those beside it (repeatable)",
+        help="calibration of the camera (repeatable: two are those of the first and of the second image of each pair; "
+        "name three and more); a rig.json stands for the calibrations beside it",
     )
     parser.add_argument(
         "--cameras",
@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pose-type",
         **repeatable,
         metavar="[PAIRS=]TYPE",
-        help=f"{', '.join(POSE_TYPES)}: of all pairs, or of those whose names match (repeatable; the first that "
-        "matches counts)",
+        help=f"{', '.join(POSE_TYPES)}: of all pairs, or of those whose names match (repeatable; the first "
+        "match counts)",
     )
     parser.add_argument(
         "--baseline-mm",
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         **repeatable,
         metavar="[PAIRS=]DEG+-SIGMA",
         help="measured angle between every two boards, such as 90+-0.3, of all pairs or of those whose names match "
-        "(repeatable; the first that matches counts)",
+        "(repeatable; the first match counts)",
     )
     parser.add_argument("-o", "--output", type=Path, help="default: dataset.toml (session.toml) in the folder")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
@@ -58,11 +58,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--board",
         **repeatable,
         metavar="CxRxMM|BOARD.toml",
-        help="such as 9x6x25 (repeatable; of a manifest instead of --square-mm)",
+        help="board in the images, such as 9x6x25 (repeatable; instead of --square-mm)",
     )
     session = parser.add_argument_group("sessions")
-    session.add_argument("--session", action="store_true", help="a session for rigkit calibrate instead")
-    session.add_argument("--model", help="camera model (default: auto, the one that predicts best)")
+    session.add_argument(
+        "--session", action="store_true", help="write a session for rigkit calibrate instead of a manifest"
+    )
+    session.add_argument("--model", help="camera model (default: auto, the lowest held-out error)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -85,7 +87,7 @@ def _session(args: argparse.Namespace) -> int:
         or args.baseline_mm
         or args.angle_deg
     ):
-        raise InputError("init --session: takes --board and --model; the other options are of manifests")
+        raise InputError("init --session: only --board and --model apply; leave the other options out")
     path = args.output or args.folder / "session.toml"
     made = session_of_folders([args.folder], args.board, path, model=args.model or "auto")
     write_together(dict(made.files), force=args.force)

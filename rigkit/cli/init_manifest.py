@@ -29,9 +29,9 @@ def run_manifest(args: argparse.Namespace) -> int:
     from rigkit.workflows.capture.new_manifest import find_pairs, name_of_folder, write_manifest
 
     if args.model:
-        raise InputError("init: --model goes with --session only; leave it out")
+        raise InputError("init: --model needs --session; add that, or leave it out")
     if args.board and args.square_mm is not None:
-        raise InputError("init: --board says how large squares are; leave --square-mm out")
+        raise InputError("init: --board states the square size already; leave --square-mm out")
     declared = parse_boards(args.board)
     if args.square_mm is not None:
         parse_length("--square-mm", args.square_mm)

@@ -23,8 +23,8 @@ LINE = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} [A-Z]+ rigkit")
 def add_log_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the log arguments of every verb."""
     group = parser.add_argument_group("log")
-    group.add_argument("-v", "--verbose", action="store_true", help="say on stderr what is being done, and with what")
-    group.add_argument("--log-file", type=Path, metavar="FILE", help="append all of that, with times, to a file")
+    group.add_argument("-v", "--verbose", action="store_true", help="log each step to stderr")
+    group.add_argument("--log-file", type=Path, metavar="FILE", help="append this log, with times, to FILE")
 
 
 def _appending(path: Path) -> logging.Handler:

@@ -22,28 +22,28 @@ from rigkit.cli.surroundings import SURROUNDINGS, Terminated, open_streams, say,
 from rigkit.core.errors import ExitCode, InputError, RigkitError, interruption, printable
 
 VERBS: dict[str, str] = {
-    "demo": "render a small capture and run everything on it",
-    "board": "a board to print, true to scale",
-    "calibrate": "a camera, or several on one mount, from images of boards",
-    "rectify": "perspective, panoramic or stereo images from any camera's",
-    "export": "cameras, rigs and clouds in other tools' formats, and back",
-    "plan": "which pictures to take next, and what they will bring",
-    "coach": "a guided capture on a local page",
-    "diff": "two calibrations, rigs or mounts: the same or not",
-    "check": "fresh pictures: does a calibration still hold, or what moved",
-    "history": "checks over months as drift plots with control limits",
-    "certify": "how wrong a length, depth, plane or angle measured may be",
-    "init": "start a manifest to validate, or a session, from a folder",
-    "validate": "captures beside what a person measured of them",
-    "reconstruct": "oriented clouds of pairs with boards, or of any scene",
-    "mesh": "a surface through an oriented cloud",
-    "crosscheck": "pairs through COLMAP and other independent methods",
-    "pose": "where a camera is against a board that is laid down",
-    "handeye": "where a camera sits on a robot",
-    "detect": "corners of every board in images",
-    "simulate": "a synthetic study: sweeps over noise, box plots, tables",
-    "fetch": "public captures with measured truth",
-    "schema": "every key of every file, as JSON Schema or a table",
+    "demo": "render a small capture and run every step on it",
+    "board": "print a calibration target, or identify the one that images show",
+    "calibrate": "calibrate a camera, or a rig, from images of boards",
+    "rectify": "undistort, reproject to a panorama, or rectify a stereo pair",
+    "export": "convert cameras, rigs and clouds to and from other formats",
+    "plan": "suggest the next images to take, and what they will gain",
+    "coach": "guide a capture live, on a local web page",
+    "diff": "compare two calibrations or rigs within their uncertainties",
+    "check": "test a calibration with new images: it holds, or what changed",
+    "history": "plot checks over months as drift with control limits",
+    "certify": "bound the error of a length, depth, plane or angle",
+    "init": "start a data set manifest, or a session, from a folder",
+    "validate": "validate reconstructions against measured ground truth",
+    "reconstruct": "reconstruct oriented point clouds, of boards or any scene",
+    "mesh": "mesh an oriented point cloud",
+    "crosscheck": "compare pairs with COLMAP and other independent methods",
+    "pose": "pose of a camera relative to one board",
+    "handeye": "hand-eye calibration: pose of a camera on a robot",
+    "detect": "detect the corners of all boards in images",
+    "simulate": "run a synthetic study: noise sweeps, box plots, tables",
+    "fetch": "download public captures with measured ground truth",
+    "schema": "list the keys of every file format, as JSON Schema or a table",
 }
 """Verb -> summary; `rigkit VERB --help` begins with the docstring of its module."""
 
@@ -82,7 +82,8 @@ def build_parser(verb: str | None) -> argparse.ArgumentParser:
         prog="rigkit",
         usage="rigkit [-h] [--version] VERB ...",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Calibrate lab cameras, reconstruct oriented point clouds, validate them against measured truth.",
+        description="Calibrate cameras and rigs, reconstruct oriented point clouds, validate both against ground "
+        "truth.",
         epilog=f"verbs:\n{listed}\n\n{FIRST_STEPS}",
     )
     parser.add_argument("--version", action=_Version, help="show version, compiled kernels and platform, and exit")
@@ -113,11 +114,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with signals_interrupt():
             if not arguments:
-                say("no verb given; this is what there is", before=build_parser(None).format_help())
+                say("no verb given; choose one of the list above", before=build_parser(None).format_help())
                 return ExitCode.BAD_INPUT
             if "" in arguments:
                 # As a path it would be the current folder.
-                raise InputError("an argument is empty: '', as a variable of the shell that is not set; give a value")
+                raise InputError("an argument is empty (''), perhaps an unset shell variable; give a value")
             args = build_parser(verb).parse_args(arguments)
             with logging_to(verbose=args.verbose, log_file=args.log_file):
                 return logged_run(args)

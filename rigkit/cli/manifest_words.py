@@ -34,7 +34,7 @@ def require_answers(args: argparse.Namespace) -> None:
     missing = {option: question for option, (question, value) in needed.items() if value is None}
     if missing and (sys.stdin is None or not sys.stdin.isatty()):
         message = "; ".join(f"the {question}: {option}" for option, question in missing.items())
-        raise InputError(f"init: images cannot tell everything; say {message}")
+        raise InputError(f"init: images do not show everything; give {message}")
 
 
 def parse_calibrations(declared: Sequence[str], folder: Path) -> dict[str, str]:
@@ -108,7 +108,7 @@ def cameras_of(
         typical = (known[0], known[-1]) if len(known) <= len(TWO_CAMERAS) else None
         found_cameras = next((cameras for pattern, cameras in patterns if fnmatch(pair, pattern)), typical)
         if found_cameras is None:
-            raise InputError(f"init: nothing says which cameras took pair '{pair}'; add --cameras {pair}=ONE,TWO")
+            raise InputError(f"init: unknown which cameras took pair '{pair}'; add --cameras {pair}=ONE,TWO")
         out[pair] = found_cameras
     return out
 
@@ -183,7 +183,7 @@ def ask(question: str, choices: tuple[str, ...] = ()) -> str:
         print(f"{question}{hint}: ", end="", file=sys.stderr, flush=True)
         line = sys.stdin.readline()
         if not line:
-            raise InputError(f"init: nobody says the {question}; give it as an option, see rigkit init --help")
+            raise InputError(f"init: the {question} is missing; give it as an option, see rigkit init --help")
         answer = line.strip()
         if answer and (not choices or answer in choices):
             return answer

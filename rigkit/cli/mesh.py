@@ -1,4 +1,4 @@
-"""`rigkit mesh`: the screened Poisson surface of an oriented cloud."""
+"""`rigkit mesh`: mesh an oriented point cloud by screened Poisson reconstruction."""
 
 from __future__ import annotations
 
@@ -10,20 +10,29 @@ from rigkit.core.errors import ExitCode
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("cloud", type=Path, metavar="CLOUD.ply", help="as `rigkit reconstruct` writes it, or any other")
-    parser.add_argument("-o", "--output", type=Path, metavar="MESH.ply", help="default: CLOUD-mesh.ply beside it")
-    parser.add_argument("--depth", type=int, default=9, help="of the octree: 2^N cells a side (default 9)")
     parser.add_argument(
-        "--cut", type=float, default=0.02, metavar="SHARE", help="of the surface, where points are fewest (default .02)"
+        "cloud",
+        type=Path,
+        metavar="CLOUD.ply",
+        help="point cloud with normals, of `rigkit reconstruct` or any other program",
+    )
+    parser.add_argument("-o", "--output", type=Path, metavar="MESH.ply", help="default: CLOUD-mesh.ply beside it")
+    parser.add_argument("--depth", type=int, default=9, help="depth of the octree: 2^DEPTH cells per side (default 9)")
+    parser.add_argument(
+        "--cut",
+        type=float,
+        default=0.02,
+        metavar="SHARE",
+        help="part of the surface to cut off where points are sparsest (default .02)",
     )
     parser.add_argument(
         "--one-view",
         action=argparse.BooleanOptionalAction,
-        help="all was seen from the origin, as from a pair of images: nothing hangs between near and far (default: as "
-        "the file's header says)",
+        help="all points were seen from the origin: build no surface between foreground and background (default: as "
+        "the header of CLOUD.ply says)",
     )
     parser.add_argument("--force", action="store_true", help="replace an existing file")
-    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""`rigkit plan`: which pictures to take next, or what a lens, a board and so many pictures will reach."""
+"""`rigkit plan`: suggest the next images to take, or predict the accuracy of a lens, a board and a number of images."""
 
 from __future__ import annotations
 
@@ -23,24 +23,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         type=Path,
         metavar="CALIBRATION|RIG.json|SESSION.toml",
-        help="what there is so far; or give --lens",
+        help="calibration or session to improve; or give --lens",
     )
-    parser.add_argument("-n", "--views", type=int, metavar="N", help="pictures to plan (default: 3; with --lens 12)")
     parser.add_argument(
-        "--check", action="store_true", help="pictures to check it with: those that would tell changes best"
+        "-n", "--views", type=int, metavar="N", help="number of images to plan (default: 3; with --lens 12)"
     )
-    parser.add_argument("--length", type=float, metavar="MM", help="what matters is a length so long,")
-    parser.add_argument("--distance", type=float, metavar="MM", help="at this distance (default: the whole projection)")
+    parser.add_argument("--check", action="store_true", help="plan images for `rigkit check` that reveal changes best")
+    parser.add_argument("--length", type=float, metavar="MM", help="optimise the measurement of a length of MM")
+    parser.add_argument(
+        "--distance", type=float, metavar="MM", help="at this distance (default: the projection over the image)"
+    )
     add_reach_arguments(parser)
-    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write a page to look at")
+    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write an HTML report")
     parser.add_argument("--force", action="store_true", help="replace an existing page")
-    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
     lens = parser.add_argument_group("before there is a calibration")
     lens.add_argument("--lens", type=float, metavar="DEG", help="field of view across the width of the image")
-    lens.add_argument("--size", metavar="WxH", help="of the images, px")
-    lens.add_argument("--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="9x6x25 (repeatable)")
-    lens.add_argument("--model", help="camera model (default: the usual one for such a lens)")
-    lens.add_argument("--sigma-px", type=float, metavar="PX", help="scatter of a corner per coordinate (default: 0.15)")
+    lens.add_argument("--size", metavar="WxH", help="image size, px")
+    lens.add_argument(
+        "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="board, such as 9x6x25 (repeatable)"
+    )
+    lens.add_argument("--model", help="camera model (default: chosen by the field of view)")
+    lens.add_argument(
+        "--sigma-px", type=float, metavar="PX", help="standard deviation of a corner per coordinate (default: 0.15)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -54,13 +60,12 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(plan_to_dict(plan) | {"page": plan_facts(plan, done.found).to_dict()})
     else:
-        print(plan_lead(plan, "then"))
+        print(plan_lead(plan))
         print("\n".join(f"  {line}" for line in plan_words(plan)))
         if done.found:
             print(tables_to_text(done.found))
         elif args.lens is None:
-            more = counted(len(plan.views), "more picture")
-            print(f"{more} would bring {100.0 * plan.gain:.0f} %")
+            print(f"{counted(len(plan.views), 'more image')}: {100.0 * plan.gain:.0f} % less error")
     note_written(done.written)
     return ExitCode.WELL
 
@@ -74,11 +79,13 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
     if (args.source is None) == (args.lens is None):
         raise InputError("plan: give a calibration or a session, or describe a lens with --lens, --size and --board")
     if args.check and (args.lens is not None or args.length is not None):
-        raise InputError("plan: --check is about a calibration or a rig; leave --lens and --length away")
+        raise InputError("plan: --check needs a calibration or a rig; leave out --lens and --length")
     if args.lens is None:
         given = [name for name in ("size", "board", "model", "sigma_px") if getattr(args, name)]
         if given:
-            raise InputError(f"plan: --{given[0].replace('_', '-')} goes with --lens; '{args.source}' says it itself")
+            raise InputError(
+                f"plan: --{given[0].replace('_', '-')} needs --lens; '{args.source}' states it itself, leave it out"
+            )
         return plan_session(args.source, _options(args, 3), progress=progress_on_stderr())
     if not (args.size and args.board):
         raise InputError("plan: --lens needs --size 1280x960 and --board 9x6x25")

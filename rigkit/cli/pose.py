@@ -1,4 +1,4 @@
-"""`rigkit pose`: where a camera is against a board that is laid down."""
+"""`rigkit pose`: pose of a camera relative to one board in its image."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("image", metavar="IMAGE", help="an image that shows the board")
     parser.add_argument("--camera", required=True, metavar="CALIB", help="the camera's calibration")
     parser.add_argument("--board", required=True, metavar="CxRxMM|BOARD.toml", help="such as 9x6x25")
-    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -27,8 +27,11 @@ def run(args: argparse.Namespace) -> int:
         return 0
     centre = pose.inverse().translation_mm
     print(pose_in_words("cam_from_board", pose, sigmas[:3], sigmas[3:]))
-    print(f"centre of the camera on the board: {centre[0]:.2f}, {centre[1]:.2f}, {centre[2]:.2f} mm")
-    print(f"RMS {placed.rms_px:.3f} px" + ("; the board tilted the other way fits too" if placed.ambiguous else ""))
+    print(f"camera centre in the board's frame: {centre[0]:.2f}, {centre[1]:.2f}, {centre[2]:.2f} mm")
+    print(
+        f"RMS {placed.rms_px:.3f} px"
+        + ("; ambiguous: the board tilted the other way fits as well" if placed.ambiguous else "")
+    )
     if not placed.lens_known:
-        print("the lens counts as exact: its file does not say how sure it is")
+        print("the camera file has no covariance: the intrinsics are treated as exact")
     return 0

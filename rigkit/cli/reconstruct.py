@@ -1,4 +1,4 @@
-"""`rigkit reconstruct`: oriented clouds of every pair of a data set, or of one scene; needs no measured truth."""
+"""`rigkit reconstruct`: oriented point clouds of the pairs of a data set, or of one scene; needs no ground truth."""
 
 from __future__ import annotations
 
@@ -36,9 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     if is_scene(args):
         if args.planes is not None:
-            raise InputError("reconstruct: --planes is about boards, and a scene has none")
+            raise InputError("reconstruct: --planes needs boards, and a scene has none; leave it out")
         if direction_options(args):
-            raise InputError("reconstruct: --directions and --det-scale are about boards, and a scene has none")
+            raise InputError(
+                "reconstruct: --directions and --det-scale need boards, and a scene has none; leave them out"
+            )
         return run_scene(args)
     from rigkit.io.manifests.manifest import load_dataset
     from rigkit.report.tables import measured_words
@@ -60,8 +62,8 @@ def run(args: argparse.Namespace) -> int:
         for r in results:
             print(
                 f"{common['output'] / r['ply']}: {r['points']} points, {len(r['boards'])} boards, baseline "
-                f"{measured_words(r['baseline_mm'], r['baseline_sigma_mm'], 3)} mm, "
-                f"Sampson rms {r['sampson_rms_px']:.3f} px, {r['pose_type']}"
+                f"{measured_words(r['baseline_mm'], r['baseline_sigma_mm'], 3)} mm, Sampson rms "
+                f"{r['sampson_rms_px']:.3f} px, {r['pose_type']}"
             )
     return exit_code_of(done.failures, ExitCode.WELL)
 

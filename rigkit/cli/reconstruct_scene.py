@@ -19,32 +19,48 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="IMAGE",
-        help="match affine features of these two images; of three and more, of a --rig, fuse the clouds of near pairs",
+        help="match affine features of two images; with --rig three or more, whose pairwise clouds are fused",
     )
     group.add_argument(
         "--correspondences",
         type=Path,
         metavar="FILE",
         help="CSV, NPZ or AffineExtractor text with affinities or directions, a matcher's NPZ or COLMAP's database; "
-        "with --images these align bare points, the cloud grows and has colours",
+        "with --images affinities are estimated for points that have none, and the cloud is dense and coloured",
     )
     group.add_argument("--camera", type=Path, metavar="CALIB", help="calibration of the camera (of image A)")
-    group.add_argument("--camera2", type=Path, metavar="CALIB", help="the same of image B (default: that of image A)")
     group.add_argument(
-        "--rig", type=Path, metavar="RIG", help="the rig that took both images, instead of --camera; its pose is kept"
+        "--camera2", type=Path, metavar="CALIB", help="calibration of image B (default: that of image A)"
     )
-    group.add_argument("--names", nargs="+", metavar="CAMERA", help="cameras of the images (default: the rig's first)")
     group.add_argument(
-        "--pose", type=Path, metavar="FILE", help="measured cam2_from_cam1, 3x4 or 4x4 numbers, mm; it is kept"
+        "--rig",
+        type=Path,
+        metavar="RIG",
+        help="the rig that took the images, instead of --camera; its extrinsics are kept fixed",
     )
-    group.add_argument("--baseline-mm", type=float, metavar="MM", help="measured baseline (default: it is the unit)")
     group.add_argument(
-        "--pose-type", choices=tuple(map(str, PoseType)), help="of the views (default general, or a rectified pair's)"
+        "--names",
+        nargs="+",
+        metavar="CAMERA",
+        help="which cameras of the rig took the images, in order (default: the first ones)",
     )
-    group.add_argument("--sparse", action="store_true", help="only the matched features; do not grow a dense cloud")
+    group.add_argument(
+        "--pose", type=Path, metavar="FILE", help="known cam2_from_cam1, 3x4 or 4x4 numbers, mm; kept fixed"
+    )
+    group.add_argument(
+        "--baseline-mm", type=float, metavar="MM", help="measured baseline (default: lengths are in baselines)"
+    )
+    group.add_argument(
+        "--pose-type",
+        choices=tuple(map(str, PoseType)),
+        help="motion between the images (default: general, or that of a rectified pair)",
+    )
+    group.add_argument("--sparse", action="store_true", help="keep matched features only; no dense cloud")
     group.add_argument("--float", action="store_true", help="write the cloud in single precision")
-    group.add_argument("--confidence", action="store_true", help="the length of a normal says how sure it is")
-    group.add_argument("--level-sigma-deg", type=float, metavar="DEG", help="how well that pose type holds")
+    group.add_argument("--confidence", action="store_true", help="scale normals by their confidence")
+    group.add_argument(
+        "--level-sigma-deg", type=float, metavar="DEG", help="standard deviation of the angles that the pose type fixes"
+    )
 
 
 def is_scene(args: argparse.Namespace) -> bool:
@@ -75,8 +91,8 @@ def run_scene(args: argparse.Namespace) -> int:
     done = reconstruct_views(options, progress=progress_on_stderr())
     scene, r = done.scene, done.scene.reconstruction
     summary = (
-        f"{len(r.cloud)} points ({scene.unit}) of {len(done.correspondences)} correspondences, "
-        f"{scene.inliers.sum()} of which agree, Sampson rms {r.sampson_rms_px:.3f} px, {r.pose_type}"
+        f"{len(r.cloud)} points ({scene.unit}) of {len(done.correspondences)} correspondences, {scene.inliers.sum()} "
+        f"inliers, Sampson rms {r.sampson_rms_px:.3f} px, {r.pose_type}"
     )
     return _show(name, out / CLOUD, summary, done.figures(), json=args.json)
 
@@ -108,10 +124,12 @@ def _run_rig(args: argparse.Namespace) -> int:
     for option in ("correspondences", "camera", "camera2", "pose", "baseline_mm", "pose_type", "sparse"):
         if getattr(args, option):
             word = option.replace("_", "-")
-            raise InputError(f"reconstruct: --{word} is for two images; with three and more the rig's file says it all")
+            raise InputError(
+                f"reconstruct: --{word} applies to two images only; leave it out, the rig's file states it"
+            )
     name = args.rig.stem
     out = results_folder(args, name)
     options = options_of(RigSceneOptions, args, output=out, **_written(args))
     done = reconstruct_rig_views(options, progress=progress_on_stderr())
-    summary = f"{len(done.cloud)} points (mm) of {len(done.pairs)} pairs, {done.merged} seen by more than one of them"
+    summary = f"{len(done.cloud)} points (mm) of {len(done.pairs)} pairs, {done.merged} seen in more than one of them"
     return _show(name, out / CLOUD, summary, done.figures(), json=args.json)

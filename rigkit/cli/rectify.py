@@ -1,4 +1,4 @@
-"""`rigkit rectify`: a perspective, cylindrical or equirectangular image from any camera's image, or a stereo pair."""
+"""`rigkit rectify`: undistort images to perspective, cylindrical or equirectangular views, or rectify a stereo pair."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from rigkit.core.errors import ExitCode, InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("image", metavar="IMAGE|FOLDER|VIDEO", help="image as captured, a folder of images, or a video")
     parser.add_argument(
-        "image", metavar="IMAGE|FOLDER|VIDEO", help="as the camera took it, a folder of them, or a video"
-    )
-    parser.add_argument(
-        "image2", metavar="IMAGE2|FOLDER2|VIDEO2", nargs="?", help="taken at once by another camera of the rig: stereo"
+        "image2",
+        metavar="IMAGE2|FOLDER2|VIDEO2",
+        nargs="?",
+        help="taken at the same time by another camera of the rig: rectifies a stereo pair",
     )
     parser.add_argument("--camera", metavar="CALIB", help="the camera's calibration.json")
     parser.add_argument(
@@ -23,14 +24,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--output",
         required=True,
         metavar="OUT",
-        help="image to write (.png, .tif, .jpg), or folder to write into",
+        help="image (.png, .tif, .jpg) or folder to write",
     )
-    parser.add_argument("--maps", type=Path, metavar="FILE.npz", help="also the geometry: K, P, Q, maps for cv2.remap")
+    parser.add_argument("--maps", type=Path, metavar="FILE.npz", help="also write K, P, Q and maps for cv2.remap")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
-    parser.add_argument("--json", action="store_true", help="the result for programs, on stdout")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
     stereo = parser.add_argument_group(
         "stereo",
-        "writes OUT/ONE/... and OUT/TWO/... (OUT-1 and OUT-2 of an image's name), in which a point has the same row",
+        "writes OUT/ONE/... and OUT/TWO/... (OUT-1 and OUT-2 of an image's name), whose corresponding points are in "
+        "the same row",
     )
     stereo.add_argument("--rig", metavar="RIG", help="the rig's file, instead of --camera")
     stereo.add_argument(
@@ -38,19 +40,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     view = parser.add_argument_group("view")
     view.add_argument("--projection", choices=("perspective", "cylindrical", "equirectangular"), default="perspective")
-    view.add_argument("--hfov-deg", type=float, metavar="DEG", help="from the left edge to the right (default: suits)")
+    view.add_argument(
+        "--hfov-deg", type=float, metavar="DEG", help="horizontal field of view (default: that of the camera)"
+    )
     view.add_argument("--yaw-deg", type=float, default=0.0, metavar="DEG", help="look to the right")
     view.add_argument("--pitch-deg", type=float, default=0.0, metavar="DEG", help="look up")
     view.add_argument("--roll-deg", type=float, default=0.0, metavar="DEG", help="turn the view clockwise")
-    view.add_argument("--size", metavar="WxH", help="of the result, px (default: keeps the source's resolution)")
     view.add_argument(
-        "--crop", action="store_true", help="cut to the largest rectangle that is seen whole (by both of a pair)"
+        "--size", metavar="WxH", help="image size of the result, px (default: keeps the source's resolution)"
+    )
+    view.add_argument(
+        "--crop",
+        action="store_true",
+        help="crop to the largest rectangle without empty pixels (in both images of a pair)",
     )
     view.add_argument(
         "--interpolation",
         choices=("spline", "lanczos", "linear", "nearest"),
         default="spline",
-        help="spline (default) keeps positions to a thousandth of a pixel, linear is quick",
+        help="spline (default) shifts points by less than 0.001 px; linear is fast",
     )
 
 

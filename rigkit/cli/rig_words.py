@@ -89,19 +89,19 @@ def describe(rig: RigCalibration, checks: Sequence[Check]) -> str:
     count = len(rig.cameras)
     lines = [
         f"{count} camera{'s' if count > 1 else ''}, {rig.shared_count} poses shared by several views: {held}, training "
-        f"RMS {rig.rms_px:.4f} px; frames scatter {rig.overdispersion:.2f} times as independent corners would"
+        f"RMS {rig.rms_px:.4f} px; overdispersion of frames {rig.overdispersion:.2f}"
     ]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         held = "not available" if alone.heldout_rms_px is None else f"{alone.heldout_rms_px:.4f} px"
         where = length_words(*camera.cam_from_rig.inverse().translation_mm.tolist(), decimals=2)
         turned = np.degrees(np.linalg.norm(log_so3(camera.cam_from_rig.rotation)))
         lines.append(
-            f"{camera.name}: {camera.camera.model}, alone held-out RMS {held}, training RMS {alone.rms_px:.4f}; in the "
-            f"rig {camera.rms_px:.4f} px; at ({where}) mm, turned by {turned:.3f} deg"
+            f"{camera.name}: {camera.camera.model}, calibrated alone held-out RMS {held}, training RMS "
+            f"{alone.rms_px:.4f}; in the rig {camera.rms_px:.4f} px; centre ({where}) mm, rotation {turned:.3f} deg"
         )
     lines += [f"baseline {a} to {b}: {measured_words(value, sigma, 3)} mm" for a, b, value, sigma in baselines(rig)]
     lines += [
-        f"a point seen by {a} appears in {b} within {middle:.3f} px (one standard deviation; {worst:.3f} at worst)"
+        f"points transferred from {a} to {b}: ±{middle:.3f} px (at worst ±{worst:.3f} px; one standard deviation)"
         for a, b, middle, worst in transfers(rig)
     ]
     lines += [f"angle {a} to {b}: {measured_words(value, sigma, 3)} deg" for a, b, value, sigma in angles(rig)]

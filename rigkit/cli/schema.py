@@ -1,4 +1,4 @@
-"""`rigkit schema`: the keys of every file, as JSON Schema for editors and programs, or as a table."""
+"""`rigkit schema`: list the keys of every file format, as JSON Schema for editors and programs, or as a table."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from rigkit.core.errors import ExitCode
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", nargs="?", metavar="NAME", help="of the file; without one all are listed")
-    parser.add_argument("--keys", action="store_true", help="as a table of keys instead of JSON")
+    parser.add_argument("name", nargs="?", metavar="NAME", help="file format (default: list all)")
+    parser.add_argument("--keys", action="store_true", help="print a table of keys instead of JSON Schema")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE.json", help="file to write")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
 

@@ -1,4 +1,4 @@
-"""`rigkit simulate`: synthetic studies, from a study file to tables and box plots."""
+"""`rigkit simulate`: run synthetic studies: from a study file to tables and box plots."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from pathlib import Path
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("studies", nargs="+", metavar="STUDY.toml", help="one or more study files")
     parser.add_argument("-o", "--output", default="out/studies", metavar="FOLDER", help="default: out/studies")
-    parser.add_argument("--trials", type=int, metavar="N", help="instead of the number in the file")
-    parser.add_argument("-j", "--jobs", type=int, default=1, metavar="N", help="processes; the numbers stay the same")
+    parser.add_argument("--trials", type=int, metavar="N", help="number of trials (default: that of the file)")
+    parser.add_argument(
+        "-j", "--jobs", type=int, default=1, metavar="N", help="number of processes; does not change the results"
+    )
     parser.add_argument("--dask", metavar="ADDRESS", help="a Dask scheduler to use instead of processes")
-    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png", help="of the figures")
+    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png", help="format of the figures")
     parser.add_argument("--json", action="store_true", help="print the tables as JSON instead of Markdown")
     parser.add_argument("--force", action="store_true", help="replace existing files")
 

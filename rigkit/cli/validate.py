@@ -1,4 +1,4 @@
-"""`rigkit validate`: every pair and every estimator against what a person measured: a page, tables, clouds.
+"""`rigkit validate`: validate reconstructed pairs against measured ground truth: report, tables, clouds.
 
 Exit code 1 if a check fails.
 """
@@ -26,25 +26,25 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_dataset_arguments(parser, several=True)
     parser.add_argument(
-        "--cluster", metavar="ADDRESS", help="of several data sets: a Dask scheduler to use instead of processes"
+        "--cluster", metavar="ADDRESS", help="with several data sets: Dask scheduler to use instead of processes"
     )
     add_direction_arguments(parser)
-    add_planes_argument(parser, "planes that angles, normals and the baseline are judged by")
+    add_planes_argument(parser, "planes used to check angles, normals and the baseline")
     parser.add_argument("--no-pictures", action="store_true", help="leave out PNG pictures and the HTML report")
     parser.add_argument(
-        "--figures", choices=("png", "pdf"), default="png", help="pdf: the pictures for a paper as well (vectors)"
+        "--figures", choices=("png", "pdf"), default="png", help="pdf: also write the pictures as vector graphics"
     )
     parser.add_argument("--no-crosscheck", action="store_true", help="leave out the comparison with pycolmap")
     parser.add_argument(
         "--paper",
         action="store_true",
-        help="the paper's own pipeline instead (chords, equal weights, linear solvers, no refinement): its tables "
-        "beside the printed ones, and its claims judged",
+        help="run the paper's own pipeline instead (chords, equal weights, linear solvers, no refinement): its tables "
+        "beside the printed ones, and whether its claims hold",
     )
     parser.add_argument(
         "--own-solvers",
         action="store_true",
-        help="with --paper: standard and forward pairs by their own constrained solvers, not by the planar one",
+        help="with --paper: use the solvers of standard and forward motion for such pairs, not the planar one",
     )
 
 
@@ -56,18 +56,18 @@ def run(args: argparse.Namespace) -> int:
     if len(args.dataset) > 1:
         return _validate_several(args)
     if args.cluster is not None:
-        raise InputError("--cluster is for several data sets; -j uses the processors of this machine")
+        raise InputError("--cluster needs several data sets; for one use -j, the processors of this machine")
     dataset = load_dataset(args.dataset[0])
     common = dataset_options(args, dataset.name)
     if args.paper and direction_options(args):
-        raise InputError("--paper has directions and a scale of its own; leave --directions and --det-scale out")
+        raise InputError("--paper fixes directions and scale itself; leave --directions and --det-scale out")
     if args.paper and args.planes is not None:
-        raise InputError("--paper takes the principal planes of the points; leave --planes out")
+        raise InputError("--paper fits planes by principal components; leave --planes out")
     if args.paper:
         options = PaperOptions(**common, own_solvers=args.own_solvers, pictures=not args.no_pictures)
         return show_paper(validate_as_paper(dataset, options, progress=progress_on_stderr()), options, json=args.json)
     if args.own_solvers:
-        raise InputError("--own-solvers is about --paper; add that, or leave it out")
+        raise InputError("--own-solvers needs --paper; add that, or leave it out")
     done = validate_dataset(dataset, _options(args, common), progress=progress_on_stderr())
     return show(done, common["output"], json=args.json)
 

@@ -38,7 +38,7 @@ def decoded(data: bytes) -> Image:
     # Checked before a decoder allocates memory for them.
     sizes = announced_sizes(data)
     if not sizes or max(max(size_px) for size_px in sizes) > MAX_PICTURE_PX:
-        raise InputError(f"coach: that is no picture of at most {MAX_PICTURE_PX} px a side; send a PNG or JPEG")
+        raise InputError(f"coach: not an image of at most {MAX_PICTURE_PX} px a side; send a PNG or JPEG")
     try:
         with quiet_opencv():
             how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
@@ -257,4 +257,4 @@ def _reason(frame_observations: Sequence[FrameObservation], advice: RigAdvice) -
         return "no board is seen"
     if wrong:
         return f"it is not good enough ({wrong})"
-    return f"it brings little that is new: {100.0 * max(advice.worth, 0.0):.0f} % of what the place asked for would"
+    return f"it adds little: {100.0 * max(advice.worth, 0.0):.0f} % of what the place asked for would"

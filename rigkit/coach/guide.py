@@ -35,7 +35,7 @@ FIRST_FRAMES = 4
 """Frames needed for a first calibration; before it, plans use a guessed lens."""
 ENOUGH_FRAMES = 8
 """With fewer frames it cannot be tested whether the lens model fits."""
-CHECKING = "Wait a moment: is it enough?"
+CHECKING = "Wait: checking whether it is enough"
 MIN_GAIN = 0.6
 """Least gain for which a frame is taken, relative to that of a board in the outline."""
 MIN_GAIN_OF_PHOTO = 0.2
@@ -194,7 +194,7 @@ class CaptureGuide:
         elif frame_observation.view is not None and worth >= min_gain and frame_observation.complaint:
             words = frame_observation.complaint.capitalize()
         elif would_do:
-            words = f"One more, to see that it is steady: {where}"
+            words = f"One more as confirmation: {where}"
         return Advice(
             words=words,
             target_px=where.outline_px,

@@ -47,7 +47,8 @@ class Keeper:
         for path, text in files.items():
             if path.exists() and read_text(path, "coach:") != text:
                 raise InputError(
-                    f"coach: '{path}' says something else; give another folder, or the same boards and cameras"
+                    f"coach: '{path}' is a session of other boards or cameras; give another folder, or the same "
+                    "boards and cameras"
                 )
             if not path.exists():
                 write_atomic(path, text)

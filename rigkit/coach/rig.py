@@ -179,7 +179,7 @@ class RigGuide:
             return replace(advice, words=enough_words(known.left, known.plan.gain), enough=True)
         words, targets = known.target()
         if would_do:
-            words = f"One more, to see that it is steady: {words[0].lower()}{words[1:]}"
+            words = f"One more as confirmation: {words[0].lower()}{words[1:]}"
         frame = [frame_observation.view for frame_observation in frame_observations]
         new = any(view is not None and not lens.repeats(view) for lens, view in zip(self.lenses, frame, strict=True))
         worth = known.worth(frame, photo=photo) if new else 0.0

@@ -141,7 +141,7 @@ def _parts(data: bytes, sizes: str | None) -> list[bytes]:
     announced = sizes.split(",")
     counts = [int(part) if part.isdecimal() and len(part) < 10 else -1 for part in announced]
     if min(counts) < 0 or sum(counts) != len(data):
-        raise InputError("coach: the pictures are not as long as said")
+        raise InputError("coach: the images do not have the stated length")
     ends = list(accumulate(counts))
     return [data[end - count : end] for end, count in zip(ends, counts, strict=True)]
 

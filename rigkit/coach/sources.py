@@ -129,7 +129,7 @@ def _moment(sources: Sequence[cv2.VideoCapture], numbers: Sequence[int]) -> Fram
     if silent:
         _release(sources)
         raise InputError(
-            f"coach: camera {', '.join(silent)} gives no picture; check the cable, and that no other program has it"
+            f"coach: camera {', '.join(silent)} gives no image; check the cable, and that no other program uses it"
         )
     return Frame([np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)) for _, frame in read if frame is not None])
 

@@ -65,5 +65,7 @@ def evaluate_claim(text: str, comparisons: Iterable[Comparison]) -> Verdict | No
             holds += 1
         elif not c.smaller - c.larger <= excess:
             excess = c.smaller - c.larger
-            against = f"against it: {c.smaller_name} {c.smaller:.2f} {c.unit}, {c.larger_name} {c.larger:.2f} {c.unit}"
+            against = (
+                f"contradicted by {c.smaller_name} {c.smaller:.2f} {c.unit}, {c.larger_name} {c.larger:.2f} {c.unit}"
+            )
     return Verdict(text, holds, total, against) if total else None

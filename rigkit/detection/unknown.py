@@ -34,7 +34,7 @@ from rigkit.detection.whole_grids import (
     whole_sizes,
 )
 
-LOOKING = "looking which board it is"
+LOOKING = "identifying the board"
 """Name of the step for progress."""
 
 WITHIN_SQUARES = np.linspace(0.2, 0.8, 9)

@@ -85,7 +85,7 @@ def identify_pair(
     message = f"boards {', '.join(sorted(fitting[0]))} look alike and were identified by the measured angles"
     if len(fitting) > 1:
         message += f", which {len(fitting)} orders of the names fit: the one with the fewest changes was taken"
-    notes = (*identity.notes, f"{message}; a layout would say for certain which is which")
+    notes = (*identity.notes, f"{message}; give a layout to identify them for certain")
     return replace(_result(winner, tied, views, kinds, boards, layout, fitting[0]), notes=notes)
 
 
@@ -139,8 +139,8 @@ def _tie_note(winner: Assignment, others: Sequence[Assignment]) -> str:
     what = "one board alone" if len(winner.matches) == 1 else "the arrangement of the boards"
     why = "with the smallest roll" if roll <= next_roll else "that the boards' colours speak for, not the smallest roll"
     return (
-        f"ambiguous: {what} cannot tell {len(others) + 1} assignments apart; took the one {why} "
-        f"between the cameras ({roll:.1f} degrees, next {next_roll:.1f}); boards of different sizes would settle it"
+        f"ambiguous: {what} fits {len(others) + 1} assignments; the one {why} between the cameras is used "
+        f"({roll:.1f} degrees, next {next_roll:.1f}); boards of different sizes would resolve it"
     )
 
 

@@ -147,10 +147,10 @@ def _spline_of(camera: Camera) -> tuple[str, FloatArray]:
     """Return lens model and intrinsics of the spline that fits the camera, by linear least squares."""
     pixels, rays = _samples(camera, SPLINE_GRID)
     if not len(rays):
-        raise InputError("mrcal: this camera sees nothing on its image; calibrate again")
+        raise InputError("mrcal: this camera has no valid rays in its image; calibrate again")
     if (rays[:, 2] < np.cos(np.radians(MAX_FOV_DEG / 2.0))).any():
         raise InputError(
-            f"mrcal: this camera sees beyond {MAX_FOV_DEG} degrees, where its splines end; choose another format"
+            f"mrcal: the field of view is beyond {MAX_FOV_DEG} degrees, where its splines end; choose another format"
         )
     u = _stereographic(rays)
     # The spline covers fov_x_deg horizontally, and vertically as much as its knots.

@@ -51,7 +51,7 @@ def nearest_camera_of(
     """
     rays, pixels = rays_of_image(lens, size_px, reach_rad, (DIRECTIONS, ANGLES))
     if len(rays) < MIN_RAYS:
-        raise InputError(f"'{name}': the lens shows next to nothing on the image; is the file whole?")
+        raise InputError(f"'{name}': the lens has hardly any valid rays in the image; is the file complete?")
     checked_rays, checked = rays_of_image(lens, size_px, reach_rad, CHECKED)
     centre = lens(np.array([[0.0, 0.0, 1.0]]))[0][0]
     best: tuple[Camera, float] | None = None

@@ -30,7 +30,7 @@ from rigkit.validation.fitted_planes import AngleResult
 from rigkit.validation.planes import NormalErrors
 
 _VALUE = nullable(NUMBER)
-_CHECKS = described(array(of_dataclass(Check)), "every quantity measured beside ours")
+_CHECKS = described(array(of_dataclass(Check)), "comparisons with measured quantities")
 _ANGLE = of_dataclass(AngleResult)
 _ANGLE["properties"] |= dict.fromkeys(ANGLE_ERRORS, _VALUE)
 _NORMALS = of_dataclass(NormalErrors)
@@ -65,7 +65,7 @@ VALIDATION_FILE = file(
         "points?": described(INTEGER, "reconstructed"),
         "sampson_rms_px?": described(_VALUE, "of the corners from their epipolar curves"),
         "checks": _CHECKS,
-        "unchecked": described(array(TEXT), "what could not be checked, and why"),
+        "unchecked": described(array(TEXT), "checks that were not possible, and why"),
         "angles": described(array(_ANGLE), "between each two boards"),
         "boards": described(array(_BOARD_RESULT), "plane, normals and frame of each board"),
         "notes?": array(TEXT),
@@ -73,7 +73,7 @@ VALIDATION_FILE = file(
 )
 CROSSCHECK_FILE = file(
     "rigkit.crosscheck/1",
-    "A pair by other methods",
+    "Comparison of a pair with independent methods",
     {
         "pair": TEXT,
         "affine_method?": TEXT,
@@ -92,7 +92,7 @@ CROSSCHECK_FILE = file(
             }
         ),
         "checks": _CHECKS,
-        "skipped?": described(array(TEXT), "methods that could not be used, and why"),
+        "skipped?": described(array(TEXT), "methods not applicable, and why"),
         "diagnosis?": array(TEXT),
     },
 )
@@ -104,7 +104,7 @@ _CELL: Schema = {
             {
                 "value": {ANY_OF: [_VALUE, TEXT]},
                 "sigma?": NUMBER,
-                "paper?": described(NUMBER, "what the paper printed there"),
+                "paper?": described(NUMBER, "value printed in the paper"),
                 "best?": BOOLEAN,
                 "failed?": BOOLEAN,
             }
@@ -123,10 +123,10 @@ _TABLES = rows(
 TABLES_FILE = file("rigkit.tables/1", "Tables of a result", {"tables": _TABLES})
 _PAGE = {
     "headline": described(TEXT, "the result in the user's units"),
-    "badge": described(TEXT, "the verdict in a word or two; empty: none"),
+    "badge": described(TEXT, "verdict in a word or two; empty: none"),
     "passed": described(nullable(BOOLEAN), "null: neither good nor bad"),
     "sentences": described(array(TEXT), "below the headline"),
-    "basis": described(TEXT, "what the result rests on"),
+    "basis": described(TEXT, "data that the result is based on"),
     "tables": described(_TABLES, "every table of the page"),
 }
 PAGE_FILE = file(
@@ -137,7 +137,7 @@ PAGE_FILE = file(
 _GRID = array(array(_VALUE))
 CERTIFICATE_FILE = file(
     "rigkit.certificate/1",
-    "How wrong a measurement may be",
+    "Error bound of a measurement",
     {
         "quantity": described(TEXT, "length, depth, plane or angle"),
         "size_mm?": NUMBER,
@@ -182,27 +182,27 @@ HISTORY_FILE = file(
             "baseline",
         ),
         "amounts": described(
-            table(row(2)), "by cause and unit: value and standard deviation, as if it alone had changed"
+            table(row(2)), "by quantity and unit: value and standard deviation, as if it alone had changed"
         ),
     },
 )
 _ROBOT_POSE = matrix(3, 4)
 HAND_EYE_FILE = file(
     "rigkit.hand_eye/1",
-    "Where a camera sits on a robot",
+    "Hand-eye calibration",
     {
         "cam_from_hand?": described(_ROBOT_POSE, "of a camera on the hand"),
         "base_from_board?": described(_ROBOT_POSE, "with it"),
-        "cam_from_base?": described(_ROBOT_POSE, "of a camera that stands before a robot"),
+        "cam_from_base?": described(_ROBOT_POSE, "of a fixed camera beside a robot"),
         "hand_from_board?": described(_ROBOT_POSE, "with it"),
         "covariance": described(matrix(), "of both poses (rad, mm), twelve by twelve"),
-        "freedom?": described(
-            nullable(NUMBER), "degrees of freedom of the covariance, which is Student's; null: infinite"
-        ),
+        "freedom?": described(nullable(NUMBER), "degrees of freedom of the covariance (Student's t); null: infinite"),
         "rms_px": NUMBER,
         "image_rms_px?": described(table(NUMBER), "by image"),
-        "median_apart_mm?": described(NUMBER, "of the boards' middles as seen from where the robot has them, median"),
-        "median_apart_deg?": described(NUMBER, "of the boards' turns, likewise"),
-        "left_out_deg?": described(table(NUMBER), "images whose pose does not go with them, and by what angle"),
+        "median_apart_mm?": described(
+            NUMBER, "median distance of the board's centre between image and robot poses, mm"
+        ),
+        "median_apart_deg?": described(NUMBER, "median rotation between image and robot poses, deg"),
+        "left_out_deg?": described(table(NUMBER), "images left out as outliers, and the angle by which they disagree"),
     },
 )

@@ -93,8 +93,8 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
     good &= (distance >= reach.nearest_mm) & (distance <= reach.farthest_mm)
     if not good.any():
         raise DegenerateError(
-            f"plan: board '{board.board_id}' ({board.columns}x{board.rows} corners) can be held nowhere wholly in view "
-            "at the distances allowed; take a smaller board, or allow other distances"
+            f"plan: board '{board.board_id}' ({board.columns}x{board.rows} corners) is nowhere completely in view at "
+            "the allowed distances; take a smaller board, or allow other distances"
         )
     return held.chosen(np.flatnonzero(good)[:CANDIDATES_KEPT])
 

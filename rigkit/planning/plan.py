@@ -95,7 +95,7 @@ def choose_views(
         best = float(after.min())
         if not (np.isfinite(before) and np.isfinite(best)):
             raise DegenerateError(
-                "plan: nothing can be said of any view: the calibration's numbers, or its board, are no real ones; "
+                "plan: no view can be evaluated: parameters or board of the calibration are implausible; "
                 "calibrate again"
             )
         if effort is None:

@@ -32,7 +32,7 @@ def rig_goal(
     motion = rows[:, layout.count :] / np.array([1.0, 1.0, 1.0, *[1.0 / distance_mm] * 3])
     along, _ = np.linalg.qr(motion)
     left = rows[:, : layout.count] - along @ (along.T @ rows[:, : layout.count])
-    what = f"rms error of all projections, {distance_mm:.0f} mm away, mounts included"
+    what = f"rms error of all projections at {distance_mm:.0f} mm, with extrinsics"
     return Goal(left.T @ left / (len(rows) / 2), "px", what)
 
 

@@ -45,7 +45,7 @@ class BoardInView:
         tilt = (
             f"tilted {5.0 * round(self.tilt_deg / 5.0):.0f} degrees, {self.nearer} nearer" if self.nearer else "facing"
         )
-        return f"{self.place}, {_length(self.distance_mm)} away, {tilt}{', turned upright' if self.upright else ''}"
+        return f"{self.place}, {_length(self.distance_mm)} away, {tilt}{', long side vertical' if self.upright else ''}"
 
 
 def _length(mm: float) -> str:

@@ -37,7 +37,7 @@ MAX_RANGE_SIGMA = 0.3
 MIN_SHARE_AGREEING = 0.3
 """Inlier ratio below which a note warns. Ten REAL pairs of five scenes have 0.64 to 0.92; a RENDERED wall of one
 repeated picture had 0.10, and a wrong pose."""
-NO_DISTANCE = "no point's distance is known; the baseline is too short for this scene"
+NO_DISTANCE = "no point has a depth better than its uncertainty; the baseline is too short for this scene"
 SAME_ROW = 1e-9
 """Tangents of rows of two rectified images agree to rounding: they are computed, not measured."""
 PIXELS_A_SIDE = 9

@@ -27,7 +27,7 @@ def rig_tables(rig: RigCalibration, checks: Sequence[Check]) -> tuple[Table, ...
     tables += [_angles(target, checks) for target in rig.board_rigs]
     if rig.left_out:
         heads, rows = columns("frame | board | why"), tuple(cells(*entry) for entry in rig.left_out)
-        note = "Each camera's own calibration uses these views; the mounts do not rest on them."
+        note = "Outliers: each camera's own calibration uses these views, the extrinsics do not."
         tables.append(Table("left-out", "Boards left out of the joint solution", heads, rows, note))
     return tuple(tables)
 
@@ -35,7 +35,7 @@ def rig_tables(rig: RigCalibration, checks: Sequence[Check]) -> tuple[Table, ...
 def _cameras(rig: RigCalibration) -> Table:
     heads = columns(
         "camera | model | held-out RMS alone [px] | training RMS alone [px] | held-out RMS in the rig [px] | "
-        "training RMS in the rig [px] | centre x [mm] .2 | centre y [mm] .2 | centre z [mm] .2 | turned by [deg]"
+        "training RMS in the rig [px] | centre x [mm] .2 | centre y [mm] .2 | centre z [mm] .2 | rotation [deg]"
     )
     rows = []
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
@@ -60,15 +60,15 @@ def _intrinsics(rig: RigCalibration) -> Table:
         for name in dict.fromkeys(name for words in own_words for name in words)
     )
     heads = (Column("parameter"), *(Column(f"{c.name} ({c.camera.model})") for c in rig.cameras))
-    note = "As all cameras together have them, with one standard deviation; fx, fy, cx and cy in px."
+    note = "Of the joint solution, with one standard deviation; fx, fy, cx and cy in px."
     return Table("intrinsics", "Intrinsics in the rig", heads, rows, note)
 
 
 def _mounts(rig: RigCalibration) -> Table:
     """Return the poses of the cameras relative to the first one."""
     sigmas = rig.sigmas
-    heads = (Column("camera"), *(Column(f"turned about {a}", "deg") for a in "xyz"))
-    heads += tuple(Column(f"moved along {a}", "mm") for a in "xyz")
+    heads = (Column("camera"), *(Column(f"rotation about {a}", "deg") for a in "xyz"))
+    heads += tuple(Column(f"translation along {a}", "mm") for a in "xyz")
     rows = []
     for k, camera in enumerate(rig.cameras[1:], start=1):
         own = sigmas[rig.mount(k)]
@@ -76,16 +76,17 @@ def _mounts(rig: RigCalibration) -> Table:
         values = zip([*turned, *camera.cam_from_rig.translation_mm], [*turned_sigma, *own[3:]], strict=True)
         rows.append(cells(camera.name, *(Cell(float(v), sigma=float(s)) for v, s in values)))
     note = "cam_from_rig: rotation vector and translation, with one standard deviation."
-    return Table("mounts", "Mounts", heads, tuple(rows), note)
+    return Table("mounts", "Extrinsics", heads, tuple(rows), note)
 
 
 def rig_basis(rig: RigCalibration) -> str:
     """Return the data that the rig's solution is based on, in words."""
     return (
-        "All intrinsics and mounts solved together; held out: frames that took no part, with one pose for all cameras. "
-        f"{rig.corner_count} corners, {rig.shared_count} poses shared by several views. Frames disagree "
-        f"{rig.overdispersion:.2f} times as much as independent corners would; all sigmas count that in."
-        + "".join(f" {words[0].upper()}{words[1:]}." for words in lag_words(rig))
+        "Intrinsics and extrinsics are solved jointly; held out: frames not used, with one board pose for all "
+        f"cameras. {rig.corner_count} corners, {rig.shared_count} poses shared by several views. Overdispersion "
+        f"{rig.overdispersion:.2f}: frames disagree that many times as much as independent corners would (included in "
+        "all "
+        "sigmas)." + "".join(f" {words[0].upper()}{words[1:]}." for words in lag_words(rig))
     )
 
 
@@ -97,19 +98,19 @@ def rig_reach(rig: RigCalibration, checks: Sequence[Check]) -> str:
     if pairs:
         values = {pair: rig.baseline_mm(*pair) for pair in pairs}
         (a, b), (value, sigma) = max(values.items(), key=lambda of: of[1][1])
-        least = "" if len(pairs) == 1 else ", the least certain distance,"
-        sentences.append(f"{a} and {b}{least} are {rounded_words(value, sigma)} mm apart.")
+        least = "" if len(pairs) == 1 else ", the least certain"
+        sentences.append(f"Baseline {a} to {b}{least}: {rounded_words(value, sigma)} mm.")
         sure = {pair: transfer_uncertainty(rig, *pair) for pair in pairs}
         known = {pair: transfer for pair, transfer in sure.items() if transfer is not None}
         if known:
             (a, b), transfer = max(known.items(), key=lambda of: of[1].worst_px)
             sentences.append(
-                f"A point that {a} sees appears in {b} within ±{transfer.median_px:.2g} px of where it is expected "
-                f"(±{transfer.worst_px:.2g} px at worst; one standard deviation)."
+                f"Points transferred from {a} to {b}: ±{transfer.median_px:.2g} px (at worst ±{transfer.worst_px:.2g} "
+                "px; one standard deviation)."
             )
     if checks:
         held = sum(check.passed for check in checks)
-        sentences.append(f"{held} of {len(checks)} measured facts hold.")
+        sentences.append(f"{held} of {len(checks)} measured facts are confirmed.")
     return " ".join(sentences)
 
 
@@ -123,10 +124,10 @@ def _baselines(rig: RigCalibration, checks: Sequence[Check]) -> Table:
         measured = _measured(checks, f"baseline {a}-{b}", f"baseline {b}-{a}")
         rows.append(cells(f"{a} to {b}", Cell(value, sigma=sigma), *measured, *sure))
     note = (
-        "Transfer: one standard deviation of where a point that the one camera sees must appear in the other, at the "
-        "middle and the worst of the boards' corners."
+        "Transfer: standard deviation of a point transferred from one camera's image to the other's, median and worst "
+        "of the boards' corners."
     )
-    return Table("baselines", "Distances between the cameras", heads, tuple(rows), note)
+    return Table("baselines", "Baselines", heads, tuple(rows), note)
 
 
 def _angles(target: BoardRig, checks: Sequence[Check]) -> Table:
@@ -153,7 +154,7 @@ def _angles(target: BoardRig, checks: Sequence[Check]) -> Table:
         for c in distances
     )
     key = f"boards-{target.names[0]}"
-    return Table(key, "Boards mounted to each other", heads, tuple(rows), note)
+    return Table(key, "Rigidly mounted boards", heads, tuple(rows), note)
 
 
 def _measured(checks: Sequence[Check], *names: str) -> tuple[Cell, Cell, Cell]:

@@ -77,8 +77,8 @@ class ValidationReport:
         if all(check.kind in DECLARED for check in self.checks):
             why = f" ({'; '.join(self.unchecked)})" if self.unchecked else ""
             raise InputError(
-                f"pair '{self.pair_id}': nothing measured can be checked{why}; "
-                "add a baseline or angles under [pairs.truth]"
+                f"pair '{self.pair_id}': nothing measured can be checked{why}; add a baseline or angles under "
+                "[pairs.truth]"
             )
 
     @property
@@ -278,8 +278,8 @@ def _baseline(
 
 def _outlier_notes(boards: Iterable[BoardResult]) -> list[str]:
     return [
-        f"board '{b.board.board_id}': {b.plane.gross} corners lie far off its plane and were left out of it; is "
-        "something in front of it?"
+        f"board '{b.board.board_id}': {b.plane.gross} corners are outliers of its plane and were left out; "
+        "was it occluded?"
         for b in boards
         if b.plane.gross
     ]

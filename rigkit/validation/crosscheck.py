@@ -172,9 +172,7 @@ def crosscheck(
         except DegenerateError as error:
             skipped.append(f"{name}: {error}")
     if any(method.name == TWO_VIEW and np.isnan(method.covariance).all() for method in methods):
-        skipped.append(
-            f"{TWO_VIEW}: its own bundle adjustment moves it by more than it is uncertain; it is no result yet"
-        )
+        skipped.append(f"{TWO_VIEW}: its own bundle adjustment changes it by more than its uncertainty; not compared")
     if other_chain is not None:
         methods.append(compare_chains(reconstruction, other_chain, OTHER_CHAIN))
     measured = measure(reconstruction)
@@ -198,8 +196,8 @@ def compare_chains(reconstruction: Reconstruction, other: Reconstruction, name: 
 def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[IndependentMethod]:
     if len(np.unique(reconstruction.cloud.board_index)) == 1:
         raise DegenerateError(
-            "all corners lie on one board, and two poses show one plane alike: pycolmap knows no squares "
-            "and may find the other one"
+            "all corners are on one plane, for which two poses fit equally well (planar ambiguity): pycolmap, which "
+            "does not use the squares, may find the other one"
         )
     pixels = (reconstruction.pixels1, reconstruction.pixels2)
     pair = colmap_pair(reconstruction.camera1, reconstruction.camera2, *pixels)
@@ -366,12 +364,12 @@ def _diagnosis(reconstruction: Reconstruction, checks: Sequence[Check]) -> tuple
             "(and the level's sigma) hold for this pair?"
         )
     elif colmap:
-        out.append("epipolar geometry: pycolmap finds another pose from the same corners, the boards' own poses agree")
+        out.append("epipolar geometry: pycolmap finds another pose from the same corners; planar PnP agrees with ours")
     elif pnp:
         out.append(
-            "calibration or board: the boards' own poses disagree where epipolar geometry agrees; look at square "
-            "sizes, flatness and the calibration of this lens"
+            "calibration or board: planar PnP disagrees while epipolar geometry agrees; check square sizes, "
+            "flatness and the calibration of this lens"
         )
     if chain:
-        out.append("rectification: raw and rectified pixels give different results; look at the rectified views")
+        out.append("rectification: raw and rectified pixels give different results; check the rectified views")
     return tuple(out)

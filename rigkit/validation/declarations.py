@@ -60,7 +60,7 @@ def contradicted_boards(boards: Mapping[str, BoardResult], layout: Mapping[str, 
             nearest = min(off, key=lambda s: float(off[s]))
             # 0 if the declared side is the nearest.
             beyond = (float(off[layout[name]] - off[nearest]), float("nan"))
-            words = f"declared {layout[name]}, looks {nearest}"
+            words = f"declared {layout[name]}, reconstructed {nearest}"
             known = (0.0, SIDE_DEG, words)
             checks.append(compare(f"layout {name}", "layout", "deg", known, beyond, LIMIT_K, found.plane.count))
     return tuple(check for check in checks if not check.passed)

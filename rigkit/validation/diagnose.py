@@ -33,7 +33,7 @@ UNITS = {"m": 1000.0, "cm": 10.0, "inches": 25.4}
 UNIT_RATIO = 0.05
 """Relative tolerance for a length that is wrong by the factor of a unit."""
 MIN_CORNERS_TO_DIAGNOSE = 12
-MEASURE_SIDES, OR_ASPECT = "measure square_x_mm and square_y_mm", ", or look at the calibration's aspect"
+MEASURE_SIDES, OR_ASPECT = "measure square_x_mm and square_y_mm", ", or check fx / fy of the calibration"
 
 
 def camera_fit(camera: Camera, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> float:
@@ -97,16 +97,16 @@ def diagnose_cameras(
         if other is not None:
             out.append(
                 f"pair '{pair_id}': image {number} fits camera '{other}' ({fit[other]:.2f} px), not the declared "
-                f"'{name}' ({fit[name]:.2f} px): the calibration of another lens?"
+                f"'{name}' ({fit[name]:.2f} px): wrong camera in the manifest?"
             )
         elif fit[name] > LARGE_RESIDUAL_PX:
             aspect, left = _best_stretch(cameras[name], detections[number - 1], boards)
-            cause = "; was the lens changed or refocused since?"
+            cause = "; was the lens changed or refocused after the calibration?"
             if left * CLEARLY_BETTER < fit[name]:
                 cause = f", {left:.2f} px with squares {_stretch(aspect)}; {MEASURE_SIDES}{OR_ASPECT}"
             out.append(
-                f"pair '{pair_id}': image {number} does not fit the calibration of '{name}': the boards' own shapes "
-                f"leave {fit[name]:.2f} px{cause}"
+                f"pair '{pair_id}': image {number} does not fit the calibration of '{name}': poses of single boards "
+                f"leave a reprojection error of {fit[name]:.2f} px{cause}"
             )
     return tuple(out)
 
@@ -131,7 +131,8 @@ def diagnose_squares(fitting: Sequence[FittingSquares]) -> tuple[str, ...]:
         ids, declared_mm = [f"'{board.board_id}'" for board in one.boards], one.boards[0].square_x_mm
         of = f"board {ids[0]}" if len(ids) == 1 else f"one of {', '.join(ids)}, {one.where} in image 1,"
         sizes.append(
-            f"{of} would fit the others with squares of {one.factor * declared_mm:.1f} mm ({declared_mm:g} is declared)"
+            f"{of} would be consistent with the others with squares of {one.factor * declared_mm:.1f} mm "
+            f"({declared_mm:g} is declared)"
         )
     return (f"{', or '.join(sizes)}; measure them again",) if sizes else ()
 
@@ -150,7 +151,10 @@ def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
 def _contradicted(report: ValidationReport) -> str:
     """Return a message about the declarations of the pose that the images contradict; "" if none."""
     off = [check.name for check in report.checks if check.kind in ("pose type", "level") and not check.passed]
-    remedy = "declare what they speak for, or a level as good as it was; what else fails there may come of it"
+    remedy = (
+        "declare the pose type that the message names, or a larger level sigma; other failures of this pair may "
+        "follow from it"
+    )
     return f"the images contradict the declared {' and '.join(off)}: {remedy}" if off else ""
 
 
@@ -212,10 +216,12 @@ def _diagnose_boards(reports: Sequence[ValidationReport]) -> list[str]:
     """Return messages about boards whose squares disagree with those of the others, or that are mirrored: one each."""
     found = _squares(reports)
     mirrored = [b.board.board_id for r in reports for b in r.boards if not b.right_handed]
-    out = [f"board '{i}' comes out mirrored: its corners are numbered the wrong way round" for i in mirrored]
+    out = [
+        f"board '{i}' is reconstructed mirrored: its corners are numbered in the opposite direction" for i in mirrored
+    ]
     out += [
-        f"board '{name}' comes out with another shape than any board: corners of different boards were matched (boards "
-        "of this kind that stand there and are not listed?), or the pose is wrong"
+        f"board '{name}' is reconstructed with an impossible shape: corners of different boards were matched (is a "
+        "board of this kind not listed?), or the pose is wrong"
         for name, squares in found.items()
         if squares.no_board
     ]
@@ -224,18 +230,18 @@ def _diagnose_boards(reports: Sequence[ValidationReport]) -> list[str]:
     measure_sides = f"{MEASURE_SIDES}{OR_ASPECT}" if all_alike else MEASURE_SIDES
     if all_alike and len(found) > 1:
         names = ", ".join(f"'{name}'" for name in found)
-        words = f"boards {names}: their squares come out {_stretch(float(np.median(aspects)))}"
+        words = f"boards {names}: their squares are reconstructed {_stretch(float(np.median(aspects)))}"
         return [*out, f"{words}; {measure_sides}"]
     for name, squares in found.items():
         if squares.stretched:
             out.append(
-                f"board '{name}': its squares come out {_stretch(squares.aspect)} ({squares.would_fit}); "
+                f"board '{name}': its squares are reconstructed {_stretch(squares.aspect)} ({squares.would_fit}); "
                 f"{measure_sides}"
             )
         elif abs(squares.size - 1.0) > ODD_BOARD and not squares.no_board:
             out.append(
-                f"board '{name}': its squares come out {100.0 * (squares.size - 1.0):+.1f} % against the other boards; "
-                f"measure them again ({squares.would_fit})"
+                f"board '{name}': its squares are {100.0 * (squares.size - 1.0):+.1f} % off relative to the other "
+                f"boards; measure them again ({squares.would_fit})"
             )
     return out
 
@@ -267,7 +273,7 @@ def _squares(reports: Sequence[ValidationReport]) -> dict[str, _SquareSizes]:
 
 def _stretch(aspect: float) -> str:
     longer, other = ("wider", "high") if aspect > 1.0 else ("higher", "wide")
-    return f"{100.0 * (max(aspect, 1.0 / aspect) - 1.0):.1f} % {longer} than {other} against what is declared"
+    return f"{100.0 * (max(aspect, 1.0 / aspect) - 1.0):.1f} % {longer} than {other} relative to the declaration"
 
 
 def _diagnose_lengths(failed: Sequence[tuple[str, Check]], reports: Sequence[ValidationReport]) -> list[str]:
@@ -286,20 +292,21 @@ def _diagnose_lengths(failed: Sequence[tuple[str, Check]], reports: Sequence[Val
         return [f"{names}: written in {unit}? Lengths are in mm; or the squares are {squares}"]
     sigma = max(check.combined_sigma / check.measured for _, check in failed)
     if len(lengths) > 1 and all(agree) and np.ptp(ratios) < SAME_RATIO + 4.0 * sigma:
-        return [f"square size: all {len(lengths)} lengths come out {percent:+.1f} %; {squares} would explain them"]
+        return [f"square size: all {len(lengths)} lengths are off by {percent:+.1f} %; {squares} would explain them"]
     if len(lengths) == 1:
         return [
-            f"pair '{failed[0][0]}': {failed[0][1].name} comes out {percent:+.1f} %: it was misread, or the squares "
+            f"pair '{failed[0][0]}': {failed[0][1].name} is off by {percent:+.1f} %: it was misread, or the squares "
             f"are {squares}"
         ]
     exchanged = [
-        f"pairs '{one}' and '{two}': each {a.name} comes out as the other's is written: they were probably exchanged"
+        f"pairs '{one}' and '{two}': each {a.name} matches the measurement of the other pair: they were probably "
+        "exchanged"
         for (one, a), (two, b) in combinations(failed, 2)
         if a.name == b.name and one != two and _would_hold(a, b.measured) and _would_hold(b, a.measured)
     ]
     return exchanged or [
-        f"pair '{pair}': {check.name} comes out {100.0 * (check.ours / check.measured - 1.0):+.1f} % while other "
-        "lengths hold: it was probably misread"
+        f"pair '{pair}': {check.name} is off by {100.0 * (check.ours / check.measured - 1.0):+.1f} % while other "
+        "lengths agree: it was probably misread"
         for pair, check in failed
     ]
 
@@ -320,8 +327,8 @@ def _diagnose_angles(report: ValidationReport) -> list[str]:
     supplement = [c for c in failed if abs(180.0 - c.ours - c.measured) <= c.limit_k * c.combined_sigma]
     if supplement:
         return [
-            f"pair '{report.pair_id}': {c.name} comes out {c.ours:.2f} deg, the supplement of what is written: an "
-            "angle is measured across the faces, on the cameras' side"
+            f"pair '{report.pair_id}': {c.name} is {c.ours:.2f} deg, the supplement of the measurement: write the "
+            "angle between the printed faces, on the cameras' side"
             for c in supplement
         ]
     ids = [result.board.board_id for result in report.boards]
@@ -332,7 +339,7 @@ def _diagnose_angles(report: ValidationReport) -> list[str]:
     counts = Counter(b for boards in involved.values() for b in boards)
     common = [b for b, count in counts.items() if count == len(failed)]
     if len(failed) > 1 and common:
-        words = f"board '{common[0]}' does not stand as measured; measure it again, or look at the calibration"
+        words = f"board '{common[0]}' is not at the measured angles; measure it again, or check the calibration"
         return [f"pair '{report.pair_id}': {', '.join(names)}: {words}"]
     return [f"pair '{report.pair_id}': {name}: {_lone_angle(report, c)}" for c, name in zip(failed, names, strict=True)]
 
@@ -342,14 +349,12 @@ def _lone_angle(report: ValidationReport, check: Check) -> str:
     angle = next(a for a in report.angles if check.name == f"angle {a.a}-{a.b}" or check.name == f"angle {a.b}-{a.a}")
     if angle.lattice_deg is not None and abs(angle.lattice_deg - check.ours) > 0.5 * abs(check.difference):
         return (
-            f"planes through the points say {check.ours:.2f} deg, the boards' known squares {angle.lattice_deg:.2f}: a "
-            "board is bent, or the calibration does not fit; see what the corners leave over"
+            f"planes through the points give {check.ours:.2f} deg, the boards' known squares {angle.lattice_deg:.2f}: "
+            "a board is bent, or the calibration does not fit; look at the residuals"
         )
     others = [c for c in report.checks if c.kind == "angle" and c is not check]
-    support = [] if angle.lattice_deg is None else [f"the boards' known squares say {angle.lattice_deg:.2f} deg too"]
-    support += ["the other angles hold"] if others and all(c.passed for c in others) else []
-    misread = (
-        f"{check.measured:g} was probably misread" if support else f"the boards do not stand at {check.measured:g}"
-    )
+    support = [] if angle.lattice_deg is None else [f"the boards' known squares also give {angle.lattice_deg:.2f} deg"]
+    support += ["the other angles agree"] if others and all(c.passed for c in others) else []
+    misread = f"{check.measured:g} was probably misread" if support else f"the boards are not at {check.measured:g} deg"
     why = f" ({', and '.join(support)})" if support else ""
     return f"{misread}: the images show {check.ours:.2f} deg{why}; measure it again"

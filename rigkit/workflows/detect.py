@@ -118,7 +118,7 @@ def detect_in_images(
         images_in([image for path in stills for image in (videos[path].images[""] if path in videos else (path,))])
     )
     if options.camera is not None and not boards:
-        raise InputError("--camera helps to find boards of known size only; give them, such as --board a9x6.toml")
+        raise InputError("--camera needs boards of known size; give them, such as --board a9x6.toml")
     camera = None if options.camera is None else import_camera(options.camera)
     overlays = _overlay_paths(images, options.overlay)
     read = [*images, *options.boards, *([options.camera] if options.camera else [])]

@@ -149,8 +149,8 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
         alike = sum(frozenset((d.columns, d.rows)) == frozenset(known.size) for d in seen)
         if alike > 1:
             raise CheckFailed(
-                f"'{image}' shows {alike} grids of the size of board '{known.board_id}', and nothing tells which of "
-                "them it is; cover what else is tiled"
+                f"'{image}' shows {alike} grids of the size of board '{known.board_id}', and which one is the "
+                "board is unknown; cover the other pattern"
             )
         why = explained([Path(image)], [known]) or "check focus and the board's file"
         raise CheckFailed(f"'{image}' does not show board '{known.board_id}'; {why}")
@@ -163,7 +163,7 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
         projected, _ = lens.project(found[0].cam_from_board.apply(points))
         rms = float(np.sqrt(((projected - view.pixels[valid]) ** 2).sum(axis=1).mean()))
         if not np.isfinite(found[0].covariance).all() or not np.isfinite(rms):
-            raise DegenerateError("the lens does not see the board where it stands; check the numbers of its file")
+            raise DegenerateError("the board is outside the camera's field of view; check the camera file")
     ambiguous = len(found) > 1 and found[1].rms_rad < PLANAR_AMBIGUITY * found[0].rms_rad
     pose, covariance, of_lens = found[0].cam_from_board, found[0].covariance.copy(), _uncertain_camera(camera)
     if of_lens is not None:

@@ -55,7 +55,9 @@ def together(columns: Sequence[Sequence[Path]]) -> tuple[ImagesByMoment, list[Pa
     frames = [{known[f"{k}"][path.name]: path for path in own} for k, own in enumerate(columns)]
     shared = [frame for frame in frames[0] if all(frame in own for own in frames)]
     if not shared:
-        raise InputError("of no moment every camera has an image of one name or number; give those taken together")
+        raise InputError(
+            "no frame has an image of every camera (same name or number); give images that were taken together"
+        )
     single = [path for own in frames for frame, path in own.items() if frame not in shared]
     return [[own[frame] for own in frames] for frame in shared], single
 
@@ -91,7 +93,7 @@ def _sides(names: Sequence[str], text: str, beside: str) -> dict[str, tuple[str,
 def _in_order(names: Sequence[str], images: Sequence[Path]) -> ImagesByMoment:
     if len(images) % len(names):
         raise InputError(
-            f"{len(images)} different images, which are not moments of {len(names)} cameras each "
-            f"({', '.join(names)}); give as many of each camera"
+            f"{len(images)} different images, which are not moments of {len(names)} cameras each ({', '.join(names)}); "
+            "give as many of each camera"
         )
     return [list(images[k : k + len(names)]) for k in range(0, len(images), len(names))]

@@ -168,7 +168,9 @@ def rectify_stereo_images(
     names : the two cameras; None: the rig's first two.
     """
     if options.hfov_deg is not None or options.size_px is not None or any(options.angles_deg):
-        raise InputError("rectify: the baseline decides the view of a stereo pair; leave out its angles and its size")
+        raise InputError(
+            "rectify: the baseline determines the view of a stereo pair; leave out the view's angles and --size"
+        )
     both, (camera1, camera2), cam2_from_cam1 = import_pair(rig, names)
     if names is None and not isinstance(images, (str, Path)):
         called = {Path(one).name if Path(one).is_dir() else Path(one).stem: one for one in images}
@@ -284,7 +286,9 @@ def _coverage(jobs: Jobs) -> list[float]:
         require_pixels(remap.target.size_px, f"rectified image '{job[0][1]}' (--size)")
     covered = [float(remap.coverage().mean()) for _, remap in jobs]
     if min(covered) == 0.0:
-        raise InputError("rectify: the camera sees nothing of this view; change --yaw-deg, --pitch-deg or --hfov-deg")
+        raise InputError(
+            "rectify: this view is outside the camera's field of view; change --yaw-deg, --pitch-deg or --hfov-deg"
+        )
     return covered
 
 

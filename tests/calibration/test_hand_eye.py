@@ -97,7 +97,7 @@ def test_what_cannot_be_solved_is_said(rng: np.random.Generator) -> None:
     views, reported = capture(rng)
     with pytest.raises(InputError, match="same order"):
         hand_eye(lens("reg"), views, reported[1:] + reported[:1])
-    with pytest.raises(InputError, match="the other way round"):
+    with pytest.raises(InputError, match="inverse robot poses"):
         hand_eye(lens("reg"), views, [pose.inverse() for pose in reported])
     with pytest.raises(InputError, match="14 poses"):
         hand_eye(lens("reg"), views, reported[:14])
@@ -176,9 +176,9 @@ def test_from_rendered_images_on_the_command_line(tmp_path: Path, capsys: pytest
     assert np.all(np.abs(np.array(found["cam_from_hand"])[:, 3] - X.translation_mm) < 5.0 * sigma + 0.02)
     assert np.linalg.norm(sigma) < 2.0
     assert main([*command, "--inverse"]) == 2
-    assert "the other way round" in capsys.readouterr().err
+    assert "inverse robot poses" in capsys.readouterr().err
     assert main(["pose", str(tmp_path / "images" / "0.png"), *known]) == 0
-    assert "centre of the camera on the board" in capsys.readouterr().out
+    assert "camera centre in the board's frame" in capsys.readouterr().out
     (tmp_path / "poses.csv").write_text("\n".join(rows[:-1]) + "\n")
     assert main(command) == 2
     assert "no pose of image '5.png'" in capsys.readouterr().err

@@ -266,7 +266,7 @@ def test_image_of_another_size_is_dropped_with_the_reason(session: Path) -> None
     [
         ("scaramuzza", 99, "scaramuzza has no degree 99; choose 3, 4, 5, 6, 7, 8, 9, 10"),
         ("brown", 6, "brown has no degree 6; choose 4, 5, 8"),
-        ("kannala_brandt", 4, "degree 4 for kannala_brandt, which comes in one size; remove it"),
+        ("kannala_brandt", 4, "degree 4 for kannala_brandt, which has one size only; remove it"),
         ("auto", 6, 'degree 6 with model = "auto", which chooses by itself'),
         ("scaramuzza", 0, "'degree' must be at least 1"),
     ],

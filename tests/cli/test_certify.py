@@ -53,7 +53,7 @@ def test_a_length_with_page_sheet_and_limit(rig: Path, capsys: pytest.CaptureFix
     assert "within the limit" in page.read_text()
     assert sheet.read_bytes().startswith(b"%PDF")
     assert main([*asked, "--limit", "0.001", "--json"]) == 1
-    assert "beyond the limit" in capsys.readouterr().out
+    assert "above the limit" in capsys.readouterr().out
 
 
 def test_a_bad_calibration_gets_no_certificate(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -69,7 +69,7 @@ def test_a_bad_calibration_gets_no_certificate(rig: Path, capsys: pytest.Capture
         rig.write_text(json.dumps(data | {"verdicts": [printed]}))
         assert main(asked) == code
         words = capsys.readouterr().out.splitlines()
-        called = "  The calibration was called bad: held-out RMS 0.1 px, but the focal length differs; fix it."
+        called = "  The calibration's verdict is bad: held-out RMS 0.1 px, but the focal length differs; fix it."
         assert (words[1] == called) == (severity == "bad")
         page = rig.with_suffix(".html")
         drawn = ["--report", str(page)] if severity == "bad" else []
@@ -119,4 +119,4 @@ def test_a_rig_without_covariance_is_refused(rig: Path, capsys: pytest.CaptureFi
     del data["covariance"]
     rig.write_text(json.dumps(data))
     assert main(["certify", str(rig), "--length", "300", "--distance", "1200"]) == 2
-    assert "does not say how sure the rig is" in capsys.readouterr().err
+    assert "the rig has no covariance" in capsys.readouterr().err

@@ -42,7 +42,7 @@ REFIT_PX = 0.05
 def test_a_camera_goes_out_and_comes_back(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     there, back = tmp_path / "there", tmp_path / "back.json"
     assert main(["export", str(CALIBRATION), "--to", kind, "-o", str(there)]) == 0
-    assert "px from the camera given" in capsys.readouterr().out
+    assert "px from the input" in capsys.readouterr().out
     assert main(["export", str(there), "--from", kind, "-o", str(back)]) == 0
     # A person sees at once whether the file was understood: a fisheye taken for a regular lens sees less.
     assert re.search(r"back.json: \w+, 1624x1240 px, sees 1[56]\d\.\d degrees across", capsys.readouterr().out)

@@ -78,4 +78,4 @@ def test_a_validation_that_fails() -> None:
     html = build_page("title", "lead", verdict, tables, [section], {"rigkit": "x"}, ["a remark"])
     assert faults(facts.to_dict()) == []
     assert facts.badge == "a check failed" and "a remark" in facts.sentences
-    assert_all_is_in(html, json.loads(json.dumps(facts.to_dict())), ("The view:",))
+    assert_all_is_in(html, json.loads(json.dumps(facts.to_dict())), ("3D view:",))

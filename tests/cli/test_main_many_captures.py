@@ -97,7 +97,7 @@ def test_a_session_that_fails_does_not_end_the_rest(
     assert main(["calibrate", *sessions]) == 2
     printed = capsys.readouterr()
     assert (tmp_path / "b" / "s-calibration.json").is_file()
-    assert "1 of 2 sessions are well" in printed.err and "a/s.toml" in printed.err
+    assert "1 of 2 sessions succeeded" in printed.err and "a/s.toml" in printed.err
     assert main(["calibrate", *sessions, "-o", str(tmp_path / "x.json")]) == 2
     assert "beside each" in capsys.readouterr().err
 
@@ -124,6 +124,6 @@ def test_a_bad_calibration_of_a_data_set_is_warned_of(captures: Path, caplog: py
         text = text.replace(str(source), str(own))
     manifest.write_text(text, encoding="utf-8")
     load_cameras(load_dataset(manifest))
-    called = "the calibration was called bad: two cameras are mixed"
+    called = "the calibration's verdict is bad: two cameras are mixed"
     warned = [record.getMessage() for record in caplog.records if called in record.getMessage()]
     assert len(warned) == 1 and "fe185" in warned[0]

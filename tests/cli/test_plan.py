@@ -48,16 +48,16 @@ def test_a_length_is_planned_for_in_mm(calibrated: Path, capsys: pytest.CaptureF
     assert main(["plan", str(calibrated), "-n", "1", "--length", "300", "--distance", "900"]) == 0
     out = capsys.readouterr().out
     assert "standard error of a length of 300 mm at 900 mm" in out and " mm now" in out
-    assert "1 more picture would bring" in out
+    assert "1 more image: " in out
 
 
 def test_pictures_to_check_with(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = tmp_path / "check.html"
     assert main(["plan", str(calibrated), "--check", "-r", str(page)]) == 0
     out = capsys.readouterr().out
-    assert "standard error of a change of focus" in out and " now" not in out and "would bring" not in out
-    assert "What these pictures would find" in out and "principal point" in out
-    assert "What these pictures would find" in page.read_text() and "inf" not in out
+    assert "standard error of a change of intrinsics" in out and " now" not in out and "less error" not in out
+    assert "Changes that these images would reveal" in out and "principal point" in out
+    assert "Changes that these images would reveal" in page.read_text() and "inf" not in out
     assert main(["plan", str(calibrated), "--check", "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["error_now"] is None and len(data["views"]) == 3
@@ -79,8 +79,8 @@ def test_the_expected_accuracy_of_a_lens_is_printed(capsys: pytest.CaptureFixtur
         (["plan", "--lens", "90"], "--lens needs --size"),
         (["plan", "--lens", "90", "--size", "12", "--board", "9x6x30"], "such as 1280x960"),
         (["plan", "--lens", "0", "--size", "640x480", "--board", "9x6x30"], "0.5 to 300"),
-        (["plan", "x.json", "--board", "9x6x30"], "goes with --lens"),
-        (["plan", "x.json", "--check", "--length", "300", "--distance", "900"], "leave --lens and --length away"),
+        (["plan", "x.json", "--board", "9x6x30"], "needs --lens"),
+        (["plan", "x.json", "--check", "--length", "300", "--distance", "900"], "leave out --lens and --length"),
         (["plan", "--lens", "90", "--size", "640x480", "--board", "9x6x30", "--length", "3"], "belong together"),
     ],
 )
@@ -126,7 +126,7 @@ def test_pictures_to_check_a_rig_with(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "Blue dots" not in text
     assert main(["plan", str(path), "-n", "2", "--json"]) == 0
     better = json.loads(capsys.readouterr().out)
-    assert "mounts included" in better["goal"]
+    assert "with extrinsics" in better["goal"]
     assert better["error_now"] > better["views"][0]["error_then"] > better["views"][1]["error_then"]
     assert main(["plan", str(path), "-n", "1", "--length", "300", "--distance", "900"]) == 0
     assert "standard error of a length of 300 mm" in capsys.readouterr().out
@@ -142,5 +142,5 @@ def test_a_calibration_that_was_called_bad_is_warned_of(
         source = tmp_path / f"{severity}.json"
         source.write_text(json.dumps(data | {"verdicts": [printed]}))
         assert main(["plan", str(source), "-n", "1"]) == 0
-        called = f"'{source}': the calibration was called bad: two cameras are mixed"
+        called = f"'{source}': the calibration's verdict is bad: two cameras are mixed"
         assert (called in capsys.readouterr().err) == (severity == "bad")

@@ -78,7 +78,7 @@ def test_views_that_cannot_be_fused_are_named(
 ) -> None:
     folder, images, _ = files
     for more, words in (
-        (("--images", *images, "--pose-type", "general"), "--pose-type is for two images"),
+        (("--images", *images, "--pose-type", "general"), "--pose-type applies to two images only"),
         (("--images", *images, "--names", "cam0", "cam1"), "3 images for 2 names"),
         (("--images", *images, "--names", "cam0", "cam1", "left"), "no camera 'left'"),
         (("--images", images[0]), "--images names two"),

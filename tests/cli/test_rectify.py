@@ -73,7 +73,7 @@ def test_nothing_is_overwritten_and_errors_are_one_line(
         (["-o", str(tmp_path / "a.xyz")], ".xyz"),
         (["-o", str(tmp_path / "a.png"), "--size", "12"], "--size"),
         (["-o", str(tmp_path / "a.png"), "--hfov-deg", "200"], "field of view"),
-        (["-o", str(tmp_path / "a.png"), "--yaw-deg", "180", "--hfov-deg", "40"], "sees nothing"),
+        (["-o", str(tmp_path / "a.png"), "--yaw-deg", "180", "--hfov-deg", "40"], "outside the camera's field of view"),
     ):
         assert main([*start, *options]) == 2
         err = capsys.readouterr().err

@@ -152,7 +152,7 @@ def test_a_misread_rule_fails_the_baseline_and_nothing_else(
     )
     code, text, failed = validate(folder, capsys, "--no-crosscheck")
     assert (code, failed) == (1, {"baseline"})
-    assert "pair 'same': baseline comes out -2.9 % while other lengths hold: it was probably misread" in text
+    assert "pair 'same': baseline is off by -2.9 % while other lengths agree: it was probably misread" in text
 
 
 def test_wrong_squares_are_named(
@@ -168,7 +168,7 @@ def test_wrong_squares_are_named(
     )
     code, text, failed = validate(folder, capsys, "--no-crosscheck")
     assert (code, failed) == (1, {"baseline"})
-    assert "probable cause: square size: all 2 lengths come out +3.0 %" in text
+    assert "probable cause: square size: all 2 lengths are off by +3.0 %" in text
     assert "50.0" in text
 
 
@@ -186,7 +186,7 @@ def test_one_board_with_wrong_squares_is_named(
     code, text, failed = validate(folder, capsys, "--no-crosscheck")
     assert code == 1
     assert "size plane2" in failed and failed <= {"baseline", "size plane2"}
-    assert "board 'plane2': its squares come out -2.9 % against the other boards" in text
+    assert "board 'plane2': its squares are -2.9 % off relative to the other boards" in text
 
 
 def test_one_board_with_squares_so_wrong_that_it_fits_nowhere_is_named(
@@ -195,7 +195,10 @@ def test_one_board_with_squares_so_wrong_that_it_fits_nowhere_is_named(
     declare_squares(folder, capture, "43.0")
     code, text, _ = validate(folder, capsys, "--no-crosscheck")
     assert code == 1
-    printed = "board 'plane2' would fit the others with squares of 50.0 mm (43 is declared); measure them again"
+    printed = (
+        "board 'plane2' would be consistent with the others with squares of 50.0 mm (43 is declared); measure "
+        "them again"
+    )
     assert f"probable cause: pair 'same': {printed}" in text
 
 
@@ -204,7 +207,10 @@ def test_reconstruct_names_the_board_that_fits_nowhere_too(
 ) -> None:
     declare_squares(folder, capture, "43.0")
     assert main(["reconstruct", str(folder), "-j", "1", "--no-pictures", "-o", str(folder / "clouds")]) == 0
-    printed = "same: board 'plane2' would fit the others with squares of 50.0 mm (43 is declared); measure them again"
+    printed = (
+        "same: board 'plane2' would be consistent with the others with squares of 50.0 mm (43 is declared); "
+        "measure them again"
+    )
     assert printed in capsys.readouterr().err
 
 
@@ -233,7 +239,7 @@ def test_the_other_lens_s_calibration_is_named(
     code, text, _ = validate(folder, capsys, "--no-crosscheck")
     assert code in (1, 2, 3)
     assert "pair 'mixed': image 2 fits camera 'fisheye'" in text
-    assert "the calibration of another lens?" in text
+    assert "wrong camera in the manifest?" in text
 
 
 def test_a_lens_that_is_in_no_calibration_is_named(

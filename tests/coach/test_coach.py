@@ -109,7 +109,7 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     assert counts[0] == 1
     assert any(str(words).startswith("Not taken, as it is frame-0001.png already. ") for words in printed)
     assert any(
-        str(words).startswith("Not taken, as it brings little that is new: 0 % of what the place asked for would. ")
+        str(words).startswith("Not taken, as it adds little: 0 % of what the place asked for would. ")
         for words in printed
     )
     assert len(coach.guide.frames) >= 7
@@ -121,7 +121,7 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     said_px = lens.advise(FrameObservation(size_px=SIZE, view=None)).left[0].error
     assert said_px is not None and re.match(r"Done: \w+, error [0-9.]+ px \(", coach.finish())
     assert "00.png: taken as frame-0001.png" in reported and any(
-        line.startswith("002.png: not taken, as it brings little that is new: 0 % of") for line in reported
+        line.startswith("002.png: not taken, as it adds little: 0 % of") for line in reported
     )
     assert len([line for line in reported if ": taken as " in line]) == len(kept) and reported[-1] == coach.finished
     found = load_calibration(tmp_path / "session/calibration.json")
@@ -219,7 +219,7 @@ def test_a_picture_that_was_copied_slowly_is_read_once_it_is_whole(
 def test_what_gives_no_frames_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not a folder"):
         frames_of_folders([tmp_path / "none"])
-    with pytest.raises(InputError, match="camera 97 gives no picture"):
+    with pytest.raises(InputError, match="camera 97 gives no image"):
         device_frames([97])
     with pytest.raises(InputError, match="does not exist"):
         run_coach(options(tmp_path / "session", video=(tmp_path / "none.mp4",)), print)
@@ -248,7 +248,7 @@ def test_killed_and_started_again_nothing_is_lost(pictures: list[np.ndarray], tm
     again.undo()
     aside = [tmp_path / f"images/frame-0006.png.dropped{more}" for more in ("", "-2")]
     assert len({path.read_bytes() for path in aside}) == 2
-    with pytest.raises(InputError, match="says something else"):
+    with pytest.raises(InputError, match="is a session of other boards or cameras"):
         open_coach(CoachOptions(folder=tmp_path, boards=("8x5x20",), guide=options(tmp_path).guide))
 
 

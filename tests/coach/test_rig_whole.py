@@ -169,7 +169,7 @@ def test_a_held_out_error_of_the_rig_that_changes_asks_for_one_more(
     guide = guide_of(frames, later)
     reported(guide, later, replace(rig, heldout_rms_px=(1.0 + 2.0 * STEADY) * typical))
     now = guide.advise(EMPTY)
-    assert not now.enough and now.words.startswith("One more, to see that it is steady: hold the board")
+    assert not now.enough and now.words.startswith("One more as confirmation: hold the board")
 
 
 def test_a_length_that_both_measure_is_required(frames: list[list[FrameObservation]], rig: RigCalibration) -> None:

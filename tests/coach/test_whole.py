@@ -118,7 +118,7 @@ def test_a_held_out_error_that_changes_asks_for_one_more(views: list[BoardView],
     guide.advise(EMPTY)
     later.tell(replace(whole, calibration=worse))
     now = guide.advise(EMPTY)
-    assert not now.enough and not now.waits and now.words.startswith("One more, to see that it is steady: ")
+    assert not now.enough and not now.waits and now.words.startswith("One more as confirmation: ")
 
 
 def test_without_its_process_the_capture_goes_on(views: list[BoardView], whole: WholeCalibration) -> None:

@@ -86,7 +86,7 @@ def test_stereo_session(stereo: Path, capsys: pytest.CaptureFixture[str]) -> Non
     other = flat["baselines"][0]
     apart = abs(other["value_mm"] - baseline["value_mm"])
     assert apart < 2.0 * np.hypot(other["sigma_mm"], baseline["sigma_mm"])
-    assert flat["overdispersion"] > 1.5 and any("scatter explains" in verdict for verdict in flat["verdicts"])
+    assert flat["overdispersion"] > 1.5 and any("corner noise explains" in verdict for verdict in flat["verdicts"])
     assert abs(other["value_mm"] - BASELINE_MM[0]) < 2.0 * other["sigma_mm"]
 
 

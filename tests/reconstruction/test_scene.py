@@ -63,9 +63,9 @@ def test_matches_that_agree_with_nothing_are_not_called_a_wrong_pose_type(rng):
 
 def test_images_without_texture_have_nothing_to_align(rng):
     flat = [np.clip(120.0 + rng.normal(0.0, 2.0, (200, 300)), 0, 255).astype(np.uint8) for _ in range(2)]
-    with pytest.raises(DegenerateError, match=r"nothing looks alike in both images|none of [1-9]"):
+    with pytest.raises(DegenerateError, match=r"no feature matches in both images|none of [1-9]"):
         match_affine_features(*flat)
-    with pytest.raises(DegenerateError, match="nothing looks alike in both images"):
+    with pytest.raises(DegenerateError, match="no feature matches in both images"):
         match_affine_features(*(np.full((200, 300), 120, np.uint8) for _ in range(2)))
 
 
@@ -164,7 +164,7 @@ def test_a_camera_that_did_not_move_is_named(rng):
 @pytest.mark.parametrize("kind", ["general", "planar", "standard"])
 def test_chance_agreement_of_wrong_matches_is_refused(rng, kind):
     found, *_ = contaminated(rng, kind, outliers=1.0, count=60)
-    with pytest.raises(DegenerateError, match="agree"):
+    with pytest.raises(DegenerateError, match=r"agree|inliers"):
         reconstruct_scene(found, REGULAR, REGULAR, pose_type=kind)
 
 

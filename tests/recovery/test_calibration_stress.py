@@ -51,7 +51,7 @@ REFUSED = {"reg-brown-1-view": 1, "fish200-scaramuzza-1-view": 7, "fish200-scara
 """Refused, and rightly, in so many of twenty seeds: the only view is tilted by 9 degrees against the image, and with
 five terms of distortion its focal length comes out as 1064 +- 969 px where 1364 is true; one or two views leave the
 coefficients of a polynomial of degree 8 open beyond what arithmetic resolves, so that no covariance can be stated."""
-REFUSALS = ("leave the focal length open", "not identifiable from these images")
+REFUSALS = ("do not determine the focal length", "not identifiable from these images")
 
 
 def failure(case: Case, seed: int) -> str | None:

@@ -80,7 +80,7 @@ def test_wrong_squares_show_in_several_pairs() -> None:
 def test_a_misread_baseline_is_recognised_by_the_other_lengths() -> None:
     found = diagnose([reported(stated_mm=BASELINE_MM / 1.03)])
     assert len(found) == 1
-    assert "baseline comes out +3.0 %" in found[0]
+    assert "baseline is off by +3.0 %" in found[0]
     assert "misread" in found[0]
     both = diagnose([reported(stated_mm=BASELINE_MM / 1.03, distances=False, pair_id="a"), reported(pair_id="b")])
     assert len(both) == 1
@@ -107,15 +107,15 @@ def test_a_board_that_was_stretched_is_named_once_with_both_sides() -> None:
     boards = (BOARDS[0], wrong, BOARDS[2])
     found = diagnose([reported(boards=boards, scale=1.01, pair_id=name) for name in ("near", "far")])
     assert found == (
-        "board 'plane2': its squares come out 3.1 % wider than high against what is declared (50.00 x 50.00 mm would "
-        "fit, 50 x 51.5464 is declared); measure square_x_mm and square_y_mm",
+        "board 'plane2': its squares are reconstructed 3.1 % wider than high relative to the declaration (50.00 x "
+        "50.00 mm would fit, 50 x 51.5464 is declared); measure square_x_mm and square_y_mm",
     )
 
 
 def test_a_board_that_is_a_little_odd_explains_no_length_that_is_far_off() -> None:
     boards = (BOARDS[0], replace(BOARDS[1], square_y_mm=50.3), BOARDS[2])
     found = diagnose([reported(boards=boards, stated_mm=1.15 * BASELINE_MM)])
-    assert "baseline comes out -13.0 % while other lengths hold: it was probably misread" in found[0]
+    assert "baseline is off by -13.0 % while other lengths agree: it was probably misread" in found[0]
     assert "0.6 % wider than high" in found[1] and len(found) == 2
 
 
@@ -131,31 +131,31 @@ def test_boards_that_are_all_stretched_alike_are_one_cause() -> None:
     boards = tuple(replace(board, square_y_mm=50.0 / 0.97) for board in BOARDS)
     found = diagnose([reported(boards=boards, scale=1.02, pair_id=name) for name in ("near", "far")])
     assert found == (
-        "boards 'plane1', 'plane2', 'plane3': their squares come out 3.1 % wider than high against what is declared; "
-        "measure square_x_mm and square_y_mm, or look at the calibration's aspect",
+        "boards 'plane1', 'plane2', 'plane3': their squares are reconstructed 3.1 % wider than high relative to the "
+        "declaration; measure square_x_mm and square_y_mm, or check fx / fy of the calibration",
     )
 
 
 def test_a_board_that_fits_nowhere_is_named_with_its_size_or_its_place() -> None:
     one, alike = (FittingSquares(b, 1.25, "the 8x6 grid round (9, 7)") for b in (BOARDS[:1], BOARDS[1:]))
-    size = "would fit the others with squares of 62.5 mm (50 is declared)"
+    size = "would be consistent with the others with squares of 62.5 mm (50 is declared)"
     assert diagnose_squares([]) == ()
     assert diagnose_squares([one, alike]) == (
-        f"board 'plane1' {size}, or one of 'plane2', 'plane3', the 8x6 grid round (9, 7) in image 1, "
-        f"{size}; measure them again",
+        f"board 'plane1' {size}, or one of 'plane2', 'plane3', the 8x6 grid round (9, 7) in image 1, {size}; measure "
+        "them again",
     )
 
 
 def test_a_board_in_another_place_than_declared_is_named() -> None:
     found = diagnose([reported(angles=(91.6, 90.0, 88.4), distances=False)])
     assert len(found) == 1
-    assert "'plane2' does not stand as measured" in found[0]
+    assert "'plane2' is not at the measured angles" in found[0]
 
 
 def test_one_misread_angle_is_recognised_by_the_others() -> None:
     found = diagnose([reported(stated_deg=88.0, distances=False)])
     assert found == (
-        "pair 'made': plane1-plane2: 88 was probably misread: the images show 90.00 deg (the other angles hold); "
+        "pair 'made': plane1-plane2: 88 was probably misread: the images show 90.00 deg (the other angles agree); "
         "measure it again",
     )
 
@@ -266,7 +266,9 @@ def test_an_angle_in_radians_is_named() -> None:
 def test_baselines_of_two_pairs_that_were_exchanged_are_named() -> None:
     near = reported(pair_id="near", stated_mm=0.6 * BASELINE_MM, distances=False)
     far = reported(pair_id="far", scale=0.6, stated_mm=BASELINE_MM, distances=False)
-    words = "pairs 'near' and 'far': each baseline comes out as the other's is written: they were probably exchanged"
+    words = (
+        "pairs 'near' and 'far': each baseline matches the measurement of the other pair: they were probably exchanged"
+    )
     assert words in diagnose([near, far])
     off = reported(pair_id="far", scale=0.6, stated_mm=1.1 * BASELINE_MM, distances=False)
     assert not any("exchanged" in one for one in diagnose([near, off]))

@@ -62,7 +62,7 @@ def test_names_that_tell_nothing_leave_the_order(tmp_path: Path) -> None:
 def test_every_camera_must_have_some_moment(tmp_path: Path) -> None:
     for name, images in (("a", ("1", "2")), ("b", ("2", "3")), ("c", ("3", "1"))):
         _images(tmp_path / name, *images)
-    with pytest.raises(InputError, match="of no moment every camera has an image"):
+    with pytest.raises(InputError, match="no frame has an image of every camera"):
         moments_of(("a", "b", "c"), [tmp_path / name for name in "abc"])
 
 

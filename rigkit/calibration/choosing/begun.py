@@ -36,8 +36,8 @@ def about_camera(name: str, views: Sequence[BoardView]) -> Iterator[None]:
             place = cluster_numbers(images, [v.board.board_id for v in views], [v.pixels for v in views])
             if not place.any():
                 words = (
-                    f"calibration: all {len(set(images))} images show the board in one and the same place, and "
-                    f"count as one; move it from image to image ({words})"
+                    f"calibration: all {len(set(images))} images show the board at the same pose and count as "
+                    f"one; move it between images ({words})"
                 )
         if not name and words == str(error):
             raise

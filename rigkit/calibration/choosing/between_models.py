@@ -92,7 +92,7 @@ def rival_shapes(chosen: FittedModel, shapes: Sequence[FittedModel]) -> list[Riv
 def with_rivals(candidates: Sequence[Candidate], rivals: Sequence[Rival]) -> tuple[Candidate, ...]:
     """Return the candidates, with the probability added to the reason of those that are rivals."""
     likely = {_lens(rival.name): f"{100.0 * rival.likely:.0f} %" for rival in rivals}
-    counted = "of images drawn anew; by how much it differs is in all sigmas"
+    counted = "of bootstrap samples of the images; its difference is included in all sigmas"
     return tuple(
         one
         if one.chosen or _lens(one.name) not in likely

@@ -177,11 +177,11 @@ def described(options: list[FittedModel], chosen: FittedModel, *, rivals: bool =
         elif o.heldout_px is None or chosen.heldout_px is None:
             reason = "too few images to cross-validate: " + ("smallest BIC" if o is chosen else "larger BIC")
         elif o is chosen:
-            reason = "fewest numbers among those whose held-out error is as good as the smallest"
+            reason = "fewest parameters among those with the lowest held-out error, within its uncertainty"
         else:
-            reason = f"held-out error {100.0 * (o.heldout_px / chosen.heldout_px - 1.0):+.1f} % against the chosen one"
+            reason = f"held-out error {100.0 * (o.heldout_px / chosen.heldout_px - 1.0):+.1f} % vs the chosen one"
             if o.heldout_px < chosen.heldout_px:
                 more = o.count - chosen.count
-                reason += f", too little for {'one number' if more == 1 else f'{more} numbers'} more"
+                reason += f", not significant for {'one more parameter' if more == 1 else f'{more} more parameters'}"
         out.append(Candidate(o.name, o.count, o.fit.rms_px, o.heldout_px, o is chosen, reason))
     return out

@@ -162,6 +162,6 @@ def _shapes(
     options = [flat, *options] if board == "auto" else options
     spared = []
     if board == "auto" and "released" not in fits:
-        reason = "not tried: corners stray from the warp by no more than chance"
+        reason = "not tried: residuals of the warp are consistent with noise"
         spared.append(Candidate("board released", 0, float("nan"), None, False, reason))
     return compared(observations, options, folds, progress), spared

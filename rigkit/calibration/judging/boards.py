@@ -34,16 +34,16 @@ def diagnose_boards(c: Calibration, provided: str, *, sure: bool) -> list[Findin
         if board.bow_mm > BOW * extent:
             out.append(
                 Finding.look(
-                    f"{name} departs from a plane by {board.bow_mm:.2f} mm",
-                    "its shape is part of the solution, but glue it to something flat: it may bend otherwise next time",
+                    f"{name} is not flat: up to {board.bow_mm:.2f} mm off a plane",
+                    "its shape is solved for, but glue it to something flat: it may bend differently next time",
                 )
             )
         if sure and abs(board.aspect) > ASPECT:
             longer, other = ("x", "y") if board.aspect > 0 else ("y", "x")
             out.append(
                 Finding.look(
-                    f"{name} has squares {100 * abs(board.aspect):.2f} % longer in {longer} than stated, compared with "
-                    f"{other}{provided}",
+                    f"{name} has squares {100 * abs(board.aspect):.2f} % longer in {longer} relative to {other} than "
+                    f"declared{provided}",
                     "measure square_x_mm and square_y_mm again",
                 )
             )
@@ -69,8 +69,8 @@ def _spacing(name: str, board: BoardShape) -> list[Finding]:
         return []
     return [
         Finding.look(
-            f"{name} has its tags {found:.2f} of a tag's side apart, {pattern.spacing:g} is declared: its lengths in "
-            "mm, and those of all poses, are off",
+            f"{name} has spacing = {found:.2f}, {pattern.spacing:g} is declared: its lengths in mm and those of all "
+            "poses are wrong",
             "measure a tag's side and the gap, correct tag_mm and spacing, and calibrate again",
         )
     ]

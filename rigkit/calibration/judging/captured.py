@@ -76,7 +76,9 @@ class Extent:
     def where(self) -> str:
         """Words for the covered part of the image, for which an error holds; empty for nearly all of it."""
         return (
-            "" if self.share >= NEARLY_ALL else f" over the {100.0 * self.share:.0f} % of the image where boards were"
+            ""
+            if self.share >= NEARLY_ALL
+            else f" over the {100.0 * self.share:.0f} % of the image where boards were seen"
         )
 
 
@@ -122,8 +124,8 @@ def _tilts(c: Calibration) -> list[Finding]:
         return []
     return [
         Finding.bad(
-            f"the board is tilted by more than {TILTED_DEG:.0f} degrees against the image in {tilted} of "
-            f"{len(c.views)} views only",
+            f"the board is tilted by more than {TILTED_DEG:.0f} degrees in only {tilted} of {len(c.views)} views, so "
+            "the focal length is poorly determined",
             f"take at least {TILTED_VIEWS} with the board tilted by 20 to 50 degrees, about different axes",
         )
     ]
@@ -140,7 +142,7 @@ def _parallel(c: Calibration) -> list[Finding]:
     return [
         Finding.look(
             f"all boards are nearly parallel to each other (within {spread:.1f} degrees, rms)",
-            "tilt the board by 20 to 50 degrees, left and right, forward and back",
+            "tilt the board by 20 to 50 degrees, about different axes",
         )
     ]
 
@@ -156,9 +158,9 @@ def boards_never_rotated(c: Calibration) -> list[Finding]:
         return []
     return [
         Finding.look(
-            "the boards are the same way up in all images: squares that are longer one way than the other hide in fx "
-            "against fy",
-            "turn the board by a quarter of a turn in half of the images",
+            "the board was never rotated in the image plane: squares that are longer in one direction are absorbed by "
+            "fx / fy",
+            "rotate the board by 90 degrees in half of the images",
         )
     ]
 
@@ -191,15 +193,15 @@ def _too_few(images: Sequence[str], number: Sequence[int]) -> list[Finding]:
     count = len(set(number))
     if count >= FEW_IMAGES:
         return []
-    words = f"{count} images only" if count > 1 else "1 image only"
+    words = f"only {count} images" if count > 1 else "only 1 image"
     if len(set(images)) > count:
-        where = f"at {count} different places" if count > 1 else "in one and the same place"
-        words = f"{len(set(images))} images show the boards {where} only"
+        where = f"only {count} different poses" if count > 1 else "a single pose"
+        words = f"{len(set(images))} images show {where} of the boards"
     return [
         Finding(
             severity=Severity.BAD if count < FAR_TOO_FEW else Severity.LOOK,
             message=words,
-            remedy=f"take at least {FEW_IMAGES}, better 15, to know how good the calibration is elsewhere",
+            remedy=f"take at least {FEW_IMAGES}, better 15",
         )
     ]
 
@@ -211,11 +213,11 @@ def _repeated(images: Sequence[str], number: Sequence[int]) -> list[Finding]:
     if not again:
         return []
     one, other = next(iter(again.items()))
-    what = f"image '{one}' shows" if len(again) == 1 else f"{len(again)} images, '{one}' the first, show"
+    what = f"image '{one}' shows" if len(again) == 1 else f"{len(again)} images, the first of them '{one}', show"
     return [
         Finding.look(
-            f"{what} the board where another one does ('{other}'): they count as one",
-            "move the board from image to image",
+            f"{what} the board at the pose of another image ('{other}'): near-duplicates count as one image",
+            "move the board between images",
         )
     ]
 
@@ -227,7 +229,9 @@ def _distances(c: Calibration) -> list[Finding]:
     near, far = quantiles_of(corner_ranges(c), [0.05, 0.95])
     if far > ONE_DISTANCE * near:
         return []
-    return [Finding.look("all boards were at one distance", "hold some at half and some at double of it")]
+    return [
+        Finding.look("all boards were at the same distance", "take some images at half and some at twice the distance")
+    ]
 
 
 def extrapolated(c: Calibration, extent: Extent, far: FarProjection) -> list[Finding]:
@@ -241,8 +245,8 @@ def extrapolated(c: Calibration, extent: Extent, far: FarProjection) -> list[Fin
         return []
     return [
         Finding.look(
-            f"in the {100 - round(100.0 * extent.share)} % of the image where no boards were the lens is extrapolated, "
-            f"and uncertain by {digits(typical)} px (one standard deviation, rms)",
-            "hold the board there as well, up to the corners of the image",
+            f"{100 - round(100.0 * extent.share)} % of the image has no board corners: there the lens model is "
+            f"extrapolated, with an uncertainty of {digits(typical)} px (one standard deviation, rms)",
+            "take images with the board there, up to the image corners",
         )
     ]

@@ -52,31 +52,33 @@ LENS_ROUNDS, LENS_TOLERANCE = 2, 1e-6
 CHANGES = {
     "focus": Finding.look(
         "the focal length differs from image to image",
-        "switch autofocus, zoom and focus breathing off (fix the focus with a screw or tape), and retake all",
+        "switch autofocus and zoom off (fix the focus with a screw or tape), and retake all images",
     ),
     "lens": Finding.look(
-        "the picture is scaled and shifted on the sensor from image to image (focus, zoom or stabilisation)",
-        "switch autofocus, zoom and image stabilisation off, and retake all, unless a program cropped, turned or "
-        "resized some",
+        "focal length and principal point differ from image to image (focus, zoom or stabilisation)",
+        "switch autofocus, zoom and image stabilisation off, and retake all images, unless a program cropped, rotated "
+        "or resized some",
     ),
     "shift": Finding.look(
         # After its pose a board determines two parameters of the image's change at first order: those of a shear.
-        "the picture is shifted on the sensor from image to image, or sheared while it was read row by row",
-        "switch image stabilisation off, hold camera and board still, and retake all, unless a program turned or "
-        "cropped some",
+        "the principal point differs from image to image (stabilisation), or images are sheared by a rolling shutter",
+        "switch image stabilisation off, hold camera and board still, and retake all images, unless a program rotated "
+        "or cropped some",
     ),
     "rows": Finding.look(
-        "boards are sheared as if they moved while the image was read row by row (rolling shutter)",
-        "hold camera and board still while an image is taken, on a stand, or expose for a shorter time",
+        "boards are sheared as by motion with a rolling shutter",
+        "fix camera and board (tripod) for each image",
     ),
-    "bend": Finding.look("the board is bent otherwise in every image", "glue it to something stiff, and retake all"),
+    "bend": Finding.look(
+        "the board bends differently in every image", "glue it to something stiff, and retake all images"
+    ),
 }
 """Finding for each kind of change of `ViewEvidence.changes` ("lens" is focus and shift)."""
 
 OF_LENS = ("focus", "shift", "lens")
 """The last is both of the others, for a zoom about another centre than that of the lens."""
 MOTION = ("rows", NO_CHANGE)
-MOVED = replace(CHANGES["rows"], message="boards or the camera moved while the image was read (rolling shutter)")
+MOVED = replace(CHANGES["rows"], message="the board or the camera moved while the image was read out (rolling shutter)")
 """After the pose, motions over rows and over columns are hard to distinguish. Where rows are best, and both explain
 nearly everything, far better than all else, it is a motion, unless a bend of each board explains most of it, too: that
 is an error of the lens or board model."""
@@ -138,7 +140,7 @@ def changing(
         return []
     if best in but:
         return []
-    message = f"{found.message}: that explains {100.0 * changes[best].share:.0f} % of the squares of all residuals"
+    message = f"{found.message}: explains {100.0 * changes[best].share:.0f} % of the sum of squared residuals"
     return [replace(found, message=message)]
 
 

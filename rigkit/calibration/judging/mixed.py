@@ -49,8 +49,8 @@ def two_cameras(calibration: Calibration, number: IntArray) -> list[Finding]:
         return []
     return [
         Finding.bad(
-            f"two cameras are mixed in these images: between '{images[start[0]]}' and '{images[end[0]]}', and "
-            f"{alike - 1} other pairs of images, the board has moved in one and the same way",
+            f"images of two cameras are mixed: the board moves in the same way between '{images[start[0]]}' and "
+            f"'{images[end[0]]}' and in {alike - 1} other pairs of images, as in stereo pairs",
             "calibrate each camera from its own images, or both as a rig with [[cameras]]",
         )
     ]

@@ -60,19 +60,18 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
         if distance is not None:
             other, one = images[int(np.argmax(named))], images[int(np.argmin(named))]
             message = (
-                f"two cameras are mixed in these images: those called like '{one}' and those called like '{other}' are "
-                f"of different lenses ({distance:.0f} standard deviations)"
+                f"images of two cameras are mixed: the lenses of those named like '{one}' and like '{other}' differ "
+                f"({distance:.0f} standard deviations)"
             )
             return (Finding.bad(message, "calibrate each camera from its own images"),)
     distance = _lens_difference_sigmas(observations, fit, state, number, later, scores)
     if distance is None or (chance := scores.chance(observations.clusters(), number)) > CHANCE:
         return ()
     message = (
-        f"the lens (or the board) was another one from '{images[first]}' on ({distance:.0f} standard deviations; the "
-        f"chance that images in any order are parted so clearly is {chance:.2g} at most): another camera, or focus, "
-        f"zoom or mount moved; {SIGMAS_DO_NOT_HOLD}"
+        f"the lens (or the board) changed at image '{images[first]}' ({distance:.0f} standard deviations, p <= "
+        f"{chance:.2g} for a split at any image): another camera, focus, zoom or mount; {SIGMAS_DO_NOT_HOLD}"
     )
-    return (Finding.bad(message, "calibrate the images before it and those from it on apart, or retake all"),)
+    return (Finding.bad(message, "calibrate the images before it and those from it on separately, or retake all"),)
 
 
 def moment(order: Sequence[str], some: Collection[str]) -> str:

@@ -58,7 +58,7 @@ NOT_FOLLOWED = 1e-10
 """Relative singular value up to which a direction common to all images is undetermined."""
 DISTANCES = (0.05, 0.95)
 """Quantiles of the corners' distances that are reported."""
-NOT_ONE_POINT = "the lens does not look from one point"
+NOT_ONE_POINT = "the lens is not central"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -180,10 +180,10 @@ def moving_pupil(calibration: Calibration, correlation: float, far: FarProjectio
     moved = abs(pupil.mm_per_rad2) * rim**2
     return [
         Finding.look(
-            f"{NOT_ONE_POINT}: its entrance pupil moves by at least {moved:.1f} mm from the "
-            f"middle to the outermost corners, which boards {near:.0f} to {away:.0f} mm away show; what is far away is "
-            f"off by at least {off:.2f} px",
-            "take boards about as far away as what is to be measured (a larger board fills as much of the image)",
+            f"{NOT_ONE_POINT}: its entrance pupil moves by at least {moved:.1f} mm between the optical axis and the "
+            f"outermost corners (boards {near:.0f} to {away:.0f} mm away), which is not modelled; distant points are "
+            f"projected with an error of at least {off:.2f} px",
+            "calibrate at the distance of what is to be measured (with a larger board)",
         )
     ]
 
@@ -196,10 +196,10 @@ def modelled_pupil(calibration: Calibration) -> list[Finding]:
     mm, sigma = calibration.pupil.shift_mm(rim)
     return [
         Finding.good(
-            f"{NOT_ONE_POINT}, and is calibrated so: its entrance pupil moves by {mm:.2f} +- "
-            f"{calibration.widening * sigma:.2f} mm from the middle to the outermost corners ({np.degrees(rim):.0f} "
-            f"degrees), as boards {near:.0f} to {away:.0f} mm away show; formats of central cameras leave it out, "
-            "exact far away"
+            f"{NOT_ONE_POINT}, which is modelled: its entrance pupil moves by {mm:.2f} +- "
+            f"{calibration.widening * sigma:.2f} mm between the optical axis and the outermost corners "
+            f"({np.degrees(rim):.0f} degrees; boards {near:.0f} to {away:.0f} mm away); exports to central models omit "
+            "it and are exact for distant points only"
         )
     ]
 

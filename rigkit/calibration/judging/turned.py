@@ -39,7 +39,7 @@ MIN_FIRST_GAIN = 0.1
 """Part of the squares that flipping views back must explain, with lens and boards held, before it is solved for: 0.4 to
 0.6 for REAL and SIMULATED sessions with every fourth image mirrored, 0 to 0.01 for the unchanged sessions."""
 WAYS = {
-    "turned by half a turn": np.array([-1.0, -1.0]),
+    "rotated by 180 degrees": np.array([-1.0, -1.0]),
     "mirrored left to right": np.array([-1.0, 1.0]),
     "mirrored top to bottom": np.array([1.0, -1.0]),
 }
@@ -189,7 +189,7 @@ def _finding_of(back: _Back, before: float, evidence: ViewEvidence) -> Finding |
     names = [view.image for view in back.observations.views]
     flipped = list(dict.fromkeys(name for name, of in zip(names, at, strict=True) if of == (part <= 0.5)))
     return Finding.bad(
-        f"{len(flipped)} of {len(set(names))} images are {back.way}, like '{flipped[0]}', or all but these: "
-        f"put back they are of one lens, and {100.0 * (1.0 - left):.0f} % of the squares of all residuals are gone",
-        "take them as the camera wrote them, and calibrate again",
+        f"{len(flipped)} of {len(set(names))} images (such as '{flipped[0]}'), or all others, are {back.way}: undoing "
+        f"that removes {100.0 * (1.0 - left):.0f} % of the sum of squared residuals",
+        "use the image files as the camera wrote them, and calibrate again",
     )

@@ -28,11 +28,11 @@ MIN_LEAD = 6.0
 evidence (Kass and Raftery, "Bayes factors", J. Am. Stat. Assoc. 90, 1995). For SIMULATED amounts of one kind (normal,
 uniform, or Student's) it was -8 with 8 images and -9 with 20 at the least in 400 draws each, 0 to -4 in a hundredth."""
 KINDS_REMEDY = (
-    "look for another camera, another zoom or focus, or images that a program has turned, mirrored, cropped, resized "
-    "or undistorted, and calibrate each kind from its own images"
+    "look for another camera, zoom or focus, or images that a program rotated, mirrored, cropped, resized or "
+    "undistorted; calibrate each group separately"
 )
 """Remedy for images of two kinds."""
-SIGMAS_DO_NOT_HOLD = "the uncertainties that are stated do not hold"
+SIGMAS_DO_NOT_HOLD = "the stated uncertainties are invalid"
 """Consequence for the result, in messages."""
 SIDES_ROUNDS = 8
 """Maximal number of rounds in which images change sides."""
@@ -88,8 +88,7 @@ def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | Non
     sides = [[v.image for v, of in zip(views, best.second, strict=True) if of == kind] for kind in (False, True)]
     like = " and ".join(f"{len(set(images))} like '{images[0]}'" for images in sides)
     return Finding.bad(
-        f"the images are of two kinds, as if two lenses had taken them, or one at two settings: {like}{how}; "
-        f"{SIGMAS_DO_NOT_HOLD}",
+        f"the images form two groups that need different lens parameters: {like}{how}; {SIGMAS_DO_NOT_HOLD}",
         KINDS_REMEDY,
     )
 

@@ -50,9 +50,7 @@ ODD_IMAGE_RATIO = 3.5
 """The same from which the calibration is not called good. It does not tell whether the image is of another camera: in
 15 REAL captures images of the camera itself have up to 3.9 (bouguet's left08); an image of another camera among those
 of bouguet and bumblebee2 has 1.1 to 4.9 in 49 of 50 cases."""
-ODD_IMAGE_REMEDY = (
-    "look whether the board or the camera moved, another camera took it or a program mirrored it, and retake it"
-)
+ODD_IMAGE_REMEDY = "look for motion blur, a moved board, another camera or a mirrored image, and retake it"
 RINGS = 4
 """Number of rings about the image centre in which residuals are compared: all corners scatter more towards the rim."""
 MAX_OUTLIER_SHARE = 0.2
@@ -200,7 +198,7 @@ def _not_converged(c: Calibration, in_force: Collection[str]) -> list[Finding]:
     return [
         Finding.bad(
             f"the solver did not converge ({c.convergence.reason}): the model may not fit this lens",
-            f"{other}add views with the board tilted",
+            f"{other}add images with the board tilted",
         )
     ]
 
@@ -219,9 +217,9 @@ def _of_another_kind(c: Calibration, order: Sequence[str]) -> list[Finding]:
     if not images:
         return []
     used = {view.image for view in c.views}
-    what = f"{len(images)} of {len(used) + len(images)} images contradict the others and are left out, "
+    what = f"{len(images)} of {len(used) + len(images)} images are inconsistent with the others and left out, "
     at = moment([image for image in dict.fromkeys(order) if image in used or image in images], images)
-    return [Finding.look(what + (f"all {at}" if at else f"'{images[0]}' the first"), KINDS_REMEDY, images[0])]
+    return [Finding.look(what + (f"all {at}" if at else f"the first of them '{images[0]}'"), KINDS_REMEDY, images[0])]
 
 
 def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[Finding]:
@@ -231,9 +229,7 @@ def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -
     dropped = [(image, reason) for image, reason in dropped if image not in contradicted]
     used = {view.image for view in views}
     parts = [(image, reason) for image, reason in dropped if image in used and reason != OTHER_GRIDS]
-    found = [
-        Finding.look(f"of image '{image}' something is left out: {reason}", image=image) for image, reason in parts
-    ]
+    found = [Finding.look(f"image '{image}' is partly left out: {reason}", image=image) for image, reason in parts]
     return [*_images_left_out([(image, reason) for image, reason in dropped if image not in used]), *found[:NAMED]]
 
 
@@ -243,7 +239,7 @@ def _images_left_out(dropped: Sequence[tuple[str, str]]) -> list[Finding]:
     reasons = Counter(reason for _, reason in dropped)
     first = {reason: image for image, reason in reversed(dropped)}
     return [
-        Finding.look(f"{count} images are left out, '{first[reason]}' the first: {reason}")
+        Finding.look(f"{count} images are left out, the first of them '{first[reason]}': {reason}")
         if count > 1
         else Finding.look(f"image '{first[reason]}' is left out: {reason}", image=first[reason])
         for reason, count in reasons.most_common(NAMED)
@@ -264,7 +260,9 @@ def _coverage(c: Calibration) -> list[Finding]:
     empty = (count < CELL_CORNERS) & valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(ASKED_DEG)))
     if not empty.any():
         return []
-    return [Finding.look(f"no corners in the {_in_words(empty)} of the image", "hold the board there, tilted")]
+    return [
+        Finding.look(f"no corners in the {_in_words(empty)} of the image", "take images with the board there, tilted")
+    ]
 
 
 def _in_words(cells: BoolArray) -> str:
@@ -305,7 +303,7 @@ def _views(c: Calibration) -> tuple[list[Finding], list[Finding]]:
         view = c.views[i]
         far = int((~view.kept & ~(np.linalg.norm(view.residuals_px, axis=1) <= SMALL_PX)).sum())
         if times[i] > MAX_RATIO_OF_MEDIANS and middle[i] > SMALL_PX:
-            what = f"has a median residual of {middle[i]:.3f} px, {times[i]:.1f} times the usual one there"
+            what = f"has a median residual of {middle[i]:.3f} px, {times[i]:.1f} times that of the other images there"
         elif far > MAX_OUTLIER_SHARE * lengths[i]:
             what = f"has {far} outliers among its {lengths[i]} corners"
         else:
@@ -330,14 +328,16 @@ def _pattern(c: Calibration, correlation: float, in_force: Collection[str], name
     cause is `named` already."""
     if correlation < PATTERN:
         return []
-    what = f"residuals of neighbouring corners agree (correlation {correlation:.2f}): "
+    what = f"residuals of neighbouring corners are correlated ({correlation:.2f}): "
     shapes = "board_shape" in in_force or any(board.kind == "released" for board in c.boards)
     if not shapes:
-        return [Finding.look(what + "the board's shape or the lens model does not fit", 'try board_shape = "auto"')]
+        return [
+            Finding.look(what + "the board is not flat, or the lens model does not fit", 'try board_shape = "auto"')
+        ]
     if "model" not in in_force:
-        return [Finding.look(what + "the lens model, or the board's shape, does not quite fit", 'try model = "auto"')]
-    what += "neither the lens models nor the boards' shapes follow all of it, so that something differs between images"
-    remedy = "fix focus and stabilisation, hold camera and board still, take a board that does not bend"
+        return [Finding.look(what + "the lens model or the board shape does not fit", 'try model = "auto"')]
+    what += "no lens model or board shape explains it, so something changes between images"
+    remedy = "fix the focus, switch stabilisation off, hold camera and board still, use a stiff board"
     return [] if named else [Finding.look(what, remedy)]
 
 
@@ -346,9 +346,9 @@ def _overfit(c: Calibration) -> list[Finding]:
         return []
     return [
         Finding.look(
-            f"held-out RMS is {c.heldout_rms_px / c.rms_px:.2f} times the training RMS: the images are too few for "
-            "this model, or some image is unlike the others",
-            "take more",
+            f"held-out RMS is {c.heldout_rms_px / c.rms_px:.2f} times the training RMS (overfitting): too few images "
+            "for this model, or an image inconsistent with the others",
+            "take more images",
         )
     ]
 
@@ -361,16 +361,16 @@ def _uncertain(c: Calibration, far: FarProjection) -> list[Finding]:
             return []
         return [
             Finding.look(
-                f"the projection is uncertain by {typical:.2f} px (one standard deviation) where the boards were, more "
-                f"than the error of {error:.2f} px that the images show",
-                "take more views, with the board tilted",
+                f"the projection uncertainty where boards were seen, {typical:.2f} px (one standard deviation), "
+                f"exceeds the reprojection error, {error:.2f} px",
+                "take more images, with the board tilted",
             )
         ]
-    what = f"the projection is uncertain by up to {worst:.1f} px (one standard deviation) where the boards were"
+    what = f"the projection uncertainty reaches {worst:.1f} px (one standard deviation) where boards were seen"
     if not np.isfinite(worst):
-        return [Finding.bad(what, "take more views, with the board tilted")]
+        return [Finding.bad(what, "take more images, with the board tilted")]
     what += f", most in the {_cell(c, far.corners.pixels[np.nanargmax(inside[far.rays_valid])])} of the image"
-    return [Finding.bad(what, "take more views there, with the board tilted")]
+    return [Finding.bad(what, "take more images there, with the board tilted")]
 
 
 def _outliers(c: Calibration, named: Collection[str | None]) -> list[Finding]:
@@ -382,7 +382,7 @@ def _outliers(c: Calibration, named: Collection[str | None]) -> list[Finding]:
     image, count = Counter(outlier.image for outlier in far).most_common(1)[0]
     return [
         Finding.look(
-            f"{100 * share:.1f} % of the corners are outliers, most of them ({count}) in '{image}'",
+            f"{100 * share:.1f} % of the corners are outliers, most ({count}) in image '{image}'",
             "check exposure, focus and motion blur there",
         )
     ]

@@ -53,9 +53,9 @@ def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[
     listed = ", ".join(f'"{name}"' for name in group) if not alike else "..."
     return (
         Finding.look(
-            f"the {words} kept their places to each other in {joint.shared_count} images",
-            f"{how} [[rigid_boards]] with boards = [{listed}] in the session: the camera gets surer, and the "
-            "boards' angles come out",
+            f"the {words} kept their relative poses in {joint.shared_count} images: they may be rigidly mounted",
+            f"{how} [[rigid_boards]] with boards = [{listed}] in the session: this lowers the camera's uncertainty "
+            "and yields the boards' relative poses",
         ),
     )
 

@@ -162,8 +162,8 @@ def solve_jointly(
     usual_px, size_px = typical_distance_px(observations, cost), _boards_px(seen)
     if usual_px > NOTHING_IN_COMMON * size_px:
         raise DegenerateError(
-            f"rig: views that should share their boards' poses disagree by {usual_px:.0f} px on where the boards are, "
-            f"which are {size_px:.0f} px large; {_advice(seen)}"
+            f"rig: the views of a frame disagree by {usual_px:.0f} px on the boards' poses (boards are {size_px:.0f} "
+            f"px large); {_advice(seen)}"
         )
     if typical_sigmas > DISAGREES:
         observations = replace(observations, held=_held(single, sigma, typical_sigmas**2 - 1.0))
@@ -230,14 +230,14 @@ def _disagreement(cost: Mapping[Key, float], sigma: float, typical: tuple[float,
     worst = sorted(cost, key=lambda key: -cost[key])[:NAMED]
     times = {frame: np.sqrt(cost[frame, target]) / max(sigma, MIN_PX) for frame, target in worst}
     frames = ", ".join(f"'{frame}' ({value:.0f})" for frame, value in times.items())
-    what = "the images of a frame are not of one moment, or the rig gives way: that cameras see boards in one place"
-    remedy = "trigger the cameras together, and let boards and rig rest while they do"
+    what = "the images of a frame are not simultaneous, or the rig is not rigid: one pose per board for all cameras"
+    remedy = "trigger the cameras together, and hold boards and rig still"
     if not several:
-        what, remedy = "the boards give way against each other: that they keep their places", "fasten the boards"
+        what, remedy = "the boards are not rigidly mounted: one pose for all of them", "fasten the boards"
     message = (
-        f"{what} costs {typical_sigmas:.1f} times the corners' noise ({usual_px:.2g} px a corner), most in the frames "
-        f"{frames}; the lenses are held near what each camera says alone, and the sigmas of the rig rest on how "
-        "far its frames disagree"
+        f"{what} leaves residuals of {typical_sigmas:.1f} times the corner noise ({usual_px:.2g} px), most in frames "
+        f"{frames}; intrinsics are held near those of each camera alone, and the rig's sigmas follow from the "
+        "disagreement between frames"
     )
     return Finding(severity=Severity.BAD if typical_sigmas > BAD else Severity.LOOK, message=message, remedy=remedy)
 
@@ -323,18 +323,17 @@ def _require_agreement(views: RigViews, left: int, shared: int) -> None:
     advice = _advice(views.seen)
     if left > MIN_SHARE * shared:
         raise DegenerateError(
-            f"rig: {left} of {shared} boards that several views share had to be left out because the views disagree on "
-            f"where they are; {advice}"
+            f"rig: the views disagree on the poses of {left} of {shared} shared boards, too many to leave out; {advice}"
         )
     try:
         mounts_of(views)
     except InputError as error:
         raise DegenerateError(
-            f"{error}; {left} boards were left out because the cameras disagree on them: {advice}"
+            f"{error}; {left} boards were left out because the cameras disagree on their poses: {advice}"
         ) from error
 
 
 def _advice(seen: Sequence[FrameObservations]) -> str:
     if len(seen) > 1:
-        return "check that the images of a frame were taken at one moment, and none is among those of another camera"
-    return "check that the boards do not move against each other"
+        return "check that the images of a frame were taken at the same time, and that no two cameras are mixed up"
+    return "check that the boards are rigidly mounted to each other"

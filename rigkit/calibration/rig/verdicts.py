@@ -51,7 +51,7 @@ def _lags(rig: RigCalibration) -> list[Finding]:
     if not rig.lags:
         return []
     words = [*lag_words(rig), *_readout_words(rig)]
-    return [Finding.good(f"{'; '.join(words)}: boards are taken where they were then")]
+    return [Finding.good(f"{'; '.join(words)}; board poses are interpolated to these times")]
 
 
 def lag_words(rig: RigCalibration) -> list[str]:
@@ -60,15 +60,15 @@ def lag_words(rig: RigCalibration) -> list[str]:
     for name, lag in rig.lags.items():
         when = "after" if lag.frames >= 0.0 else "before"
         out.append(
-            f"camera '{name}' takes its pictures {abs(lag.frames):.3f} +- {lag.sigma:.3f} of the time between two "
-            f"frames {when} '{first}' (they vary by {lag.scatter:.3f})"
+            f"camera '{name}' exposes {abs(lag.frames):.3f} +- {lag.sigma:.3f} frame periods {when} '{first}' (jitter "
+            f"{lag.scatter:.3f})"
         )
     return out
 
 
 def _readout_words(rig: RigCalibration) -> list[str]:
     return [
-        f"camera '{name}' takes {own.frames:.3f} +- {own.sigma:.3f} of that time to read an image, row by row"
+        f"the rolling shutter of camera '{name}' reads an image in {own.frames:.3f} +- {own.sigma:.3f} frame periods"
         for name, own in rig.readouts.items()
     ]
 
@@ -85,9 +85,8 @@ def _left_out(rig: RigCalibration) -> list[Finding]:
         return []
     return [
         Finding.look(
-            f"{len(rig.left_out)} of {total} boards that several views share were left out because the views disagree "
-            "on them",
-            "fix rig and boards while the images are taken, and trigger the cameras together",
+            f"{len(rig.left_out)} of {total} shared board poses are left out as outliers: the views disagree on them",
+            "hold rig and boards still during the capture, and trigger the cameras together",
         )
     ]
 
@@ -97,8 +96,8 @@ def _few_shared(rig: RigCalibration) -> list[Finding]:
         return []
     return [
         Finding.look(
-            f"{rig.shared_count} boards are seen by several cameras at once",
-            f"take at least {FEW_SHARED} frames in which they are",
+            f"only {rig.shared_count} board poses are seen by several cameras at once",
+            f"take at least {FEW_SHARED} frames in which several cameras see the board",
         )
     ]
 
@@ -110,9 +109,9 @@ def _uncertain(rig: RigCalibration, far: Sequence[FarProjection]) -> list[Findin
         if worst > UNCERTAIN_PX:
             out.append(
                 Finding.bad(
-                    f"the projection of camera '{camera.name}' is uncertain by up to {worst:.1f} px where the boards "
-                    "were",
-                    "take more frames, the boards tilted",
+                    f"the projection uncertainty of camera '{camera.name}' reaches {worst:.1f} px where boards were "
+                    "seen",
+                    "take more frames, with the boards tilted",
                 )
             )
     for a, b in combinations([c.name for c in rig.cameras], 2):
@@ -120,9 +119,9 @@ def _uncertain(rig: RigCalibration, far: Sequence[FarProjection]) -> list[Findin
         if transfer is not None and transfer.median_px > UNCERTAIN_PX:
             out.append(
                 Finding.bad(
-                    f"where points of camera '{a}' must appear in camera '{b}' is uncertain by "
-                    f"{transfer.median_px:.1f} px",
-                    "take more frames that both see, or that link them",
+                    f"points transferred from camera '{a}' to camera '{b}' are uncertain by {transfer.median_px:.1f} "
+                    "px",
+                    "take more frames in which both see the board, or that link them by other cameras",
                 )
             )
     return out
@@ -131,8 +130,8 @@ def _uncertain(rig: RigCalibration, far: Sequence[FarProjection]) -> list[Findin
 def _timing(rig: RigCalibration) -> str:
     """Return what may be wrong with the moments of the images, in words."""
     if rig.lags:
-        return "the cameras' lags do not explain all of it"
-    return "the cameras were not quite of one moment"
+        return "the cameras' time lags vary"
+    return "the cameras were not exactly synchronised"
 
 
 def _overdispersed(rig: RigCalibration, in_force: Collection[str]) -> list[Finding]:
@@ -141,8 +140,8 @@ def _overdispersed(rig: RigCalibration, in_force: Collection[str]) -> list[Findi
     automatic = " and ".join(f'{name} = "auto"' for name in ("board_shape", "model") if name not in in_force)
     return [
         Finding.look(
-            f"the frames disagree by {rig.overdispersion:.1f} times what the corners' scatter explains; all sigmas "
-            f"count it in. Boards or lenses are not quite as the models say, or {_timing(rig)}",
+            f"overdispersion: frames disagree {rig.overdispersion:.1f} times as much as corner noise explains "
+            f"(included in all sigmas): boards or lenses depart from their models, or {_timing(rig)}",
             (f"try {automatic}, or " if automatic else "take ") + "a flatter board",
         )
     ]
@@ -159,11 +158,11 @@ def _worse(rig: RigCalibration) -> list[Finding]:
         return []
     return [
         Finding.look(
-            f"frames that took no part are off by {together / typical:.1f} times as much as for the cameras alone: "
+            f"held-out RMS is {together / typical:.1f} times that of the cameras alone: "
             + (
-                f"{_timing(rig)}, or a mount gives way"
+                f"{_timing(rig)}, or the rig is not rigid"
                 if len(rig.cameras) > 1
-                else "the boards give way against each other"
+                else "the boards are not rigidly mounted"
             )
         )
     ]

@@ -103,8 +103,8 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
         if np.isfinite(robust_sigma(fit, observations)):
             return fit
     raise DegenerateError(
-        f"calibration: no {model.model} camera explains the views even roughly; take views in which the board is "
-        "tilted, and check the board's size"
+        f"calibration: no {model.model} camera fits the views, even roughly; check columns, rows and size of the "
+        "board, and take views in which it is tilted"
     )
 
 
@@ -236,8 +236,8 @@ def _sigma(state: State, total: float, kept: BoolArray) -> float:
     freedom = 2 * int(kept.sum()) - state.camera.parameters.size - 6 * views
     if freedom <= 0:
         raise DegenerateError(
-            f"calibration: a {state.camera.model} camera of {state.camera.parameters.size} numbers and the poses of "
-            f"{views} views are as many unknowns as their corners can tell, or more; take more views"
+            f"calibration: a {state.camera.model} camera of {state.camera.parameters.size} parameters and the poses of "
+            f"{views} views are at least as many unknowns as corner coordinates; take more views"
         )
     sigma = np.sqrt(total / freedom)
     return float(np.sqrt((total + prior * sigma**2) / freedom)) if prior else float(sigma)
@@ -269,6 +269,6 @@ def _exists(camera: Camera, step: FloatArray) -> bool:
 def not_identifiable(model: str) -> DegenerateError:
     """Return the error for a model whose parameters the images do not determine."""
     return DegenerateError(
-        f"calibration: a {model} camera is not identifiable from these images: other numbers show them as well; take a "
-        "simpler model, or views with the board tilted by 20 to 50 degrees in several directions and towards the rim"
+        f"calibration: a {model} camera is not identifiable from these images: other parameters fit equally well; use "
+        "a simpler model, or take views with the board tilted by 20 to 50 degrees, also near the image border"
     )

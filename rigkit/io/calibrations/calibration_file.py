@@ -119,8 +119,8 @@ def _calibration_in(data: dict[str, Any], path: str | Path) -> Calibration:
     missing = sorted(CALIBRATION_KEYS - LATER_KEYS - set(data))
     if "covariance" in missing and "camera" in data:
         raise InputError(
-            f"'{path}': a camera without its calibration, as of another program's file, which does not say how sure it "
-            "is; `rigkit calibrate` pictures of that camera, and give what that writes"
+            f"'{path}': a camera without covariance, as imported from another program; run `rigkit calibrate` on "
+            "images of that camera, and give its result"
         )
     if missing:
         raise InputError(f"'{path}': no {', '.join(missing)}; calibrate again")

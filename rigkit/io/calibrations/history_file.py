@@ -122,8 +122,8 @@ def _verdict(check: SentinelCheck) -> str:
     if check.holds:
         return "holds"
     if check.flipped:
-        return f"the pictures seem {check.flipped}: put back, they fit"
-    return "nothing that moved explains it" if check.unexplained else str(check.change)
+        return f"the images seem {check.flipped}; undoing that, it holds"
+    return "no change of the camera or rig explains it" if check.unexplained else str(check.change)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

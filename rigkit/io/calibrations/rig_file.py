@@ -86,7 +86,7 @@ class SavedRig:
         """Return `with_departures` and `sigma_px`; raises InputError if the file at `path` lacks them."""
         cameras, covariance = self.with_departures
         if covariance is None or self.sigma_px is None:
-            raise InputError(f"'{path}': the file does not say how sure the rig is; calibrate it with rigkit")
+            raise InputError(f"'{path}': the rig has no covariance; calibrate it with rigkit")
         return cameras, covariance, self.sigma_px
 
     @property

@@ -44,12 +44,12 @@ _FINDING: Schema = {
         obj(
             {
                 "severity": described(choice(*(str(s) for s in Severity)), "good, look, or bad: do not use"),
-                "message": described(TEXT, "what is the matter, and how one can tell"),
+                "message": described(TEXT, "what was found, with the evidence"),
                 "image?": described(TEXT, "which image it is about"),
                 "remedy?": described(TEXT, "what to do"),
             }
         ),
-        described(TEXT, "as former files have it"),
+        described(TEXT, "the same in files of earlier versions"),
     ]
 }
 _MADE = obj(
@@ -61,10 +61,10 @@ _MADE = obj(
     "by what, when, and from what it was made",
 )
 _FREEDOM = described(
-    nullable(NUMBER), "degrees of freedom of the covariances, which are Student's; null: too few images to know"
+    nullable(NUMBER), "degrees of freedom of the covariances (Student's t); null: too few images to estimate"
 )
 _HELDOUT = described(
-    nullable(NUMBER), "the headline: RMS over images that took no part, the lens frozen and only poses fitted"
+    nullable(NUMBER), "reprojection error on images not used, with fixed intrinsics and only board poses fitted"
 )
 _OF_CALIBRATION = of_dataclass(Calibration, only=("rms_px", "sigma_px", "overdispersion"))["properties"]
 _VIEW = obj(
@@ -72,7 +72,7 @@ _VIEW = obj(
         "image": described(TEXT, "its name"),
         "board_id": described(TEXT, "which board"),
         "cam_from_board": _POSE,
-        "rms_px?": described(nullable(NUMBER), "over the corners kept"),
+        "rms_px?": described(nullable(NUMBER), "reprojection error over the corners used"),
         "grid": described(matrix(columns=2), "column and row of each corner"),
         "pixels": described(matrix(columns=2), "the corners as measured"),
         "residuals_px": described(array(row(2, nullable(NUMBER))), "measured minus projected; null: does not project"),
@@ -85,7 +85,7 @@ _SHAPE = obj(
         "kind": described(TEXT, "flat, warp or released"),
         "points_mm": described(matrix(columns=3), "its corners, row by row"),
         "bow_mm?": described(NUMBER, "largest departure from a plane"),
-        "aspect?": described(NUMBER, "how much longer its squares are along x than stated, against y"),
+        "aspect?": described(NUMBER, "relative error of the squares' declared aspect, x over y"),
         "target?": DECLARED_BOARD,
     }
 )
@@ -96,12 +96,12 @@ _PUPIL = described(
             "mm_per_rad4": described(NUMBER, "e2"),
             "covariance": described(matrix(rows=2, columns=2), "of both"),
             "with_frame": described(
-                matrix(columns=2), "of both with what `frame_covariance`, in a rig `covariance`, is of"
+                matrix(columns=2), "cross-covariance with the quantities of `frame_covariance`, in a rig `covariance`"
             ),
         }
     ),
-    "how the entrance pupil moves: the ray at the angle t from the axis starts at e1 t^2 + e2 t^4 mm on it; missing: "
-    "all rays start at one point",
+    "moving entrance pupil: the ray at the angle t (rad) from the axis starts at e1 t^2 + e2 t^4 mm on it; missing: "
+    "central camera",
 )
 CALIBRATION_FILE = file(
     "rigkit.calibration/1",
@@ -112,77 +112,76 @@ CALIBRATION_FILE = file(
         **optional(_OF_CALIBRATION),
         "heldout_rms_px?": _HELDOUT,
         "freedom?": _FREEDOM,
-        "verdicts?": described(array(_FINDING), "what is good and what is not, the headline first"),
+        "verdicts?": described(array(_FINDING), "findings, the headline first"),
         "candidates?": described(array(of_dataclass(Candidate)), "models, degrees and board shapes tried"),
         "rivals?": rows(
             {"name": described(TEXT, "among the candidates"), "likely": described(NUMBER, "0 to 1"), "camera": _CAMERA},
-            "lenses of other models that the images support about as well, and how likely each is the better one",
+            "alternative models that the images support about as well, with the probability that each is better",
         ),
         "convergence?": described(of_dataclass(Convergence), "of the final solve"),
-        "dropped?": described(array(row(2, TEXT)), "image and why it was not used"),
+        "dropped?": described(array(row(2, TEXT)), "image and reason"),
         "outliers?": described(array(of_dataclass(Outlier)), "corners left out of views that were used"),
         "covariance?": described(matrix(), "of the parameters, in their order"),
         "frame_covariance?": described(matrix(), "of the parameters and the mean motion of the boards (rad, mm)"),
         "pupil?": _PUPIL,
-        "boards?": described(array(_SHAPE), "boards as the solution has them"),
+        "boards?": described(array(_SHAPE), "solved board shapes"),
         "views?": described(array(_VIEW), "the views used"),
     },
 )
 RIG_FILE = file(
     "rigkit.rig/1",
-    "Cameras on one mount",
+    "Cameras of a rig",
     {
         "made?": _MADE,
         "cameras": rows(
             {
                 "name": described(TEXT, "its name"),
-                "camera": described(_CAMERA, "as all cameras together have it"),
+                "camera": described(_CAMERA, "of the joint solution"),
                 "cam_from_rig": _POSE,
                 "rms_px": described(NUMBER, "training error in the rig"),
                 "outline_px?": described(matrix(columns=2), "convex, around all corners that it saw"),
                 "departures?": described(
                     obj({"modes": matrix(), "moves": matrix()}),
-                    "what its lens may do beyond its model: independent displacements of the image of one sigma each, "
-                    "and how much what `covariance` is of is off with them",
+                    "lens errors beyond the model: independent displacements of the image of one sigma each, and the "
+                    "changes that each makes to the quantities of `covariance`",
                 ),
                 "pupil?": _PUPIL,
                 "lag?": described(
                     obj({"frames": NUMBER, "sigma": NUMBER, "scatter": NUMBER}),
-                    "by how much it takes its pictures after the first, the standard deviation of that, and by how "
-                    "much its pictures lag differently, in the usual time between two frames",
+                    "time lag to the first camera, its standard deviation, and its jitter, in frame periods",
                 ),
                 "readout?": described(
                     obj(
                         {"frames": described(NUMBER, "that time"), "sigma": described(NUMBER, "its standard deviation")}
                     ),
-                    "how long it takes from the first row of an image to the last, in the time between two frames",
+                    "readout time of the rolling shutter, first to last row, in frame periods",
                 ),
             },
             "the first is the rig's frame",
             min_items=1,
         ),
         "rms_px?": described(NUMBER, "training error of all cameras together"),
-        "heldout_rms_px?": described(nullable(NUMBER), "of frames that took no part, one pose for all cameras"),
-        "sigma_px?": described(NUMBER, "standard deviation of a corner of median quality"),
-        "overdispersion?": described(NUMBER, "by how much more frames disagree than the corners' scatter explains"),
+        "heldout_rms_px?": described(
+            nullable(NUMBER), "held-out reprojection error of frames not used, one board pose for all cameras"
+        ),
+        "sigma_px?": described(NUMBER, "standard deviation of a corner of median quality, px"),
+        "overdispersion?": described(NUMBER, "overdispersion: disagreement of frames over what corner noise explains"),
         "freedom?": _FREEDOM,
         "scale_sigma?": described(NUMBER, "relative standard deviation of all lengths, from the boards' squares"),
         "covariance?": described(
-            matrix(), "of all parameters, camera by camera, then of the mounts of all but the first (rad, mm)"
+            matrix(), "of all intrinsics, camera by camera, then of the extrinsics of all but the first (rad, mm)"
         ),
-        "boards?": rows(
-            {"board_id": described(TEXT, "its name"), "target": DECLARED_BOARD}, "what was calibrated with"
-        ),
+        "boards?": rows({"board_id": described(TEXT, "its name"), "target": DECLARED_BOARD}, "boards used"),
         "baselines?": rows(
             {"from": TEXT, "to": TEXT, "value_mm": NUMBER, "sigma_mm": NUMBER}, "distances between cameras"
         ),
-        "verdicts?": described(array(_FINDING), "what is good and what is not, the headline first"),
-        "spread?": described(NUMBER, "what overdispersion was called"),
+        "verdicts?": described(array(_FINDING), "findings, the headline first"),
+        "spread?": described(NUMBER, "former name of overdispersion"),
     },
 )
 BOARD_RIG_FILE = file(
     "rigkit.board_rig/1",
-    "Boards on one mount",
+    "Rigidly mounted boards",
     {
         "rigs": rows(
             {
@@ -202,7 +201,7 @@ BOARD_RIG_FILE = file(
                     },
                     "the first is the target's frame",
                 ),
-                "covariance": described(matrix(), "of the places of all boards but the first (rad, mm)"),
+                "covariance": described(matrix(), "of the poses of all boards but the first (rad, mm)"),
             },
             "one entry a mount",
         )

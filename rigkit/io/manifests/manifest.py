@@ -42,7 +42,7 @@ _DOWN = [0.0, 0.98, 0.17]
 _LEVEL: Schema = {
     **obj(
         {
-            "sigma_deg?": described({**NUMBER, "minimum": 0}, "how well it held; 0 means exactly level", 0.2),
+            "sigma_deg?": described({**NUMBER, "minimum": 0}, "standard deviation of the level; 0: exactly level", 0.2),
             "down1?": described(row(3), "which way is down in camera 1, for planar motion", _DOWN),
             "down2?": described(row(3), "the same in camera 2", _DOWN),
         },
@@ -66,17 +66,18 @@ _PAIR_KEYS: Mapping[str, Schema] = {
     "level?": _LEVEL,
     "layout?": described(
         table(choice(*BOARD_SIDES)),
-        "where boards that look alike stand, from camera 1",
+        "positions of boards that look alike, seen from camera 1",
         {"plane1": "left", "plane2": "floor", "plane3": "right"},
     ),
     "planes?": described(choice(*PLANE_CHOICES), "of this pair, where it differs"),
     "truth?": obj(
-        {"baseline?": obj(measured("mm"), "distance of the two lenses"), **TRUTH_KEYS}, "what a person measured"
+        {"baseline?": obj(measured("mm"), "distance between the two entrance pupils"), **TRUTH_KEYS},
+        "measured ground truth",
     ),
 }
 DATASET_FILE = file(
     DATASET_SCHEMA,
-    "Pairs of images, and what a person measured of them",
+    "Pairs of images with measured ground truth",
     {
         "name": described(NAME, "of the data set", "my-lab"),
         "boards": rows(
@@ -85,7 +86,7 @@ DATASET_FILE = file(
                 "file?": described(TEXT, "of the board, or its keys here", "board.toml"),
                 **optional(BOARD_KEYS),
             },
-            "the boards that stand there",
+            "boards in the images",
             min_items=1,
         ),
         "cameras": rows(
@@ -100,11 +101,13 @@ DATASET_FILE = file(
             min_items=1,
         ),
         "pairs": rows(_PAIR_KEYS, "two images of the same boards each", min_items=1),
-        "images?": described(choice("real", "rendered"), "what they are: stands beside ratios to the paper's results"),
+        "images?": described(
+            choice("real", "rendered"), "real or rendered images: printed beside ratios to the paper's results"
+        ),
         "planes?": described(
             choice(*PLANE_CHOICES),
-            "what planes, angles and clouds are built on: each point by itself (free, the default), the points of a "
-            "board in one plane, or on its known lattice",
+            "planes for angles and clouds: free (every point by itself, the default), coplanar (points of a board in "
+            "one plane), or lattice (on its known grid)",
         ),
         "truth_table?": described(TEXT, "a CSV file with what was measured, kept in a spreadsheet", "truth.csv"),
     },

@@ -54,7 +54,7 @@ PUBLIC_FILE = file(
                 "value": described(NUMBER, "how much", 120.0),
                 "sigma?": described(POSITIVE, "where somebody stated one", 0.1),
                 "unit": choice("mm", "deg", "px"),
-                "how": described(TEXT, "by what it was measured: steel rule, set square, calipers", "calipers"),
+                "how": described(TEXT, "instrument: steel rule, set square, calipers", "calipers"),
             },
             "what is known of it",
         ),

@@ -213,12 +213,12 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
         alike = alike or twice
     if alike is not None:
         raise InputError(
-            f"{alike} would be of one moment by their names, so that nothing says what was taken at the same moment; "
-            'rename the images, or write frames = "order" if the sorted lists belong together one by one'
+            f"{alike} are simultaneous by their names, which is impossible; "
+            'rename the images, or write frames = "order" if the sorted lists correspond one by one'
         )
     raise InputError(
-        "no two cameras have an image of the same name or number, so nothing says what was taken at the same moment; "
-        'rename the images, or write frames = "order" if the sorted lists belong together one by one'
+        "no two cameras have an image of the same name or number, so simultaneous images are unknown; "
+        'rename the images, or write frames = "order" if the sorted lists correspond one by one'
     )
 
 

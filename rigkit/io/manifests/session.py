@@ -49,7 +49,7 @@ SESSION_NAME = "session.toml"
 
 _IMAGES = described({ANY_OF: [TEXT, texts()]}, "a pattern, or a list of files and patterns", "images/*.jpg")
 _MODEL_KEYS: Mapping[str, Schema] = {
-    "model?": described(choice("auto", *MODELS), "camera model; auto (default): the one that predicts best"),
+    "model?": described(choice("auto", *MODELS), "camera model; auto (default): the lowest held-out error"),
     "degree?": described(
         COUNT, "terms of brown (4, 5, 8), degree of scaramuzza; by default chosen by held-out error", 6
     ),
@@ -59,13 +59,17 @@ ONE_CAMERA_KEYS = ("schema", "images", "board", "boards", "model", "degree", "bo
 _CAMERA_KEYS: Mapping[str, Schema] = {
     "id": described(NAME, "its name", "left"),
     "images": _IMAGES,
-    "calibration?": described(TEXT, "file of a lens that stays as it is: only the mount is found", "left.json"),
+    "calibration?": described(
+        TEXT, "calibration file whose intrinsics are kept: only the extrinsics are solved", "left.json"
+    ),
     **_MODEL_KEYS,
 }
 _RIGID_KEYS: Mapping[str, Schema] = {
     "boards": described(texts(2), "boards mounted to each other", ["left", "floor", "right"]),
     "layout?": described(
-        table(choice(*BOARD_SIDES)), "which is which, of boards that look alike", {"left": "left", "floor": "floor"}
+        table(choice(*BOARD_SIDES)),
+        "relative positions, which identify boards that look alike",
+        {"left": "left", "floor": "floor"},
     ),
     **TRUTH_KEYS,
 }
@@ -82,18 +86,18 @@ SESSION_FILE = file(
         ),
         "frames?": described(
             choice("name", "number", "time", "order"),
-            "of several cameras, which images were taken together: those of one name, one number at the end of the "
-            "name, nearly one time as name, or one place in the sorted list",
+            "of several cameras, how simultaneous images are matched: by name, by the number at its end, by nearly "
+            "equal times as names, or by the position in the sorted list",
         ),
         "rig?": described(
-            TEXT, "file of a rig whose cameras stay as they are, lens and mount: others are added to it", "rig.json"
+            TEXT, "rig file whose intrinsics and extrinsics are kept: other cameras are added to it", "rig.json"
         ),
         "cameras?": rows(_CAMERA_KEYS, "several cameras, instead of images; the first is the rig's frame", min_items=2),
         "baselines?": described(
             array(between("mm", "a camera", "left", "right")),
-            "what a person measured between two lenses: judged, not used",
+            "measured distances between cameras: compared with the result, not used",
         ),
-        "rigid_boards?": rows(_RIGID_KEYS, "boards on one mount"),
+        "rigid_boards?": rows(_RIGID_KEYS, "rigidly mounted boards"),
     },
 )
 

@@ -16,8 +16,8 @@ def measured(unit: str) -> dict[str, Schema]:
     """Return the keys of a measurement in `unit`."""
     return {
         f"value_{unit}": described(POSITIVE, f"as measured, {unit}", {"deg": 90.0, "mm": 300.0}[unit]),
-        f"sigma_{unit}": described(POSITIVE, "how far off the measurement may well be: one standard deviation", 0.5),
-        "how": described(TEXT, "by what it was measured: steel rule, set square, calipers", "steel rule"),
+        f"sigma_{unit}": described(POSITIVE, "standard deviation of the measurement", 0.5),
+        "how": described(TEXT, "instrument: steel rule, set square, calipers", "steel rule"),
     }
 
 

@@ -117,7 +117,7 @@ def fuse_clouds(clouds: Sequence[PosedCloud]) -> FusedCloud:
     Merging reduces only independent noise, not the errors of poses and calibrations. Raises InputError without clouds.
     """
     if not clouds:
-        raise InputError("clouds: there is none to fuse")
+        raise InputError("clouds: no cloud to fuse")
     # The most certain clouds come first: others are merged into them.
     order = sorted(range(len(clouds)), key=lambda k: float(np.median(clouds[k].cloud.sigma_mm)))
     surfaces: list[_MergedSurface] = []

@@ -84,12 +84,12 @@ class PoseTypeEvidence:
         if entry.p_value >= CONTRADICTION_P:
             return None
         instead = (
-            "though no other type fits better" if str(declared) == self.choice else f"they speak for '{self.choice}'"
+            "although no other type fits better" if str(declared) == self.choice else f"they support '{self.choice}'"
         )
         off, level = np.degrees(entry.deviation_rad), np.degrees(self.level_sigma_rad)
         return (
-            f"declared '{declared}', but the matches show a deviation of {off:.2f} deg from it "
-            f"(level {level:.2f} deg; chance {entry.p_value:.1e}); {instead}"
+            f"declared '{declared}', but the matches show a deviation of {off:.2f} deg from it (level {level:.2f} deg; "
+            f"chance {entry.p_value:.1e}); {instead}"
         )
 
 

@@ -42,10 +42,7 @@ CONFIDENCE = 0.999
 """Probability of at least one sample without outliers, given the share of inliers found so far."""
 MAX_TRIALS = 4000
 
-NO_POSE = (
-    "no pose that enough matches agree with, from in front of both cameras, in {} samples; check that the cameras are "
-    "those of the images, and the order of the images"
-)
+NO_POSE = "no pose with enough inliers in front of both cameras in {} samples; check which camera took which image"
 BATCH = 96
 """Samples per batch: slightly more than 40 % of outliers require."""
 WIDE = 4.0

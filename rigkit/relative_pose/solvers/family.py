@@ -68,7 +68,8 @@ FORWARD = FamilySolver("forward motion", TRANSLATIONS[2:])
 FREE_TRANSLATION = FamilySolver(
     "pure translation",
     TRANSLATIONS,
-    "the translation is not determined: the two images show the same rays; take them from different places",
+    "the translation is not determined: the two images have the same rays (no baseline); take them from different "
+    "places",
 )
 FORWARD_WITH_ROLL = FamilySolver(
     "forward motion with a free roll",

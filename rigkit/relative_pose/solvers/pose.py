@@ -21,8 +21,8 @@ def essential_from_pose(cam2_from_cam1: Rigid3) -> Mat3:
     size = float(np.linalg.norm(E21))
     if size == 0.0:
         raise DegenerateError(
-            "no baseline: the pose has a zero translation and no epipolar geometry; "
-            "take the images from different places"
+            "no baseline: the pose has a zero translation and no epipolar geometry; take the images from different "
+            "places"
         )
     return np.asarray(E21 / size)
 
@@ -82,7 +82,7 @@ def choose_pose(E21: Mat3, rays1: Rays, rays2: Rays, pose_type: PoseType | str =
     if best <= 0.5 * len(rays1) or best == second:
         raise DegenerateError(
             f"cheirality does not decide the pose: the best two hypotheses put {best} and {second} of {len(rays1)} "
-            "points in front of both cameras; check that the two images are matched rightly and have a baseline"
+            "points in front of both cameras; check that the matches are correct and that there is a baseline"
         )
     return poses[order[0]]
 

@@ -152,7 +152,7 @@ def radius_svg(calibration: Calibration) -> str:
     order = np.array_split(np.argsort(radius), min(IMAGE_RINGS, max(len(radius) // 20, 1)))
     rings = np.array([[radius[o].mean(), np.sqrt(np.mean(error[o] ** 2))] for o in order])
     plot.line(rings[:, 0], rings[:, 1], LINES, width=2.4)
-    plot.words(WIDTH - RIGHT, TOP + 12, "line: RMS of rings", "end", LINES)
+    plot.words(WIDTH - RIGHT, TOP + 12, "line: RMS by ring", "end", LINES)
     plot.below(_ticks(0.0, reach))
     return plot.done()
 
@@ -168,14 +168,14 @@ def histogram_svg(calibration: Calibration) -> str:
     x = np.linspace(-reach, reach, CURVE_POINTS)
     curve = len(values) * step / (sigma * np.sqrt(2.0 * np.pi)) * np.exp(-0.5 * (x / sigma) ** 2)
     top = round_up(float(max(counts.max(), curve.max())))
-    plot = _Plot("residuals", (-reach, reach), (0.0, top), ("residual along u or v, px", "how many"))
+    plot = _Plot("residuals", (-reach, reach), (0.0, top), ("residual along u or v, px", "count"))
     for count, left in zip(counts, edges, strict=False):
         y, wide = plot.v(float(count)), plot.u(float(left + step)) - plot.u(float(left))
         place = f'x="{plot.u(float(left)):.1f}" y="{y:.1f}" width="{wide:.1f}" height="{plot.v(0.0) - y:.1f}"'
         plot.parts.append(f'<rect {place} fill="{INK}" fill-opacity=".6"/>')
     plot.line(x, curve, LINES)
     beyond = int((np.abs(values) > reach).sum())
-    plot.words(WIDTH - RIGHT, TOP + 12, f"line: normal, sigma {sigma:.3g} px; {beyond} lie outside", "end", LINES)
+    plot.words(WIDTH - RIGHT, TOP + 12, f"line: normal, sigma {sigma:.3g} px; {beyond} are outside", "end", LINES)
     plot.below([-reach, -0.5 * reach, 0.0, 0.5 * reach, reach])
     return plot.done()
 

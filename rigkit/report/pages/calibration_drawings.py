@@ -92,7 +92,7 @@ def pattern_svg(calibration: Calibration) -> str:
         start, by = zoom * places[chosen], zoom * times * mean[chosen]
         path = strokes(start, by) + _heads(start, by)
         out.append(f'<path d="{path}" stroke="{colour}" stroke-width="1.6" fill="none"/>')
-    expected = f"{int(beyond.sum())} of {len(beyond)} coloured: beyond chance, which makes {CHANCE * len(beyond):.1f}"
+    expected = f"{int(beyond.sum())} of {len(beyond)} significant (coloured; {CHANCE * len(beyond):.1f} by chance)"
     return "".join([*out, _scale(calibration, times), _ending(calibration, words, expected)])
 
 
@@ -119,7 +119,7 @@ def coverage_svg(calibration: Calibration) -> str:
     empty = int((seen & (count == 0)).sum())
     words = f"{len(pixels)} corners of {len(calibration.views)} boards seen"
     return "".join(
-        [*out, _ending(calibration, words, f"{empty} of the {int(seen.sum())} cells that the lens sees are empty")]
+        [*out, _ending(calibration, words, f"{empty} of the {int(seen.sum())} cells in the field of view are empty")]
     )
 
 
@@ -147,7 +147,7 @@ def uncertainty_svg(calibration: Calibration) -> str:
     out.append(f'<polygon points="{outline}" fill="none" stroke="#fff" stroke-width="1.5" stroke-dasharray="6 4"/>')
     out += _numbers(calibration)
     return "".join(
-        [*out, _ending(calibration, words, "dashed: around all corners that were seen; outside only lens models tell")]
+        [*out, _ending(calibration, words, "dashed: hull of all corners; outside the lens model extrapolates")]
     )
 
 

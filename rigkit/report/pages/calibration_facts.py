@@ -72,23 +72,23 @@ def rig_facts(rig: RigCalibration, checks: Sequence[Check], cameras: Mapping[str
 
 def next_words(plan: Plan) -> str:
     """Return the heading of the pictures to take next."""
-    return f"Take these {len(plan.views)} next: they would bring {100.0 * plan.gain:.0f} %"
+    return f"Next {len(plan.views)} images to take: they would reduce the error by {100.0 * plan.gain:.0f} %"
 
 
 def training_note(rms_px: float, heldout_rms_px: float | None) -> str:
     """Return an explanation if the training RMS exceeds the held-out RMS, which looks like a mistake; else ""."""
     if heldout_rms_px is None or rms_px <= heldout_rms_px:
         return ""
-    return "every corner alike, in the held-out RMS blurred ones count less"
+    return "equal weights; the held-out RMS weights corners by their sigmas"
 
 
 def _basis(c: Calibration) -> str:
     width, height = c.camera.size_px
     return (
-        f"{c.camera.model} camera, {width} x {height} px, {c.corner_count} corners in {len(c.views)} views "
-        f"of {len({v.image for v in c.views})} images, {len(c.outliers)} corners and {c.images_left_out} images left "
-        f"out; a corner scatters by {c.sigma_px:.3f} px per axis; solver: {c.convergence.reason} after "
-        f"{c.convergence.iterations} steps."
+        f"{c.camera.model} camera, {width} x {height} px, {c.corner_count} corners in {len(c.views)} views of "
+        f"{len({v.image for v in c.views})} images, {len(c.outliers)} corners and {c.images_left_out} images left out; "
+        f"corner noise {c.sigma_px:.3f} px per axis; solver: {c.convergence.reason} after {c.convergence.iterations} "
+        "steps."
     )
 
 
@@ -100,17 +100,17 @@ def _reach(c: Calibration) -> str:
     grid = uncertainty_map(c, grid=MAP_GRID)
     beyond = grid.worst_px[np.isfinite(grid.worst_px) & ~covered_by_boards(c, grid.pixels)]
     words = (
-        f"A far point is projected to ±{digits(far.usual_px)} px where boards were "
-        f"(±{digits(far.worst_px)} px at worst; one standard deviation)"
+        f"Projection of distant points: ±{digits(far.usual_px)} px where boards were seen (at worst "
+        f"±{digits(far.worst_px)} px; one standard deviation)"
     )
     if not beyond.size:
         return words + "."
-    words += f", and to ±{digits(beyond.max())} px at worst outside, if the lens goes on there as lens models do"
+    words += f", at worst ±{digits(beyond.max())} px elsewhere (extrapolated by the lens model)"
     if worst(c.verdicts) is Severity.BAD:
         return words + "."
     if beyond.max() < MAX_RATIO_BEYOND * far.worst_px:
         return words + ": all of the image can be used."
-    words += ": use the part inside the dashed line only, or add pictures"
+    words += ": use the part inside the dashed line only, or add images"
     return words + " with the board at the border, tilted by 30 degrees."
 
 
@@ -144,7 +144,7 @@ def _parameters(c: Calibration) -> Table:
         *(cells(name, words, "px" if name in IN_PX else "") for name, words in named),
     )
     heads = columns("name | value and standard deviation | unit")
-    return Table("parameters", "Parameters", heads, rows, "The file has every digit.")
+    return Table("parameters", "Parameters", heads, rows, "Rounded; the calibration file has all digits.")
 
 
 def _candidates(c: Calibration) -> Table:
@@ -154,20 +154,20 @@ def _candidates(c: Calibration) -> Table:
             option.parameter_count or None,
             Cell(option.heldout_rms_px, best=option.chosen),
             option.rms_px,
-            "taken" if option.chosen else "",
+            "chosen" if option.chosen else "",
             option.reason,
         )
         for option in c.candidates
     )
-    none = cells("nothing but what was asked for", None, None, None, "", "")
-    heads = columns("tried | numbers .0 | held-out RMS [px] .4 | training RMS [px] .4 | taken | why")
+    none = cells("only what was requested", None, None, None, "", "")
+    heads = columns("tried | parameters .0 | held-out RMS [px] .4 | training RMS [px] .4 | chosen | why")
     return Table("candidates", "Models and board shapes tried", heads, rows or (none,))
 
 
 def _boards(c: Calibration) -> Table:
     rows = tuple(cells(b.board_id, b.kind, b.bow_mm, 100.0 * b.aspect) for b in c.boards)
-    heads = columns("board | shape | off a plane by [mm] | x longer than y by [%]")
-    return Table("boards", "Boards as the solution has them", heads, rows)
+    heads = columns("board | shape | flatness error [mm] | squares longer in x than in y by [%]")
+    return Table("boards", "Solved board shapes", heads, rows)
 
 
 def _images(c: Calibration) -> Table:

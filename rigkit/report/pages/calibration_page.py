@@ -43,12 +43,12 @@ KEPT_COLOUR, LEFT_OUT_COLOUR = (60, 220, 60), (60, 60, 255)
 DRAWINGS: tuple[tuple[str, Callable[[Calibration], str]], ...] = (
     ("Projection uncertainty", uncertainty_svg),
     ("Residuals", residuals_svg),
-    ("What the residuals have in common", pattern_svg),
+    ("Systematic residuals", pattern_svg),
     ("Coverage", coverage_svg),
     ("RMS by image", images_svg),
-    ("Error by distance from the centre", radius_svg),
-    ("Residuals and chance", histogram_svg),
-    ("The lens", lens_svg),
+    ("Error against distance from the centre", radius_svg),
+    ("Distribution of residuals", histogram_svg),
+    ("Lens curve", lens_svg),
 )
 VERDICTS = {"good": "pass", "look": "look", "bad": "fail"}
 

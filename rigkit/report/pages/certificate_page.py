@@ -43,17 +43,17 @@ def certificate_facts(certificate: Certificate, limit: float | None = None) -> P
     percent = f"{100.0 * task.confidence:g} %"
     headline = f"{what}: {percent} of errors within {certificate.worst:.3g} {unit} everywhere in view"
     sentences = [
-        f"Half of the view keeps {certificate.median:.3g} {unit}; it is worst at pixel "
+        f"The bound is {certificate.median:.3g} {unit} in half of the view, and largest at pixel "
         f"({', '.join(f'{x:.0f}' for x in certificate.pixels[certificate.worst_place])}).",
         f"{100.0 * float(certificate.in_view.mean()):.0f} % of the image of camera '{certificate.instrument.names[0]}' "
-        f"see all of it" + (" in both cameras." if certificate.instrument.is_rig else "."),
+        "have the whole object in view" + (" of both cameras." if certificate.instrument.is_rig else "."),
     ]
     passed = None
     if limit is not None:
         passed = certificate.worst <= limit
         share = certificate.share_within(limit)
-        sentences.insert(0, f"The limit of {limit:g} {unit} is kept in {100.0 * share:.0f} % of the view.")
-    badge = {None: "no limit given", True: "within the limit", False: "beyond the limit"}[passed]
+        sentences.insert(0, f"The bound is within the limit of {limit:g} {unit} in {100.0 * share:.0f} % of the view.")
+    badge = {None: "no limit given", True: "within the limit", False: "above the limit"}[passed]
     bad = [finding for finding in certificate.findings if finding.severity is Severity.BAD]
     others = [finding for finding in certificate.findings if finding.severity is not Severity.BAD]
     if bad:
@@ -77,9 +77,9 @@ def causes_table(certificate: Certificate) -> Table:
         for cause, sigma in certificate.sigma.items()
     )
     heads = columns(
-        f"cause | median sigma [{unit}] .4 | sigma where worst [{unit}] .4 | part of the variance there [%] .1"
+        f"cause | median sigma [{unit}] .4 | sigma where worst [{unit}] .4 | share of the variance there [%] .1"
     )
-    return Table("causes", "What the error is made of", heads, rows)
+    return Table("causes", "Error budget", heads, rows)
 
 
 def certificate_page(
@@ -116,9 +116,7 @@ def basis(certificate: Certificate) -> dict[str, str]:
     if i.is_rig:
         a, b = (pose.inverse().translation_mm for pose in i.cam_from_rig)
         facts["baseline"] = f"{float(np.linalg.norm(b - a)):.2f} mm"
-        facts["board scale"] = (
-            f"{100.0 * i.scale_sigma:.3g} %" if i.scale_sigma else "counted as exact: nobody stated it"
-        )
+        facts["board scale"] = f"{100.0 * i.scale_sigma:.3g} %" if i.scale_sigma else "not stated: treated as exact"
     percent = f"{100.0 * certificate.task.confidence:g} %"
     freedom = f", {i.freedom:.3g} degrees of freedom of the calibration" if np.isfinite(i.freedom) else ""
     facts["bound"] = f"{percent}, Student's quantile of the root of the summed variances{freedom}; to first order"
@@ -186,7 +184,7 @@ def _draw_causes(axis: Any, certificate: Certificate) -> None:
             axis.bar(place, part, 0.7, bottom=base, color=f"C{index}", label=cause if place == 0 else None)
             base += part
     axis.set_xticks([0, 1], ["median", "worst"], fontsize=7)
-    axis.set_ylabel("part of the variance, %", fontsize=7)
+    axis.set_ylabel("share of the variance, %", fontsize=7)
     axis.tick_params(labelsize=7)
     axis.legend(fontsize=7, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     for side in ("top", "right"):

@@ -31,55 +31,54 @@ PART_OF = {"focus": "lens", "principal point": "lens", "distortion": "lens", "ro
 
 def check_facts(check: SentinelCheck) -> PageFacts:
     """Return the facts of a check."""
-    frames = counted(check.frames, "fresh frame")
+    frames = counted(check.frames, "new frame")
     p = f"p = {check.chance:.3g}"
     sentences = [
-        f"Fresh points lie {check.rms_px:.3f} px rms from where the calibration has them ({check.corners} points in "
-        f"{frames}); {check.expected_px:.3f} px are expected."
+        f"Reprojection error of the new images: {check.rms_px:.3f} px rms ({check.corners} points in {frames}); "
+        f"{check.expected_px:.3f} px are expected."
     ]
     sentences += _since_words(check.baseline)
     change = check.change
     if check.holds:
         little = min((power.chance for power in check.powers), default=0.0) < LIKELY_SEEN
-        holds = "Nothing moved since" if check.baseline is not None else "Still holds"
-        headline = f"{holds}{', as far as these pictures tell' if little else ''} ({p}, {frames})"
+        holds = "Nothing changed since" if check.baseline is not None else "Still holds"
+        headline = f"{holds}{', as far as these images show' if little else ''} ({p}, {frames})"
         if change is not None and check.chance < ALARM_CHANCE:
             sentences.append(
-                f"More than chance is there, of no importance: {change}; it moves the projection by "
-                f"{change.size_px:.3f} px."
+                f"A change is significant, but negligible: {change}; it moves the projection by {change.size_px:.3f} "
+                "px."
             )
     elif check.flipped:
-        headline = f"Does NOT hold as the images are ({p}): they seem {check.flipped}; put back, they fit"
+        headline = f"Does NOT hold for the images as they are ({p}): they seem {check.flipped}; undoing that, it holds"
         sentences.append(
-            "Give them as the camera wrote them: a viewer, a tag of the file or a setting of the camera flips pictures."
-            + ("" if check.unexplained or change is None else f" Else it would be this: {change}.")
+            "Use the files as the camera wrote them: a viewer, an EXIF tag or a setting of the camera flips images."
+            + ("" if check.unexplained or change is None else f" The alternative explanation: {change}.")
         )
     elif check.unexplained or change is None:
-        headline = f"Does NOT hold ({p}): nothing that moved explains it"
+        headline = f"Does NOT hold ({p}): no change of the camera or rig explains it"
         sentences.append(
-            f"{check.rms_fixed_px:.2f} px rms are left after the best explanation: another camera, lens or image size, "
-            "or another board; check what was photographed, and calibrate anew."
+            f"{check.rms_fixed_px:.2f} px rms remain after the best correction: another camera, lens, image size or "
+            "board? Check what was photographed, and calibrate again."
         )
     else:
         # The amounts of a combined change are not named: only its effect is meaningful.
         what = change.hypothesis.words if change.hypothesis.kind == "lens" else change
-        message = "Moved since" if check.baseline is not None else "Does NOT hold"
+        message = "Changed since" if check.baseline is not None else "Does NOT hold"
         headline = f"{message} ({p}): {what}; {_cost_words(check, change)}"
-        caveat = "" if change.size_px >= ALARM_PX else f", perhaps {change.max_px:.2f} px: these pictures tell it badly"
+        caveat = "" if change.size_px >= ALARM_PX else f" (up to {change.max_px:.2f} px: poorly determined)"
         sentences.append(
             f"It moves the projection by {change.size_px:.3f} px rms{caveat}; after the correction "
-            f"{check.rms_fixed_px:.3f} px are left.{_nearest_words(check, change)}"
+            f"{check.rms_fixed_px:.3f} px remain.{_nearest_words(check, change)}"
         )
     if not check.holds and check.baseline is None and len(check.monitored.cameras) > 1:
         sentences.append(
-            "Moved since, or never held? Pictures of the time of the calibration, given with --before, tell: what was "
-            "wrong then is no change."
+            "Changed since, or wrong from the start? Compare with images from the time of the calibration: --before."
         )
     if check.holds and check.powers:
         worst = min(check.powers, key=lambda power: power.chance)
         sentences.append(_could_have_found(worst))
         if worst.chance < FOUND and len(check.monitored.cameras) == 1:
-            sentences.append("Which pictures would tell most: rigkit plan CALIBRATION --check")
+            sentences.append("For the images that would reveal most: rigkit plan CALIBRATION --check")
     return PageFacts(
         headline=headline,
         badge="holds" if check.holds else "does not hold",
@@ -94,13 +93,13 @@ def _since_words(then: Baseline | None) -> list[str]:
     if then is None:
         return []
     said = [
-        f"Since {counted(then.frames, 'frame')} of before: these lay {then.rms_px:.3f} px rms from where the file has "
-        f"them, {then.rms_corrected_px:.3f} px once it is corrected to them; that is no change."
+        f"Reference: {counted(then.frames, 'earlier frame')}, {then.rms_px:.3f} px rms with the calibration as it is, "
+        f"{then.rms_corrected_px:.3f} px corrected to them; this correction is not counted as a change."
     ]
     if then.chance < ALARM_CHANCE:
         said.append(
-            f"The file was off by more than it says even then (p = {then.chance:.2g}): make sure that the pictures of "
-            "before are of the same camera, and that nothing had moved yet."
+            f"The calibration was inconsistent with the earlier frames already (p = {then.chance:.2g}): make sure that "
+            "they are of the same camera, and that nothing had changed by then."
         )
     return said
 
@@ -125,47 +124,47 @@ def _nearest_words(check: SentinelCheck, change: Change) -> str:
     if not simpler or change.gain <= 0.0:
         return ""
     best = max(simpler, key=lambda c: c.gain)
-    return f" {min(best.gain / change.gain, 1.0):.0%} of what is seen is explained by this alone: {best}."
+    return f" {min(best.gain / change.gain, 1.0):.0%} of it is explained by this alone: {best}."
 
 
 def _could_have_found(power: Power) -> str:
     """Return the chance to detect the least visible change, and what would raise it, in words."""
     whose = "" if power.camera is None else f" of camera '{power.camera}'"
     size = f"{power.size:g} {power.unit}"
-    seen = f"A change of {size} rms over the image" if power.unit == "px" else f"A turn of {size}"
-    message = f"{seen} would have been found with chance {power.chance:.2f} ({power.kind}{whose}, what is seen worst"
+    seen = f"A change of {size} rms over the image" if power.unit == "px" else f"A rotation of {size}"
+    message = f"{seen} would have been detected with probability {power.chance:.2f} (worst: {power.kind}{whose}"
     if np.isfinite(power.found_from):
-        message += f"; {FOUND:.0%} of the time from {power.found_from:.2g} {power.unit} on"
+        message += f"; {FOUND:.0%} from {power.found_from:.2g} {power.unit} on"
     if power.chance >= FOUND:
         return f"{message})."
     if power.frames is None:
-        reason = "far from so sure" if power.both is None else "not so sure itself"
-        more = "" if power.both is None else f": it takes about {power.both} times as many, in both"
-        return f"{message}); more pictures like these alone would not find it, for the calibration is {reason}{more}."
-    return f"{message}); {power.frames} pictures like these would find it {FOUND:.0%} of the time."
+        reason = "far too uncertain" if power.both is None else "too uncertain itself"
+        more = "" if power.both is None else f": that needs about {power.both} times as many in both"
+        return f"{message}); more images like these alone would not detect it: the calibration is {reason}{more}."
+    return f"{message}); {power.frames} images like these would detect it with probability {FOUND:g}."
 
 
 def _frames_needed(power: Power) -> str:
     if power.frames is not None:
         return f"{power.frames}"
     many = f"more than {TIMES[-1]}" if power.both is None else f"{power.both}"
-    return f"{many} times as many, in the calibration too"
+    return f"{many} times as many, also in the calibration"
 
 
-def power_table(powers: Sequence[Power], title: str = "What these pictures would have found") -> Table:
+def power_table(powers: Sequence[Power], title: str = "Detectable changes") -> Table:
     """Return the table of the chances to detect changes."""
-    heads = columns(f"change | of | found with chance .2 | {FOUND:.0%} found from | frames for {FOUND:.0%}")
+    heads = columns(f"change | size | probability of detection .2 | {FOUND:.0%} detected from | frames for {FOUND:.0%}")
     rows = tuple(
         cells(
             power.kind if power.camera is None else f"{power.kind} of {power.camera}",
             f"{power.size:g} {power.unit}",
             power.chance,
-            f"{power.found_from:.2g} {power.unit}" if np.isfinite(power.found_from) else "not seen",
+            f"{power.found_from:.2g} {power.unit}" if np.isfinite(power.found_from) else "not detectable",
             _frames_needed(power),
         )
         for power in powers
     )
-    none = cells("none can be told from these pictures", "", None, "", "")
+    none = cells("none is detectable in these images", "", None, "", "")
     return Table("powers", title, heads, rows or (none,))
 
 
@@ -179,9 +178,9 @@ def check_table(check: SentinelCheck) -> Table:
         )
         named = check.change is not None and change.hypothesis is check.change.hypothesis
         rows.append(cells(change.hypothesis.words, f"{change.chance:.2g}", Cell(change.gain, best=named), amounts))
-    none = cells("nothing can be told from these pictures", "", None, "")
-    heads = columns("if this alone happened | chance without it | explains .1 | amount")
-    return Table("causes", "What may have happened", heads, tuple(rows) or (none,))
+    none = cells("these images determine no change", "", None, "")
+    heads = columns("if this alone changed | p-value of no such change | explains .1 | amount")
+    return Table("causes", "Possible changes", heads, tuple(rows) or (none,))
 
 
 def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
@@ -207,7 +206,7 @@ def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
 def check_page(check: SentinelCheck, title: str, provenance: Mapping[str, str]) -> str:
     """Return the check as self-contained HTML."""
     chance = check.holds and check.chance >= ALARM_CHANCE
-    moves = "no more than chance; magnified" if chance else "how the best explanation moves what it sees"
+    moves = "not significant; magnified" if chance else "image displacement by the best explanation"
     return build_facts_page(
         title,
         check_facts(check),

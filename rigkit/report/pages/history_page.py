@@ -43,8 +43,8 @@ def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
         badge="does not hold" if bad else "holds",
         passed=not bad,
         sentences=(
-            "Each amount as if it alone had changed since the calibration, with its standard deviation. Dashed: "
-            "control limits, three standard deviations of each entry. Red: entries that raised an alarm.",
+            "Each quantity as if it alone had changed since the calibration, with its standard deviation. Dashed: "
+            "control limits (three standard deviations of each entry). Red: alarms.",
             *overwritten(kept),
         ),
         tables=(*_heat_tables(kept), _history_table(entries)),
@@ -76,7 +76,7 @@ def history_page(entries: Sequence[HistoryEntry], title: str, provenance: Mappin
             heat = _temperature_drift(edition, name)
             if heat is not None:
                 own = _entries_by_temperature(edition, name)
-                drawings.append((f"{whose}{name}: over the temperature", heat_svg(own, name, heat)))
+                drawings.append((f"{whose}{name}: against temperature", heat_svg(own, name, heat)))
     return build_facts_page(title, history_facts(entries), provenance, drawings=drawings)
 
 
@@ -117,8 +117,8 @@ def _heat_tables(kept: Sequence[Edition]) -> tuple[Table, ...]:
                     + cells(Cell(message, best=heat.chance < ALARM_CHANCE), f"{heat.chance:.2g}")
                     + cells(f"{low:.3g} to {high:.3g}", len(own))
                 )
-    heads = columns("amount | with the temperature | chance if it does nothing | from, to [°C] | entries .0")
-    return (Table("heat", "Over the temperature", heads, tuple(rows)),) if rows else ()
+    heads = columns("quantity | per °C | p-value of no effect | from, to [°C] | entries .0")
+    return (Table("heat", "Against temperature", heads, tuple(rows)),) if rows else ()
 
 
 def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
@@ -150,7 +150,7 @@ def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str
     value, sigma = np.array([entry.amounts[name] for entry in entries]).T
     top = _upper_limit(0.0, value, sigma)
     x, y = _x_coordinates(celsius), ZERO_HEIGHT * (1.0 - heat.at(celsius) / top)
-    out = [svg.opened(f"{name} over the temperature", f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
+    out = [svg.opened(f"{name} against temperature", f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
     for amount in (-top / 1.1, 0.0, top / 1.1):
         height = ZERO_HEIGHT * (1.0 - amount / top)
         ends = svg.line([np.array([LEFT_MARGIN, height]), np.array([DRAWN_WIDTH - 6.0, height])])

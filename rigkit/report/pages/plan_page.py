@@ -36,9 +36,9 @@ def plan_words(plan: Plan) -> list[str]:
         where = str(placement(view.camera, view.board, view.cam_from_board))
         if view.seen_by:
             own, *others = (f"'{name}'" for name in view.seen_by)
-            also = f"; {' and '.join(others)} {'sees' if len(others) == 1 else 'see'} it, too" if others else ""
+            also = f"; also seen by {' and '.join(others)}" if others else ""
             where = f"before camera {own}: {where}{also}"
-        lines.append(f"{number}. {where}{which}: {view.error:.3g} {unit} then")
+        lines.append(f"{number}. {where}{which}: {view.error:.3g} {unit}")
     return lines
 
 
@@ -69,7 +69,7 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
 
 def plan_table(plan: Plan) -> Table:
     """Return the table of the goal's error after each view."""
-    heads = (Column("views more"), Column(plan.goal.what, plan.goal.unit), Column("less than before by", "%", 0))
+    heads = (Column("more images"), Column(plan.goal.what, plan.goal.unit), Column("reduction", "%", 0))
     errors = [plan.error, *(view.error for view in plan.views)]
     # Without pictures the error is infinite: changes are relative to the first finite error.
     first = next((k for k, error in enumerate(errors) if np.isfinite(error)), len(errors))
@@ -77,7 +77,7 @@ def plan_table(plan: Plan) -> Table:
         cells(str(k), float(f"{errors[k]:.4g}"), 100.0 * (1.0 - errors[k] / errors[first]))
         for k in range(first, len(errors))
     )
-    return Table("plan", "What the views bring", heads, rows)
+    return Table("plan", "Gain of the images", heads, rows)
 
 
 def view_svg(plan: Plan, index: int, taken: Pixels | None = None) -> str:
@@ -122,7 +122,7 @@ def _path(pixels: Pixels) -> str:
 
 def plan_facts(plan: Plan, found: Sequence[Table] = ()) -> PageFacts:
     """Return the facts of a plan; `found` are tables of further improvements."""
-    headline = f"{plan_lead(plan, 'after these pictures')}."
+    headline = f"{plan_lead(plan)}."
     return PageFacts(
         headline=headline[0].upper() + headline[1:],
         sentences=tuple(plan_words(plan)),
@@ -130,11 +130,11 @@ def plan_facts(plan: Plan, found: Sequence[Table] = ()) -> PageFacts:
     )
 
 
-def plan_lead(plan: Plan, then: str) -> str:
-    """Return in words the error of the goal now, if finite, and `then`, after the plan."""
+def plan_lead(plan: Plan) -> str:
+    """Return in words the error of the goal now, if finite, and after the plan."""
     now = f"{plan.error:.3g} {plan.goal.unit} now, " if np.isfinite(plan.error) else ""
     unit = "" if now else f" {plan.goal.unit}"
-    return f"{plan.goal.what}: {now}{plan.views[-1].error:.3g}{unit} {then}"
+    return f"{plan.goal.what}: {now}{plan.views[-1].error:.3g}{unit} after these images"
 
 
 def plan_page(

@@ -22,9 +22,9 @@ from rigkit.validation.tables import check_table, mean_normal_error
 SUMMARY_WORDS = (
     "Estimator: of the affine transformation at each corner, from the directions of its edges (F2UDIR, F3UDIR, "
     "DET3UDIR, 2SDIR, 3SDIR: L. Hajder, Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations); "
-    "shown is the one whose normals agree best with the planes. Angle error: between planes fitted to the points, "
-    "against what was measured. Normal error: of the normal at one corner, from its affine transformation, against the "
-    "plane of its board. Sampson: distance of a corner from its epipolar curve, to first order."
+    "the one whose normals agree best with the planes is shown. Angle error: angle between planes fitted to the points "
+    "minus the measured one. Normal error: angle between the normal at a corner, from its affine transformation, and "
+    "that of its board's plane. Sampson: first-order distance of a corner from its epipolar curve."
 )
 
 
@@ -50,8 +50,8 @@ def summary_table(reports: Sequence[ValidationReport]) -> Table:
 def camera_table(calibrations: Mapping[str, Calibration]) -> Table:
     """Return one row for each calibrated camera: images, corners, errors and uncertainty."""
     heads = columns(
-        "camera | model | images .0 | corners .0 | held-out RMS [px] | training RMS [px] | "
-        "uncertainty, median [px] .4 | uncertainty, 95 % [px] .4 | remarks"
+        "camera | model | images .0 | corners .0 | held-out RMS [px] | training RMS [px] | uncertainty, median [px] "
+        ".4 | uncertainty, 95 % [px] .4 | remarks"
     )
     rows = []
     for name, c in calibrations.items():
@@ -63,9 +63,9 @@ def camera_table(calibrations: Mapping[str, Calibration]) -> Table:
             + cells(c.rms_px, float(middle), float(high), f"{remarks}, below" if remarks else "none")
         )
     note = (
-        "Held out: on images that took no part, with the lens frozen and only the board's pose fitted. Training: on "
-        "the images fitted. Both are sqrt(mean |residual|²) over corners. Uncertainty: of the projection where the "
-        "boards were, standard deviation in the worst direction."
+        "Held out: on images not used for the calibration, with fixed intrinsics and only the board's pose fitted. "
+        "Training: on the images used. Both are sqrt(mean |residual|²) over corners. Uncertainty: of the projection "
+        "where boards were seen, standard deviation in the worst direction."
     )
     return Table("cameras", "Calibrations", heads, tuple(rows), note)
 
@@ -97,10 +97,9 @@ def pair_section(
     """
     shown = next(r for r in reports if r.affine_method == reconstruction.affine_method)
     lead = (
-        f"{shown.pose_type} motion, {shown.count} points, {counted(len(shown.boards), 'board')}; "
-        f"shown: {shown.affine_method}; baseline "
-        f"{measured_words(shown.baseline_mm, shown.baseline_sigma_mm, 2)} mm; "
-        f"Sampson rms {shown.sampson_rms_px:.3f} px"
+        f"{shown.pose_type} motion, {shown.count} points, {counted(len(shown.boards), 'board')}; shown: "
+        f"{shown.affine_method}; baseline {measured_words(shown.baseline_mm, shown.baseline_sigma_mm, 2)} mm; Sampson "
+        f"rms {shown.sampson_rms_px:.3f} px"
     )
     tables = (check_table([shown]), _by_estimator(reports), *extra)
     notes = (*shown.notes, *(f"not checked: {words}" for words in shown.unchecked))

@@ -119,7 +119,7 @@ def _headline(best: Sequence[ValidationReport]) -> str:
     unchecked = sum(len(report.unchecked) for report in best)
     held = [(pair, c) for pair, c in checks if c.passed]
     pairs = f"of {len(best)} pairs" if len(best) > 1 else "of the pair"
-    words = f"{len(held)} of {len(checks) + unchecked} facts that were measured or declared {pairs} hold"
+    words = f"{len(held)} of {len(checks) + unchecked} measured or declared facts {pairs} are confirmed"
     parts = []
     for kinds, what, decimals in ((("baseline", "distance"), "lengths", 2), (("angle",), "angles", 3)):
         own = [(pair, c) for pair, c in held if c.kind in kinds]
@@ -139,6 +139,6 @@ def _fineness(best: Sequence[ValidationReport]) -> str:
     c = max(coarse, key=lambda c: c.measured_sigma / max(c.our_sigma, 1e-9))
     ours = measured_words(c.ours, c.our_sigma, 2)
     return (
-        f"The rule (±{c.measured_sigma:g} mm) is coarser than what was reconstructed ({ours} mm): it would not show "
-        "smaller errors."
+        f"The measurement (±{c.measured_sigma:g} mm) is less precise than the reconstruction ({ours} mm): errors below "
+        "it cannot be detected."
     )

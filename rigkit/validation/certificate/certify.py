@@ -109,20 +109,22 @@ def _findings(certificate: Certificate) -> list[Finding]:
         share = "less than 1" if coarse < 0.01 else f"{100.0 * coarse:.0f}"
         found.append(
             Finding.look(
-                f"in {share} % of the view the bound is but a lower one: the lines of sight "
-                "hardly cross there, and points are uncertain by more than a tenth of what is measured",
-                "measure elsewhere in the image, nearer, or move the cameras apart",
+                f"in {share} % of the view the bound is too low: rays are nearly parallel there, and points are "
+                "uncertain by more than a tenth of what is measured",
+                "measure elsewhere in the image, nearer, or with a longer baseline",
             )
         )
     if instrument.is_rig and instrument.scale_sigma == 0.0 and OF_SCALE in certificate.sigma:
         found.append(
             Finding.look(
-                "nobody stated how well the boards' squares were measured, so their scale counts as exact",
+                "the uncertainty of the boards' square size is not stated: the scale is treated as exact",
                 "give square_sigma_mm in the board's file and calibrate again",
             )
         )
     if not instrument.is_rig and task.distance_sigma_mm == 0.0:
-        found.append(Finding.look("the distance counts as exact", "say with --distance-sigma how well it is known"))
+        found.append(
+            Finding.look("the distance is treated as exact", "give its standard deviation as --distance-sigma")
+        )
     found.append(Finding.good(f"to halve the worst error: {_how_to_halve(certificate.shares(), certificate)}"))
     return found
 
@@ -149,10 +151,11 @@ def _remedy(cause: str, factor: float, share: float, scale_percent: float) -> st
     times = f"{int(np.ceil(factor)):d} times"
     root = f"{np.sqrt(factor):.1f} times"
     remedies: dict[str, str] = {
-        OF_CORNERS: f"repeat the measurement {times} and average, or come nearer, or move the cameras apart",
-        OF_LENSES: f"calibrate with {times} as many pictures, boards also where the bound is worst",
-        OF_MOUNTS: f"calibrate with {times} as many pictures of boards that both cameras see",
-        OF_SCALE: f"measure the squares {root} better than the {scale_percent:.3g} % stated, over the whole board",
-        OF_DISTANCE: f"measure the distance {root} better",
+        OF_CORNERS: f"average {times[:-6]} measurements, come nearer, or use a longer baseline",
+        OF_LENSES: f"calibrate with {times} as many images, with boards also where the bound is largest",
+        OF_MOUNTS: f"calibrate with {times} as many images of boards that both cameras see",
+        OF_SCALE: f"measure the square size {root} more precisely than the {scale_percent:.3g} % stated, over the "
+        "whole board",
+        OF_DISTANCE: f"measure the distance {root} more precisely",
     }
     return f"{part}: {remedies[cause]}"

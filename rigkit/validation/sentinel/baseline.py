@@ -62,9 +62,8 @@ def judge_since(monitored: Monitored, before: Look, look: Look, cost: Sequence[G
     left_px, expected_px = before(corrected).rms_px, unchanged_px(corrected, first)
     if exceeds_expected(left_px, expected_px):
         raise InputError(
-            f"check: the pictures of before do not fit: {left_px:.2f} px rms are left once the calibration is "
-            f"corrected to them, {expected_px:.2f} px are expected; give those of these cameras, and of a rig those "
-            "taken together"
+            f"check: the images of --before do not fit: {left_px:.2f} px rms remain once the calibration is corrected "
+            f"to them, {expected_px:.2f} px are expected; give images of these cameras, of a rig simultaneous ones"
         )
     check = evaluate_evidence(corrected, lambda now: wider.of_frames(look(now)), cost)
     return replace(check, baseline=Baseline(len(first.score), first.rms_px, left_px, chance))

@@ -59,7 +59,7 @@ class ChangeAim:
             one = (inverse @ by_px, by_px.T @ inverse @ by_px)
             if _explained_variances(*one, by_all).min() > NULL_RANK * np.trace(one[1]):
                 shown.append(one)
-        changes = "focus, principal point, distortion or mount" if several else "focus, principal point or distortion"
+        changes = "intrinsics or extrinsics" if several else "intrinsics"
         return cls(tuple(shown), f"standard error of a change of {changes}, over the image")
 
     def error(self, covariance: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_o
 from rigkit.validation.sentinel.judge import check_views, exceeds_expected, unchanged_px
 
 FLIP_SIGNS = {
-    "turned by half a turn": (-1.0, -1.0),
+    "rotated by 180 degrees": (-1.0, -1.0),
     "mirrored left to right": (-1.0, 1.0),
     "mirrored top to bottom": (1.0, -1.0),
 }

@@ -44,11 +44,11 @@ class Hypothesis:
             "focus": "the focus of {} changed",
             "principal point": "the principal point of {} moved",
             "distortion": "the distortion of {} changed",
-            "lens": "the lens of {} changed in several ways",
-            "rotation": "{} turned on its mount",
+            "lens": "several parameters of the lens of {} changed",
+            "rotation": "{} was rotated on its mount",
             "shift": "{} was shifted",
-            "moved": "{} was shifted and turned",
-            "scale": "the scale changed: all baselines alike, or the board's squares are not what they were",
+            "moved": "{} was moved (shifted and rotated)",
+            "scale": "the scale changed: all baselines alike, or the board has squares of another size",
         }
         return texts[self.kind].format("the camera" if self.camera is None else f"camera '{self.camera}'")
 

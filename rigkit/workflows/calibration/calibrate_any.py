@@ -98,7 +98,7 @@ def calibrate_session_file(
         # The videos are inputs as well as the frames that replace them.
         ensure_writable((output, report), force=options.force, inputs=session_inputs(listed, options))
     if isinstance(session, Session) and options.known.files:
-        raise InputError("one camera has no mounts to find; `rigkit pose` says where it is against a board")
+        raise InputError("one camera has no extrinsics to solve for; `rigkit pose` gives its pose relative to a board")
     with about(options.corners) if options.corners else nullcontext():
         if isinstance(session, RigSession):
             return calibrate_rig_session(session, options, progress=progress)
@@ -153,7 +153,7 @@ def calibrate_folders(
 def _boards(places: Sequence[Path], declared: FolderOptions, progress: Progress) -> tuple[str, ...]:
     """Return the declared boards, or those that the images show, with squares of `declared.square_mm`."""
     if declared.boards and declared.square_mm is not None:
-        raise InputError("calibrate: --board says how large squares are; leave --square-mm out")
+        raise InputError("calibrate: --board states the square size already; leave --square-mm out")
     if declared.square_mm is None:
         return declared.boards
     boards = boards_seen(places, declared.square_mm, progress)
@@ -194,10 +194,12 @@ def _folders_of(
     if not videos:
         return list(places)
     if len(videos) < len(places):
-        raise InputError("calibrate: videos together with folders of images; give all cameras one way")
+        raise InputError(
+            "calibrate: videos mixed with folders of images; give all cameras as videos, or all as folders"
+        )
     if not boards:
         raise InputError(
-            "calibrate: how large are the squares in the video? give --square-mm, the side of one, or the board, such "
+            "calibrate: the square size is missing; give --square-mm, the side of one, or the board, such "
             "as --board 9x6x25; rigkit board identify shows which"
         )
     seen = [board_of_words(words) for words in boards]

@@ -66,7 +66,7 @@ def next_frames(
         away = float(np.median(np.linalg.norm(frames.translation_mm, axis=-1)))
         goal = rig_goal(watched.cameras, watched.cam_from_rig, away, reach.field_deg)
     elif len(watched.cameras) != 2:
-        raise InputError("plan: --length is for one camera or a rig of two; leave it away")
+        raise InputError("plan: --length needs one camera or a rig of two; leave it out")
     else:
         (goal,) = length_goals(watched.cameras, watched.cam_from_rig, length)
     return frames.plan(watched, boards, goal, count)

@@ -46,8 +46,8 @@ from rigkit.workflows.inputs.paths import NamesFiles
 
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 LAN_WARNING = (
-    "--lan: everybody in this network who has the address sees the pictures, and nothing is encrypted; the address "
-    "is a secret, and a network of strangers is no place for it"
+    "--lan: anyone in this network who has the address sees the images, unencrypted; keep the address secret, and do "
+    "not use it in a public network"
 )
 _log = logging.getLogger(__name__)
 
@@ -132,7 +132,7 @@ def finished_words(folder: Path, guide: GuideOptions) -> str:
 def _finished(what: str, rms_px: float, heldout_px: float | None, verdict: Severity, written: Sequence[Path]) -> str:
     fit = f"rms {rms_px:.3f} px" if heldout_px is None else f"held-out {heldout_px:.3f} px"
     page = written[-1].name
-    more = {Severity.LOOK: f"; {page} says what to look at", Severity.BAD: f"; do not trust it: {page} says why"}
+    more = {Severity.LOOK: f"; with warnings: see {page}", Severity.BAD: f"; verdict bad: see {page}"}
     return f"Done: {what}, {fit}, {written[0].name} written{more.get(verdict, '')}"
 
 

@@ -112,7 +112,7 @@ def plan_session(
             return _checked(monitored, boards, options, source)
         with about(source):
             plan = next_frames(monitored, boards, options.count, length=options.length, reach=options.reach)
-        return _shown(plan, options, f"Next pictures for {source.name}", source)
+        return _shown(plan, options, f"Next images for {source.name}", source)
     if source.suffix == ".toml":
         session = load_session(source)
         calibrating = CalibrateOptions(cache=Cache.UPDATE)
@@ -132,7 +132,7 @@ def plan_session(
     warn_of_pupil(source, calibration)
     with about(source):
         plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
-    return _shown(plan, options, f"Next pictures for {source.name}", source, taken)
+    return _shown(plan, options, f"Next images for {source.name}", source, taken)
 
 
 def _checked(
@@ -141,8 +141,8 @@ def _checked(
     """Return the pictures to check a camera or a rig with."""
     with about(source):
         plan, powers = informative_views(monitored, boards, options.count, options.reach)
-    found = (power_table(powers, "What these pictures would find"),)
-    return _shown(plan, options, f"Pictures to check {source.name} with", source, taken, found)
+    found = (power_table(powers, "Changes that these images would reveal"),)
+    return _shown(plan, options, f"Images to check {source.name} with", source, taken, found)
 
 
 def plan_lens(lens: LensOptions, options: PlanOptions) -> PlannedSession:
@@ -156,7 +156,7 @@ def plan_lens(lens: LensOptions, options: PlanOptions) -> PlannedSession:
     plan = plan_views(
         knowledge, lens.boards, goal_of(camera, options.reach, options.length), options.count, reach=options.reach
     )
-    return _shown(plan, options, f"{options.count} pictures for a lens of {lens.hfov_deg:g} degrees")
+    return _shown(plan, options, f"{options.count} images for a lens of {lens.hfov_deg:g} degrees")
 
 
 def _shown(

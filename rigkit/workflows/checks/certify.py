@@ -68,7 +68,7 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
     if (bad := called_bad(path)) is not None:
         certificate = replace(certificate, findings=(bad, *certificate.findings))
     if any(isinstance(camera, NearCamera) for camera in certificate.instrument.cameras):
-        message = Finding.good("the lens does not look from one point: how its entrance pupil moves is counted in")
+        message = Finding.good("the lens is not central: its moving entrance pupil is included")
         certificate = replace(certificate, findings=(*certificate.findings, message))
     title = f"Certificate: {task.quantity} with {Path(path).name}"
     facts = {Path(path).name: digest_line(Path(path)), **software_facts()}

@@ -113,7 +113,7 @@ def check_pictures(
     monitored, known = load_monitored(source)
     warn_if_bad(source)
     if not images:
-        raise InputError("check: give fresh images, or a folder of them")
+        raise InputError("check: give new images, or a folder of them")
     now, single = moments_of(monitored.names, [Path(image) for image in images])
     before, alone = moments_of(monitored.names, options.before) if options.before else ([], [])
     inputs = [source, *(image for frame in (*now, *before) for image in frame)]
@@ -122,7 +122,7 @@ def check_pictures(
         ensure_register(options.history, inputs, options.temperature_c)
     both = {path for frame in now for path in frame} & {path for frame in before for path in frame}
     if both:
-        raise InputError(f"check: '{min(both)}' is both a fresh image and one of before")
+        raise InputError(f"check: '{min(both)}' is given both as a new image and with --before")
     goals = [] if options.length is None else length_goals(monitored.cameras, monitored.cam_from_rig, options.length)
     boards = _as_known(options.boards, known) or known
     pictures = _Pictures(source=source, monitored=monitored, boards=boards, known=known, progress=progress)
@@ -213,8 +213,8 @@ def _as_known(boards: Sequence[Board], known: Sequence[Board]) -> tuple[Board, .
         out.append((named or alike or [board])[0])
         if known and not alike:
             _log.warning(
-                "board '%s' is none of the calibration's: it is taken to be flat, with squares as stated, and what it "
-                "is otherwise passes for a change",
+                "board '%s' is not one of the calibration: it is assumed flat, with squares as declared; any departure "
+                "looks like a change",
                 board.board_id,
             )
     return tuple(out)
@@ -242,9 +242,7 @@ class _Pictures:
         """Return the evidence of frames as a function of the cameras, and the boards in them; no boards for a scene."""
         if scene:
             if len(self.monitored.cameras) < 2:
-                raise InputError(
-                    "check: a scene without boards tells of a rig only; one camera needs pictures of a board"
-                )
+                raise InputError("check: --scene needs a rig; one camera needs images of a board")
             read = [self._read(frame) for frame in frames]
             matches = matches_of_scenes(self.monitored, [images for images in read if images], progress=self.progress)
             return (lambda now: evidence_of_matches(now, matches)), []
@@ -253,7 +251,7 @@ class _Pictures:
         found = self._boards_seen(frames)
         wrong = other_size({name: own for each in found for name, own in each.items()}, self.boards, self.known)
         if wrong is not None:
-            raise InputError(f"check: {wrong}; give the board that the pictures show with --board")
+            raise InputError(f"check: {wrong}; give the board in the images with --board")
         views = _views(self.monitored, frames, found, self.boards, self.left_out)
         if not views:
             raise InputError(f"check: {_nothing_to_check(self.left_out, self.unreadable, self.boards)}")
@@ -335,8 +333,8 @@ def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> No
             # Two cameras with equal lenses, both turned upside down, look as if exchanged.
             how = f"exchanged, or {check.flipped}" if check.flipped else "exchanged"
             raise InputError(
-                f"check: the images of '{names[i]}' and '{names[j]}' are {how}: put right, they fit; give them in the "
-                f"rig's order, {', '.join(names)}"
+                f"check: the images of '{names[i]}' and '{names[j]}' are {how}: undoing that, they fit; give them in "
+                f"the rig's order, {', '.join(names)}"
             )
 
 
@@ -346,10 +344,11 @@ def fixed_text(source: Path, check: SentinelCheck) -> str:
     monitored = load_monitored(source)[0]
     # Relative to images from before, only the change since then.
     fixed, own = monitored.changed(check.step), monitored.of_models
-    since = "" if check.baseline is None else f" beside {check.baseline.frames} of before"
+    since = "" if check.baseline is None else f" and {check.baseline.frames} earlier ones"
     message = Finding.look(
-        f"corrected from {check.frames} fresh frames{since}: {check.change}; views and residuals are older",
-        "calibrate anew when there is time",
+        f"corrected from {check.frames} new frames{since}: {check.change}; views and residuals are those of the "
+        "original",
+        "calibrate again when possible",
     )
     # The file states the inadequacy of the models separately; no hypothesis changes a pupil.
     covariance = np.array(data["covariance"]) + (check.covariance - check.monitored.covariance)[np.ix_(own, own)]

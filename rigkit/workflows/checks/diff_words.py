@@ -18,7 +18,7 @@ from rigkit.report.pictures.figures import difference_png
 from rigkit.workflows.checks.diff import BoardsPair, CameraPair, RigPair
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
 
-NO_VERDICT = "no verdict: only rigkit's calibrations state how unsure they are, and one of these is another tool's"
+NO_VERDICT = "no verdict: a file of another tool has no covariance; compare calibrations of rigkit"
 Pair = CameraPair | RigPair | BoardsPair
 
 
@@ -44,7 +44,7 @@ def facts_of(pair: Pair) -> PageFacts:
     cameras = _cameras_of(pair)
     tables = [_camera_table(cameras)] if cameras else []
     if isinstance(pair, RigPair) and pair.mounts.mounts:
-        tables.append(_mount_table("Mounts", pair.mounts))
+        tables.append(_mount_table("Extrinsics", pair.mounts))
     if isinstance(pair, BoardsPair):
         tables += [_mount_table(f"Boards with {name}", target) for name, target in pair.targets.items()]
     sentences = [line[0].upper() + line[1:] + "." for line in sentences]
@@ -79,8 +79,8 @@ def _cameras_of(pair: Pair) -> Mapping[str, CameraPair]:
 
 def _camera_table(cameras: Mapping[str, CameraPair]) -> Table:
     heads = columns(
-        "camera | difference rms [px] .4 | at most [px] .4 | expected of one camera [px] .4 | times as much .2 | "
-        "chance of as much | turned by [deg] .4 | of the image [%] .0 | verdict"
+        "camera | difference rms [px] .4 | at most [px] .4 | expected if unchanged [px] .4 | ratio .2 | p-value | "
+        "rotation removed [deg] .4 | of the image [%] .0 | verdict"
     )
     rows = []
     for name, own in cameras.items():
@@ -89,16 +89,16 @@ def _camera_table(cameras: Mapping[str, CameraPair]) -> Table:
         tail = (f["rotation_deg"], 100.0 * f["coverage"], f["verdict"] or "no covariance")
         rows.append(cells(name or "camera", *numbers, _chance(f["chance"]), *tail))
     note = (
-        "After the rotation that brings the two closest, where both had boards: a camera's own frame turns with every "
-        "calibration. Chance: of at least as much between two calibrations of one camera."
+        "Where both had boards, after the best rotation: the orientation of a camera's frame differs between "
+        "calibrations. p-value: of at least this difference between two calibrations of one camera."
     )
-    return Table("cameras", "Lenses", heads, tuple(rows), note)
+    return Table("cameras", "Intrinsics", heads, tuple(rows), note)
 
 
 def _mount_table(title: str, difference: RigDifference) -> Table:
-    heads = columns("which | moved by [mm] | turned by [deg] .4 | chance of as much")
+    heads = columns("which | moved by [mm] | rotated by [deg] .4 | p-value")
     rows = tuple(cells(m.name, m.shift_mm, m.rotation_deg, _chance(m.chance)) for m in difference.mounts)
-    return Table("mounts", title, heads, rows, "Against the first one.")
+    return Table("mounts", title, heads, rows, "Relative to the first camera or board.")
 
 
 def _chance(value: float | None) -> str:
@@ -135,12 +135,11 @@ def _camera_in_words(figures: dict[str, Any]) -> str:
     low, high = figures["usual_px"]
     at = f" at {figures['rms_px']:.2g} px" if figures["verdict"] == CameraVerdict.UNIMPORTANT else ""
     # Of normal size but significant: the difference is in a place or a direction that both know more precisely.
-    how = "" if figures["same"] or figures["rms_px"] > high else ", but in a way of which both are surer than that"
+    how = "" if figures["same"] or figures["rms_px"] > high else ", but where both are more certain"
     return line + (
-        f"expected of one camera {figures['predicted_px']:.4f} px ({low:.3f} to {high:.3f} in nine of ten cases), "
-        f"{figures['ratio']:.2f} times as much is found{how} "
-        f"(chance {figures['chance']:.3g}): {figures['verdict']}{at}"
-        + ("" if figures["same_model"] else "; the chance allows for what their different models make of one lens")
+        f"expected of one camera {figures['predicted_px']:.4f} px (90 % interval {low:.3f} to {high:.3f}), ratio "
+        f"{figures['ratio']:.2f}{how} (p = {figures['chance']:.3g}): {figures['verdict']}{at}"
+        + ("" if figures["same_model"] else "; p includes how differently the two models fit one lens")
     )
 
 
@@ -164,14 +163,14 @@ def _boards_figures(pair: BoardsPair) -> dict[str, Any]:
 def _boards_in_words(pair: BoardsPair) -> list[str]:
     lines = [line for target in pair.targets.values() for line in _mounts_in_words(target)]
     chances = ", ".join(f"{target.chance:.3g}" for target in pair.targets.values())
-    verdict = "the same mount" if pair.same else "NOT the same mount: a board moved"
-    return [*lines, f"{verdict} (boards together: chance {chances})"]
+    verdict = "the boards did not move" if pair.same else "NOT the same: a board moved"
+    return [*lines, f"{verdict} (all boards jointly: p = {chances})"]
 
 
 def _mounts_in_words(difference: RigDifference) -> list[str]:
     return [
-        f"{m.name}: sits {length_words(m.shift_mm, decimals=3)} mm and {m.rotation_deg:.4f} deg from where it sat"
-        + ("" if m.chance is None else f" (chance {m.chance:.3g})")
+        f"{m.name}: moved by {length_words(m.shift_mm, decimals=3)} mm, rotated by {m.rotation_deg:.4f} deg"
+        + ("" if m.chance is None else f" (p = {m.chance:.3g})")
         for m in difference.mounts
     ]
 
@@ -181,14 +180,14 @@ def _rigs_in_words(pair: RigPair, figures: dict[str, Any]) -> list[str]:
     lines += [f"{name}: {_camera_in_words(own)}".replace("\n", "; ") for name, own in figures["cameras"].items()]
     if figures["same"] is None:
         return [*(line.removesuffix(f"; {NO_VERDICT}") for line in lines), NO_VERDICT]
-    chance = "" if figures["chance"] is None else f" (mounts together: chance {figures['chance']:.3g})"
+    chance = "" if figures["chance"] is None else f" (all extrinsics jointly: p = {figures['chance']:.3g})"
     verdict = "the same rig" if figures["same"] else "NOT the same rig: a camera or a lens moved"
     scale, lenses = pair.mounts.scale, all(own.same is not False for own in pair.cameras.values())
     if scale is not None and lenses:
         # With two cameras, a scale and a shift along the baseline are indistinguishable.
-        how = ", or one camera moved along the line between both" if len(figures["cameras"]) == 2 else ""
+        how = ", or one camera moved along the baseline" if len(figures["cameras"]) == 2 else ""
         verdict = (
             f"NOT the same rig: lengths of the second are {scale:.5g} times those of the first, and nothing else "
-            f"differs: boards were described with squares of another size{how}"
+            f"differs: the square size of the boards was declared differently{how}"
         )
     return [*lines, f"{verdict}{chance}"]

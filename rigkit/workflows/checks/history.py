@@ -82,8 +82,8 @@ def _since(register: Path, entries: Sequence[HistoryEntry]) -> Iterator[str]:
         file = register.parent / watched
         if file.is_file() and digest_of(file) != entry.digest:
             yield (
-                f"{watched} was overwritten since its last entry of {entry.date[:10]}: the entries are changes of "
-                "another calibration"
+                f"{watched} was overwritten since its last entry of {entry.date[:10]}: its earlier entries refer "
+                "to another calibration"
             )
 
 

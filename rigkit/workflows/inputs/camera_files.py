@@ -97,9 +97,8 @@ def require_sure(source: Path) -> None:
     """Raise InputError for another program's camera file, which has no covariance."""
     if source.is_file() and camera_format(camera_text(source)) not in (None, "rigkit"):
         raise InputError(
-            f"'{source}': another program's file does not say how sure it is, so that nobody can tell its own error "
-            "from what is asked for; `rigkit calibrate` pictures of that camera, or rig, of the time when it held, and "
-            "give what that writes"
+            f"'{source}': a file of another program has no covariance, so its own error cannot be separated from a "
+            "change; run `rigkit calibrate` on images from the time when it held, and give its result"
         )
 
 
@@ -116,7 +115,7 @@ def called_bad(path: str | Path) -> Finding | None:
 def bad_of(verdicts: Iterable[Finding]) -> Finding | None:
     """Return the first verdict of severity BAD, reworded as said of a calibration in use; None if there is none."""
     bad = next((finding for finding in verdicts if finding.severity is Severity.BAD), None)
-    return None if bad is None else replace(bad, message=f"the calibration was called bad: {bad.message}")
+    return None if bad is None else replace(bad, message=f"the calibration's verdict is bad: {bad.message}")
 
 
 def warn_if_bad(path: str | Path, verdicts: Iterable[Finding] | None = None) -> None:

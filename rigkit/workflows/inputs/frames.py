@@ -148,8 +148,8 @@ def _warn_of_clocks(videos: Mapping[str, Video]) -> None:
         if len({round(value, 2) for value in known.values()}) > 1:
             words = ", ".join(f"{value:.6g} of '{name}'" for name, value in known.items())
             _log.warning(
-                "the videos differ in %s, %s: frames of one number are taken as of one moment, which they may not be; "
-                "--timestamps tells which are",
+                "the videos differ in %s, %s: frames of the same number are assumed simultaneous, which may be wrong; "
+                "give --timestamps",
                 what,
                 words,
             )

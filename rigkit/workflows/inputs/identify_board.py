@@ -268,15 +268,15 @@ def _partial_board_words(guess: BoardGuess) -> str:
     if not guess.sizes:
         either = [guess.board, *filter(None, [guess.either])]
         return (
-            "an AprilGrid whose tags look smaller or larger than they are, as too much light or ink runs over: "
+            "an AprilGrid whose tags look smaller or larger than they are (overexposure, or ink that spreads): "
             f"{' or '.join(words_of_board(board) for board in either)}, with a spacing that may be off by some "
             "hundredths; take images with less light, or measure a tag and the gap beside it"
         )
     words = " or ".join(f"{columns} x {rows}" for columns, rows in guess.sizes)
     if guess.board.identified:
         return (
-            f"a ChArUco board of at least {words} inner corners, {words_of_board(guess.board)}: none shows where its "
-            "rows end; count them on the board"
+            f"a ChArUco board of at least {words} inner corners, {words_of_board(guess.board)}: no image shows "
+            "all of its rows; count them on the board"
         )
     if len(guess.sizes) > 1:
         return f"a chessboard of {words} inner corners and do not tell which; count them on the board"

@@ -176,13 +176,13 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool = False, progress: Progr
                 sources[name] = files[_file_of(name, index)] = calibration_text(calibration)
                 warn_if_bad(name, calibration.verdicts)
                 _log.info(
-                    f"camera '{name}' was calibrated from '{entry.session}', for these results alone; "
-                    "`rigkit calibrate` keeps a calibration beside its session"
+                    f"camera '{name}' was calibrated from '{entry.session}', for these results alone; `rigkit "
+                    "calibrate` keeps a calibration beside its session"
                 )
         except RigkitError as error:
             failed[name] = error
             if name not in used:
-                _log.info(f"camera '{name}', which no pair uses, is left aside: {error}")
+                _log.info(f"camera '{name}', which no pair uses, is skipped: {error}")
     out = LoadedCameras(known=known, failed=failed, files=files, sources=sources)
     if not any({p.camera1.camera_id, p.camera2.camera_id} <= set(known) for p in dataset.pairs):
         raise next(error for name, error in failed.items() if name in used)

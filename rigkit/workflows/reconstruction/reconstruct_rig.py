@@ -125,7 +125,7 @@ def reconstruct_rig_views(options: RigSceneOptions, *, progress: Progress = sile
     if not grown:
         raise DegenerateError(
             f"'{options.rig}': none of {len(pairs)} pairs of views gives a cloud; check which camera took which image "
-            f"(--names), and that the images are of one moment. The first: {notes[0]}"
+            f"(--names), and that the images were taken at the same time. The first: {notes[0]}"
         )
     fused = fuse_clouds(tuple(grown.values()))
     files = _files(options, fused, first)
@@ -185,7 +185,9 @@ def _views(options: RigSceneOptions, cameras: Mapping[str, tuple[Camera, Rigid3]
                     "each camera"
                 )
     if not any(np.linalg.norm(v.cam_from_world.inverse().translation_mm) > 0.0 for v in views):
-        raise InputError(f"'{options.rig}': all cameras stand at one place: no baseline, so no distances")
+        raise InputError(
+            f"'{options.rig}': all cameras have the same centre: without a baseline there are no distances"
+        )
     return views
 
 
@@ -206,7 +208,7 @@ def _dense(one: _View, other: _View, known: UncertainPair | None) -> DenseScene:
 
 
 def _files(options: RigSceneOptions, fused: FusedCloud, first: DenseScene | None) -> dict[str, str | bytes]:
-    comments = [f"fused of several pairs; {int((fused.pairs_of > 1).sum())} points were seen by more than one"]
+    comments = [f"fused from several pairs; {int((fused.pairs_of > 1).sum())} points were seen by more than one"]
     files: dict[str, str | bytes] = {
         CLOUD: ply_bytes(
             fused.cloud, single_precision=options.single_precision, confidence=options.confidence, comments=comments

@@ -219,7 +219,7 @@ def _cameras(options: SceneOptions) -> tuple[tuple[Camera, Camera], KnownPose | 
     known = None if options.pose is None else KnownPose(_read_pose(options.pose))
     notes = []
     if options.camera2 is None:
-        notes.append("one calibration is used for both images: right if one camera was moved, else name the other's")
+        notes.append("one calibration is used for both images (one moved camera); of two cameras give --camera2")
     return (camera1, camera2), known, notes
 
 
@@ -308,8 +308,8 @@ def _sparse(
             if options.rig is not None and _fits(scene_of, found.exchanged()):
                 one, other = options.images or ("", "")
                 raise DegenerateError(
-                    f"'{options.name}': images '{one}' and '{other}' are exchanged: the other way round they fit the "
-                    "rig; give them in the order of its cameras, or name these with --names"
+                    f"'{options.name}': images '{one}' and '{other}' are exchanged: in the opposite order they fit "
+                    "the rig; give them in the order of its cameras, or name these with --names"
                 ) from error
             raise
     raise AssertionError("one of two attempts returns or raises")

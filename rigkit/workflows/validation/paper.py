@@ -177,11 +177,11 @@ def paper_page(name: str, images: str | None, tables: Sequence[Table], provenanc
     sentences = (
         "The paper's own pipeline: chords to neighbouring corners, equal weights, its linear solvers with the formulas "
         "corrected, no refinement, planes by principal components.",
-        f"The images are {images}." if images else "Nobody said whether the images are real or rendered.",
+        f"The images are {images}." if images else "Whether the images are real or rendered is not stated.",
         f"What the paper claims passes or fails no check of ours, and {NOT_CHECKED}.",
     )
     facts = PageFacts(
-        headline=f"{held} of {len(judged)} statements of the paper that this data set can test hold on it",
+        headline=f"{held} of {len(judged)} statements of the paper that this data set can test are confirmed",
         sentences=sentences,
         tables=(claims, *(table for table in tables if table.key != "claims")),
     )

@@ -30,7 +30,7 @@ from rigkit.core.findings import Severity
 NEAR, FAR = Board("near", 9, 6, 12.0, 12.0), Board("far", 9, 6, 120.0, 120.0)
 """They fill the image at 90 to 210 mm, and at ten times that."""
 MM_PER_RAD2, NOISE_PX = 1.5, 0.03
-MESSAGE = "the lens does not look from one point"
+MESSAGE = "the lens is not central"
 
 
 def from_the_pupil(points_mm: Points, mm_per_rad2: float) -> Points:
@@ -86,7 +86,7 @@ def test_a_pupil_that_moves_is_found_and_what_it_does_far_away(shape: str) -> No
     assert found.verdicts[0].message.startswith("training RMS") and MESSAGE in found.verdicts[0].message
     # The images all say the same: that something differs between them would be another cause.
     printed = judge(found, in_force=("model", "board_shape"))
-    assert not any("something differs between images" in one.message for one in printed)
+    assert not any("something changes between images" in one.message for one in printed)
     pupil, true = pupil_of(found), off_far_away(found)
     assert 0.4 * MM_PER_RAD2 < pupil.mm_per_rad2 < 1.1 * MM_PER_RAD2
     assert true > 1.0
@@ -177,14 +177,14 @@ def test_an_insignificant_pupil_is_dropped_with_a_finding(monkeypatch: pytest.Mo
     found = session(NEAR, MM_PER_RAD2, 0, pupil="auto")
     assert found.pupil is None
     printed = {c.name: c for c in found.candidates}
-    assert printed[CENTRAL].chosen and printed[CENTRAL].reason == "images do not surely agree that the pupil moves"
-    assert not printed[MOVING].chosen and printed[MOVING].reason == "by how much it moves may be chance"
+    assert printed[CENTRAL].chosen and printed[CENTRAL].reason == "a moving pupil is not significant"
+    assert not printed[MOVING].chosen and printed[MOVING].reason == "movement not significant"
     assert session(NEAR, MM_PER_RAD2, 0, pupil="moving").pupil is not None
 
 
 def test_a_requested_pupil_that_images_do_not_determine_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rigkit.calibration.calibrate.solved_with_pupil", lambda *_: None)
-    with pytest.raises(DegenerateError, match="the images do not tell how the entrance pupil moves"):
+    with pytest.raises(DegenerateError, match="the images do not determine how the entrance pupil moves"):
         session(NEAR, MM_PER_RAD2, 0, pupil="moving")
     assert session(NEAR, MM_PER_RAD2, 0, pupil="auto").pupil is None
 

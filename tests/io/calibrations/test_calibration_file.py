@@ -61,7 +61,7 @@ def test_a_camera_alone(tmp_path: Path) -> None:
     path = tmp_path / "camera.json"
     save_camera(path, lens("reg"))
     assert (load_camera(path).parameters == lens("reg").parameters).all()
-    with pytest.raises(InputError, match=r"without its calibration, .* does not say how sure it is"):
+    with pytest.raises(InputError, match=r"without covariance, as imported"):
         load_calibration(path)
 
 

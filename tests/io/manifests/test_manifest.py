@@ -99,7 +99,7 @@ def test_the_level_may_be_exact_and_that_of_each_camera_known(tmp_path: Path) ->
 
 
 WRONG = [
-    ("sigma_deg = 0.2", "sigma_deg = -0.2", ["must not be negative", "0 means exactly level"]),
+    ("sigma_deg = 0.2", "sigma_deg = -0.2", ["must not be negative", "0: exactly level"]),
     ("sigma_deg = 0.2", "down1 = [0, 1, 0], down2 = [0, 1, 0]", ["for planar motion, not for 'forward'"]),
     ('forward"\nlevel = { sigma_deg = 0.2', 'planar"\nlevel = { down1 = [0, 1, 0]', ["'down2' is missing"]),
     (

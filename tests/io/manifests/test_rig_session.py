@@ -118,7 +118,9 @@ def test_times_nearly_the_same_are_of_one_moment() -> None:
 
 
 def test_images_of_one_name_in_many_folders_are_named() -> None:
-    with pytest.raises(InputError, match=r"'mon/a/img.jpg' and 'tue/a/img.jpg' of camera 'a' would be of one moment"):
+    with pytest.raises(
+        InputError, match=r"'mon/a/img.jpg' and 'tue/a/img.jpg' of camera 'a' are simultaneous by their names"
+    ):
         frames_of_images({"a": ["mon/a/img.jpg", "tue/a/img.jpg"], "b": ["mon/b/img.jpg", "tue/b/img.jpg"]})
 
 

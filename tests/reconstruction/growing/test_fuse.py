@@ -141,5 +141,5 @@ def test_one_cloud_stays_and_surfaces_apart_are_not_merged() -> None:
 
 
 def test_without_clouds_there_is_none_to_fuse() -> None:
-    with pytest.raises(InputError, match="none to fuse"):
+    with pytest.raises(InputError, match="no cloud to fuse"):
         fuse_clouds([])

@@ -108,9 +108,9 @@ def test_a_training_rms_above_the_heldout_one_is_explained(calibration: Calibrat
     odd = replace(calibration, heldout_rms_px=0.5 * calibration.rms_px)
     for text in (describe(odd), page(odd)):
         assert re.search(
-            r"training RMS [\d.]+ px \(.*every corner alike, in the held-out RMS blurred ones count less\)", text
+            r"training RMS [\d.]+ px \(.*equal weights; the held-out RMS weights corners by their sigmas\)", text
         )
-    assert "every corner alike" not in describe(replace(calibration, heldout_rms_px=2.0 * calibration.rms_px))
+    assert "equal weights" not in describe(replace(calibration, heldout_rms_px=2.0 * calibration.rms_px))
 
 
 def test_chosen_models_are_named_as_chosen(calibration: Calibration) -> None:
@@ -123,13 +123,14 @@ def test_chosen_models_are_named_as_chosen(calibration: Calibration) -> None:
     for printed in (moving, central):
         assert "model brown 5, of 2 compared: why brown 5" in printed
     assert f"lens with {MOVING}, of 2 compared: why {MOVING}" in moving
-    assert f"lens with {CENTRAL}, of 2 compared: images do not surely agree" in central
+    assert f"lens with {CENTRAL}, of 2 compared: a moving pupil is not significant" in central
     assert [one.reason for one in kept_central(models)] == [one.reason for one in models]
 
 
 def reported_focal_px(calibration: Calibration) -> tuple[float, float]:
     """Return the focal length and its standard deviation as they are printed."""
-    words = re.search(r"focal length on the axis ([\d.]+) ± ([\d.]+) px, sees [\d.]+ degrees", describe(calibration))
+    pattern = r"focal length on the axis ([\d.]+) ± ([\d.]+) px, horizontal field of view [\d.]+ degrees"
+    words = re.search(pattern, describe(calibration))
     assert words is not None and "focal length on the axis" in page(calibration)
     return float(words[1]), float(words[2])
 
@@ -211,8 +212,8 @@ def test_residual_patterns_separate_chance_from_a_lens_that_does_not_fit(calibra
 def test_the_pictures_to_take_next_are_on_the_page(calibration: Calibration) -> None:
     plan = plan_views(Knowledge.of(calibration), [BOARD], projection_goal(calibration.camera), 2)
     text = build_calibration_page("t", "l", [CalibrationSection("cam", calibration, {}, plan)], {})
-    assert "Take these 2 next" in text and plan_words(plan)[1] in text
-    assert "Take these" not in build_calibration_page("t", "l", [CalibrationSection("cam", calibration)], {})
+    assert "Next 2 images to take" in text and plan_words(plan)[1] in text
+    assert "images to take" not in build_calibration_page("t", "l", [CalibrationSection("cam", calibration)], {})
 
 
 def test_the_headline_and_the_finding_have_one_figure(calibration: Calibration) -> None:
@@ -221,15 +222,15 @@ def test_the_headline_and_the_finding_have_one_figure(calibration: Calibration) 
     )
     judged = replace(unsure, verdicts=judge(unsure))
     text = page(judged)
-    headline = re.search(r"where boards were \(±([\d.]+) px at worst", text)
-    finding = re.search(r"uncertain by up to ([\d.]+) px \(one standard deviation\) where the boards were", text)
+    headline = re.search(r"where boards were seen \(at worst ±([\d.]+) px", text)
+    finding = re.search(r"uncertainty reaches ([\d.]+) px \(one standard deviation\) where boards were seen", text)
     assert headline is not None and finding is not None
     assert float(headline[1]) == float(finding[1]) == 5.0
 
 
 def test_the_sentence_and_the_map_have_one_worst_place(calibration: Calibration) -> None:
     text = page(calibration)
-    beyond = re.search(r"to ±([\d.e+]+) px at worst outside", text)
+    beyond = re.search(r"at worst ±([\d.e+]+) px elsewhere", text)
     drawn = re.search(r"px at best, ([\d.e+]+) px at worst", text)
     assert beyond is not None and drawn is not None
     assert beyond[1] == f"{float(drawn[1]):.2g}"
@@ -243,7 +244,7 @@ def test_what_a_bad_calibration_says_of_the_rest_of_the_image_is_no_advice(
     printed = [
         _reach(replace(calibration, verdicts=(finding,))) for finding in (Finding.good("well"), Finding.bad("ill"))
     ]
-    assert "px at worst outside" in printed[1] and printed[0].startswith(printed[1].rstrip("."))
+    assert "px elsewhere" in printed[1] and printed[0].startswith(printed[1].rstrip("."))
     assert advice in printed[0] and advice not in printed[1]
 
 

@@ -70,7 +70,7 @@ def test_amounts_follow_the_temperature() -> None:
 def test_the_page_and_what_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     warm = [entry(k, "a", 0.01 * (k - 5), 15.0 + k) for k in range(1, 10)]
     page = history_page(warm, "cam", {})
-    assert "focus, %: over the temperature" in page and "+0.01 ± 0.003 % per °C" in page
+    assert "focus, %: against temperature" in page and "+0.01 ± 0.003 % per °C" in page
     assert "is another file" not in page
     calibration, register = tmp_path / "cam.json", tmp_path / "cam.jsonl"
     calibration.write_text("one")

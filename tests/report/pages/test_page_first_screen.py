@@ -15,7 +15,7 @@ def words_of(page: str) -> str:
 def test_a_check_that_failed_stands_first_with_its_cause() -> None:
     report = reported(88.0)
     first = words_of(page_of(report))
-    assert "a check failed" in first and "3 of 4 facts" in first
+    assert "a check failed" in first and "3 of 4 measured or declared facts" in first
     found_words = first.index("angle plane1-plane2: 90.000 deg, measured 88 ± 0.3 (set square)")
     cause = first.index("88 was probably misread")
     assert found_words < cause
@@ -25,7 +25,7 @@ def test_a_check_that_failed_stands_first_with_its_cause() -> None:
 
 def test_a_passed_verdict_is_in_the_users_units_with_the_accuracy_of_the_ruler() -> None:
     first = words_of(page_of(reported(90.0)))
-    assert "all checks passed" in first and "4 of 4 facts" in first
+    assert "all checks passed" in first and "4 of 4 measured or declared facts" in first
     assert "lengths to 0.50 mm" in first and "angles to 0.000 deg" in first
-    assert "The rule (±2 mm) is coarser" in first
+    assert "The measurement (±2 mm) is less precise" in first
     assert "probably" not in first

@@ -74,7 +74,7 @@ def facts_page() -> str:
         PageFacts(
             headline="A length: 95 % of errors within 0.3 mm",
             badge="no limit given",
-            sentences=("Half of the view keeps 0.2 mm.",),
+            sentences=("The bound is 0.2 mm in half of the view.",),
             tables=(table,),
         ),
         {"rigkit": "x"},

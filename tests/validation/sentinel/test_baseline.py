@@ -67,14 +67,14 @@ def test_a_wrong_rig_is_checked_for_changes_since_earlier_frames(seed: int) -> N
     assert quiet.holds and quiet.baseline is not None and quiet.baseline.frames == 2
     assert quiet.baseline.rms_corrected_px < 0.5 * quiet.baseline.rms_px
     assert quiet.baseline.chance < ALARM_CHANCE
-    asked = "make sure that the pictures of before are of the same camera"
+    asked = "make sure that they are of the same camera"
     assert any(asked in sentence for sentence in check_facts(quiet).sentences)
-    assert check_facts(quiet).headline.startswith("Nothing moved since")
+    assert check_facts(quiet).headline.startswith("Nothing changed since")
     assert not check.holds and check.change is not None and check.change.hypothesis.kind == "rotation"
     sigmas = check.change.sigmas
     assert check.change.amounts == pytest.approx([TURN_DEG, 0.0, 0.0], abs=4.0 * float(sigmas.max()))
     assert sigmas[0] < 0.1 * TURN_DEG
-    assert check_facts(check).headline.startswith("Moved since (")
+    assert check_facts(check).headline.startswith("Changed since (")
 
 
 def test_pictures_of_before_of_two_moments_are_refused() -> None:
@@ -92,7 +92,7 @@ def test_pictures_of_before_of_two_moments_are_refused() -> None:
         return lambda now: evidence_of(now, views)
 
     assert judge_since(rig, boards(0), boards(0)).holds
-    with pytest.raises(InputError, match="the pictures of before do not fit"):
+    with pytest.raises(InputError, match="the images of --before do not fit"):
         judge_since(rig, boards(1), boards(0))
 
 

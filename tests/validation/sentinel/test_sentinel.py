@@ -47,7 +47,7 @@ def test_unchanged_cameras_hold(calibration: Calibration) -> None:
     assert min(check.chance for check in checks) > 1e-3
     assert check_facts(checks[0]).headline.startswith("Still holds (")
     blind = replace(checks[0], powers=tuple(replace(power, chance=0.1) for power in checks[0].powers))
-    assert check_facts(blind).headline.startswith("Still holds, as far as these pictures tell (")
+    assert check_facts(blind).headline.startswith("Still holds, as far as these images show (")
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_a_check_that_holds_says_what_it_could_have_missed(calibration: Calibrat
         assert (power.found_from < power.size) == (power.chance > FOUND) == (power.frames == 3)
     # A narrow lens shows where its axis is, better than its focus.
     assert powers["principal point"].chance > FOUND > powers["focus"].chance
-    assert "would have been found with chance" in check_facts(check).sentences[-2]
+    assert "would have been detected with probability" in check_facts(check).sentences[-2]
     assert "rigkit plan CALIBRATION --check" in check_facts(check).sentences[-1]
     # A calibration that is no surer finds no more with any number of pictures.
     vague = replace(calibration, covariance=1e4 * calibration.covariance)
@@ -118,7 +118,7 @@ def test_a_check_that_holds_says_what_it_could_have_missed(calibration: Calibrat
     powers = {p.kind: p for p in checked(unsure, lens("reg"), np.random.default_rng(0)).powers}
     focus = powers["focus"]
     assert focus.frames is None and focus.both is not None and 1 < focus.both <= UNSURE * 4
-    assert "times as many, in the calibration too" in check_page(printed, "t", {})
+    assert "times as many, also in the calibration" in check_page(printed, "t", {})
 
 
 def test_another_camera_is_explained_by_nothing(calibration: Calibration, rng: np.random.Generator) -> None:
@@ -198,8 +198,10 @@ def test_a_lens_changed_in_several_ways_is_described_by_its_displacement(calibra
     check = checked(calibration, much, np.random.default_rng(1))
     assert check.change is not None and check.change.hypothesis.kind == "lens" and not check.holds
     words = check_facts(check)
-    assert re.search(r"changed in several ways; [\d.]+ px, [\d.]+ mm at 1 m$", words.headline)
-    assert re.search(r"\d+% of what is seen is explained by this alone: the ", words.sentences[1])
+    assert re.search(
+        r"several parameters of the lens of the camera changed; [\d.]+ px, [\d.]+ mm at 1 m$", words.headline
+    )
+    assert re.search(r"\d+% of it is explained by this alone: the ", words.sentences[1])
 
 
 def test_the_same_calibration_again_is_no_change(calibration: Calibration, tmp_path: Path) -> None:

@@ -170,8 +170,8 @@ def test_pictures_too_far_off_to_linearise_are_not_of_these_cameras(tmp_path: Pa
     )
     check = evaluate_evidence(rig, lambda _: far)
     assert check.unexplained and not check.holds and check.change is None
-    assert "nothing that moved explains it" in check_facts(check).headline
-    assert HistoryEntry.of_check(check, tmp_path).verdict == "nothing that moved explains it"
+    assert "no change of the camera or rig explains it" in check_facts(check).headline
+    assert HistoryEntry.of_check(check, tmp_path).verdict == "no change of the camera or rig explains it"
     # Where nothing is off, it is the calibration's numbers that are.
     with pytest.raises(DegenerateError, match="calibration's numbers"):
         evaluate_evidence(rig, lambda _: replace(far, rms_px=0.1))

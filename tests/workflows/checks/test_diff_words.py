@@ -20,4 +20,4 @@ def test_another_camera_that_differs_by_no_more_than_usual(typical_times: tuple[
     judged = CalibrationComparison(difference, 0.5 * (low + high), (low, high), 0.001, True)
     words = words_of(CameraPair(difference, judged))[-1]
     assert "another camera or a moved lens" in words
-    assert ("times as much is found, but in a way of which both are surer than that (chance 0.001)" in words) == surer
+    assert ("but where both are more certain (p = 0.001)" in words) == surer

@@ -152,7 +152,7 @@ def test_a_video_tells_its_board_and_why_another_is_not_seen(tmp_path: Path) -> 
 def test_the_board_of_a_video_is_identified(tmp_path: Path) -> None:
     path = video(tmp_path / "a.avi", [picture((0.2 * k - 0.4, 0.3 * k - 0.5, 0.0), 5.0 * k) for k in range(5)])
     assert boards_seen([path], 12.5) == (f"{BOARD.columns}x{BOARD.rows}x12.5",)
-    with pytest.raises(InputError, match="how large are the squares in the video"):
+    with pytest.raises(InputError, match="the square size is missing"):
         calibrate_folders([path], FolderOptions(), CalibrateOptions())
 
 

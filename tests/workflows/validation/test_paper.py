@@ -47,7 +47,7 @@ def test_tables_have_the_printed_numbers_and_the_claims(repeated) -> None:
     assert cell.paper == "8.3326"
     assert (out / "tables.md").read_text() == done.files["tables.md"]
     page = (out / "report.html").read_text()
-    assert "statements of the paper that this data set can test hold on it" in page
+    assert "statements of the paper that this data set can test are confirmed" in page
     assert "DET3UDIR is the worst of the five" in page and "The images are rendered." in page
     verdicts = {str(row[0].value): str(row[1].value) for row in tables["claims"].rows}
     # Equal weights and the squared mean scale: on exact renders the scale's bias is the largest error there is.
@@ -79,7 +79,7 @@ def test_directions_and_scale_are_options(tmp_path: Path) -> None:
 def test_contradictory_options_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for options, words in (
         (["--own-solvers"], "add that"),
-        (["--paper", "--directions", "line"], "of its own"),
+        (["--paper", "--directions", "line"], "fixes directions"),
     ):
         assert main(["validate", str(LAB), "-o", str(tmp_path / "out"), *options]) == ExitCode.BAD_INPUT
         assert words in capsys.readouterr().err

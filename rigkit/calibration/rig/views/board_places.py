@@ -78,7 +78,7 @@ def board_places(
         if single is not None:
             raise InputError(
                 f"rigid boards {', '.join(group)}: '{single}' is never seen together with the others; take images that "
-                "show it beside one of them"
+                "show it with one of them"
             )
         first = next(name for name in group if name in known)
         origin = known[first].inverse()
@@ -90,8 +90,8 @@ def board_places(
         if open_scenes:
             notes.append(
                 Finding.look(
-                    f"in {open_scenes} of {len(scenes)} images nothing tells which of the boards "
-                    f"{', '.join(group)} is which; there they count as boards of their own"
+                    f"in {open_scenes} of {len(scenes)} images the boards {', '.join(group)} cannot be identified; "
+                    "there their relative poses are not used"
                 )
             )
     return replace(views, seen=out, places=places), tuple(notes)

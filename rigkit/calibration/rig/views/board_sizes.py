@@ -59,7 +59,7 @@ def _error(values: FloatArray) -> float:
 
 def _finding(cameras: tuple[str, str], boards: tuple[str, str], typical_mm: tuple[float, float]) -> Finding:
     return Finding.bad(
-        f"boards '{boards[0]}' and '{boards[1]}' are not of the sizes that are stated: by the one cameras "
-        f"'{cameras[0]}' and '{cameras[1]}' are {typical_mm[0]:.4g} mm apart, by the other {typical_mm[1]:.4g} mm",
+        f"the declared sizes of boards '{boards[0]}' and '{boards[1]}' are inconsistent: they give the baseline of "
+        f"cameras '{cameras[0]}' and '{cameras[1]}' as {typical_mm[0]:.4g} mm and {typical_mm[1]:.4g} mm",
         "measure the squares of both (are the two sizes swapped?), and calibrate again",
     )

@@ -99,7 +99,7 @@ def part_far(seen: Sequence[FrameObservations], off_px: Mapping[Key, float]) -> 
     out = []
     for key in sorted(shared):
         if off_px[key] > max(MAX_DISTANCE_RATIO * typical, 0.5 * worst):
-            words = f"by {digits(off_px[key])} px, {off_px[key] / typical:.0f} times the usual"
+            words = f"by {digits(off_px[key])} px, {off_px[key] / typical:.0f} times the median"
             out.append((*key, why(seen, key, words)))
             part(seen, key)
     return out
@@ -110,10 +110,10 @@ def why(seen: Sequence[FrameObservations], key: Key, how: str) -> str:
     cameras = [k for k, own in enumerate(seen) if any(e.key == key for e in own.values())]
     if len(cameras) > 1:
         return (
-            f"the cameras disagree on where it is ({how}); the board or the rig moved between the exposures, or they "
-            "are not of one moment"
+            f"the cameras disagree on its pose ({how}); board or rig moved between the exposures, or the images are "
+            "not simultaneous"
         )
-    return f"its boards disagree on where it is ({how}); one of them was moved against the others"
+    return f"its boards disagree on its pose ({how}); one of them was moved relative to the others"
 
 
 def part(seen: Sequence[FrameObservations], key: Key) -> None:

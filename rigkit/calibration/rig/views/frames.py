@@ -120,16 +120,18 @@ def mounts_of(views: RigViews) -> tuple[list[Rigid3], tuple[Finding, ...]]:
         shared = sorted(targets[i].keys() & targets[j].keys())
         if not shared:
             raise InputError(
-                f"rig: camera '{names[j]}' shares no board in any frame with '{names[0]}' or the cameras that hang "
-                "together with it; take frames in which both see a whole board, and check the names of the frames"
+                f"rig: camera '{names[j]}' shares no board in any frame with '{names[0]}' or the cameras connected to "
+                "it; take frames in which both see a whole board, and check that simultaneous images have the same "
+                "name or number"
             )
         motion, rival = _motion([(targets[i][key], targets[j][key]) for key in shared])
         if rival is not None:
             notes.append(
                 Finding.look(
-                    f"cameras '{names[i]}' and '{names[j]}' share {len(shared)} boards, which look the same "
-                    f"turned: turned by {np.degrees(rotation_angle(rival.rotation @ motion.rotation.T)):.0f} deg the "
-                    "one against the other would fit as well; the smaller turn is taken",
+                    f"cameras '{names[i]}' and '{names[j]}' share only {len(shared)} boards, which are symmetric: an "
+                    "extrinsic rotation that differs by "
+                    f"{np.degrees(rotation_angle(rival.rotation @ motion.rotation.T)):.0f} deg fits equally well; the "
+                    "smaller rotation is used",
                     "tilt the board differently in more frames, or use one with an odd and an even number of corners",
                 )
             )

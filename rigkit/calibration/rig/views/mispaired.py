@@ -67,12 +67,12 @@ def same_pictures(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> list[
         total = len({frame for frame, _ in shared})
         if len(frames) == total:
             raise InputError(
-                f"rig: cameras '{a}' and '{b}' have the same pictures in {_all(total)}; give each camera its own"
+                f"rig: cameras '{a}' and '{b}' have identical images in {_all(total)}; give each camera its own images"
             )
         out.append(
             Finding.bad(
-                f"cameras '{a}' and '{b}' have the same picture in {_named(frames)} of {total} frames",
-                "give each camera its own, and calibrate again",
+                f"cameras '{a}' and '{b}' have identical images in {_named(frames)} of {total} frames",
+                "give each camera its own images, and calibrate again",
             )
         )
     return out
@@ -88,16 +88,18 @@ def put_together_wrongly(views: RigViews, mounts: Sequence[Rigid3], left_out: It
     tried: list[tuple[RigViews, str, str, str]] = []
     for i, j in combinations(range(len(own)), 2):
         trial = those.with_camera(i, own[j]).with_camera(j, own[i])
-        tried.append((trial, f"'{names[i]}' and '{names[j]}' are exchanged", "put right", "give them their own names"))
+        tried.append(
+            (trial, f"'{names[i]}' and '{names[j]}' are exchanged", "exchanging them back", "correct their names")
+        )
     for k, camera in enumerate(views.cameras):
         trial = those.with_camera(k, _turned(own[k], camera))
-        remedy = "take them as the camera wrote them"
-        tried.append((trial, f"'{names[k]}' are turned by half a turn", "turned back", remedy))
+        remedy = "use the image files as the camera wrote them"
+        tried.append((trial, f"'{names[k]}' are rotated by 180 degrees", "rotating them back", remedy))
     out = []
     for trial, what, mended, remedy in tried:
         if right := _put_right(now, _by_frame(_off(trial, mounts))):
-            agree = "the cameras agree there on where the boards are"
-            message = f"the images of {what} in {_named(right)}: {mended}, {agree}"
+            agree = "makes the cameras agree on the boards' poses"
+            message = f"the images of {what} in {_named(right)}: {mended} {agree}"
             out.append(Finding.bad(message, f"{remedy}, and calibrate again"))
     return [*out, *_miscounted(views, mounts, now)]
 
@@ -119,10 +121,10 @@ def _miscounted(views: RigViews, mounts: Sequence[Rigid3], now: Mapping[str, flo
                 moments = _in_order(typical)
                 called = [moments[moments.index(frame) + step] for frame in right]
                 message = (
-                    f"the images of '{views.names[k]}' in {_named(called)} are of {_steps(step)}: counted so, the "
-                    "cameras agree there on where the boards are; an image is missing, or was taken twice"
+                    f"the images of '{views.names[k]}' in {_named(called)} belong to {_steps(step)}: with "
+                    "that shift the cameras agree on the boards' poses; an image is missing, or was taken twice"
                 )
-                return [Finding.bad(message, "name the images of one moment alike, and calibrate again")]
+                return [Finding.bad(message, "give simultaneous images the same number, and calibrate again")]
     return []
 
 
@@ -135,9 +137,9 @@ def why_nothing_agrees(views: RigViews) -> Finding | None:
         for step in STEPS if k else ():
             if _typical_px(views.with_camera(k, _counted(seen, k, step))) <= limit:
                 return Finding.bad(
-                    f"the images of '{names[k]}' are of {_steps(step)} in all frames: counted so, the cameras agree; "
-                    "an image is missing, or they did not begin together",
-                    "name the images of one moment alike",
+                    f"the images of '{names[k]}' belong to {_steps(step)} in all frames: with that shift the "
+                    "cameras agree; an image is missing, or the cameras did not start together",
+                    "give simultaneous images the same number",
                 )
         for axis in (0, 1):
             mirrored = {key: _mirrored(entry, camera, axis) for key, entry in seen[k].items()}
@@ -145,17 +147,17 @@ def why_nothing_agrees(views: RigViews) -> Finding | None:
                 # Of two cameras either may be the mirrored one.
                 who = f"'{names[k]}'" if len(seen) > 2 else f"'{names[0]}' or those of '{names[1]}'"
                 return Finding.bad(
-                    f"the images of {who} are mirrored: mirrored back, the cameras agree",
-                    "take them as the camera wrote them",
+                    f"the images of {who} are mirrored: undoing that makes the cameras agree",
+                    "use the image files as the camera wrote them",
                 )
         turned = _turned(seen[k], camera)
         for sides in _as_one_frame_has_it(views, k, turned):
             some = {key: turned[key] if key[0] in sides else entry for key, entry in seen[k].items()}
             if sides and _typical_px(views.with_camera(k, some)) <= limit:
                 return Finding.bad(
-                    f"the images of '{names[k]}' are turned by half a turn in {_named(_in_order(sides))}, or in all "
-                    "others: turned back, the cameras agree",
-                    "take them as the camera wrote them",
+                    f"the images of '{names[k]}' are rotated by 180 degrees in {_named(_in_order(sides))}, or in "
+                    "all others: undoing that makes the cameras agree",
+                    "use the image files as the camera wrote them",
                 )
     return None
 
@@ -258,7 +260,7 @@ def _one_picture(one: BoardView, other: BoardView) -> bool:
 
 def _steps(step: int) -> str:
     count = "one frame" if abs(step) == 1 else f"{abs(step)} frames"
-    return f"{count} {'before' if step > 0 else 'after'}"
+    return f"{count} {'earlier' if step > 0 else 'later'}"
 
 
 def _in_order(frames: Iterable[str]) -> list[str]:

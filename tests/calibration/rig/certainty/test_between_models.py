@@ -66,7 +66,7 @@ def test_held_out_frames_are_compared_with_the_cameras_alone(
 
 
 @pytest.mark.parametrize(
-    ("lags", "cause"), [({}, "not quite of one moment"), ({"wide": Lag(0.1, 0.01, 0.0)}, "lags do not explain")]
+    ("lags", "cause"), [({}, "not exactly synchronised"), ({"wide": Lag(0.1, 0.01, 0.0)}, "time lags vary")]
 )
 def test_solved_lags_are_not_named_as_a_cause_again(lags: dict[str, Lag], cause: str) -> None:
     """Frames worse than the cameras alone are explained by moments only as far as those were not solved for."""

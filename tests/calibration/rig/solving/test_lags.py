@@ -82,7 +82,7 @@ def test_a_lag_is_solved_for(tmp_path: Path) -> None:
         assert abs(found.frames - lag) < 3.0 * found.sigma < abs(lag)
         assert abs(off) < min(3.0 * sigma, LEFT * without_mm)
         when = "after" if lag > 0.0 else "before"
-        assert any(f"of the time between two frames {when} 'left'" in printed.message for printed in rig.verdicts)
+        assert any(f"frame periods {when} 'left'" in printed.message for printed in rig.verdicts)
     (tmp_path / "rig.json").write_text(rig_text(rig))
     first, second = json.loads((tmp_path / "rig.json").read_text())["cameras"]
     assert "lag" not in first
@@ -109,8 +109,8 @@ def test_images_are_read_row_by_row(tmp_path: Path) -> None:
         assert abs(found.frames - 0.1) < 3.0 * found.sigma < 0.01
     off, sigma = off_mm(rig)
     assert abs(off) < 3.0 * sigma < 0.2
-    assert any("row by row" in printed.message for printed in rig.verdicts)
-    assert not any("not quite of one moment" in printed.message for printed in rig.verdicts)
+    assert any("rolling shutter" in printed.message for printed in rig.verdicts)
+    assert not any("not exactly synchronised" in printed.message for printed in rig.verdicts)
     (tmp_path / "rig.json").write_text(rig_text(rig))
     cameras = json.loads((tmp_path / "rig.json").read_text())["cameras"]
     assert [camera["readout"]["frames"] for camera in cameras] == [own.frames for own in rig.readouts.values()]

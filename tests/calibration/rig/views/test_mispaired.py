@@ -90,8 +90,8 @@ def half_a_turn(views: Views) -> Views:
     ("mistake", "words"),
     [
         (exchanged, r"the images of 'left' and 'right' are exchanged in frames '3', '10':"),
-        (one_missing, r"the images of 'right' in frames '7', '8', '9' are of one frame after:"),
-        (half_a_turn, r"the images of 'right' are turned by half a turn in frames '2', '9':"),
+        (one_missing, r"the images of 'right' in frames '7', '8', '9' belong to one frame later:"),
+        (half_a_turn, r"the images of 'right' are rotated by 180 degrees in frames '2', '9':"),
     ],
 )
 def test_the_mistake_is_the_first_thing_that_is_said(
@@ -115,13 +115,13 @@ def test_a_board_that_was_moved_is_no_such_mistake(rng: np.random.Generator) -> 
     rig = calibrated(views)
     assert {"2", "6"} <= {frame for frame, _, _ in rig.left_out}
     words = " ".join(map(str, rig.verdicts))
-    assert not any(word in words for word in ("exchanged", "turned", "counted", "same picture"))
+    assert not any(word in words for word in ("exchanged", "rotated", "belong to", "identical"))
 
 
 def test_one_off_in_all_frames(rng: np.random.Generator) -> None:
     views = pair(rng)
     views["right"] = [(str(int(f) + 1), view) for f, view in views["right"]]
-    assert "the images of 'right' are of one frame before in all frames:" in cause(views)
+    assert "the images of 'right' belong to one frame earlier in all frames:" in cause(views)
 
 
 @pytest.mark.parametrize("board", [BOARD, Board("even", 8, 6, 30.0, 30.0)])
@@ -142,7 +142,7 @@ def test_one_camera_mirrored(board: Board, rng: np.random.Generator) -> None:
 def test_half_of_one_camera_turned(rng: np.random.Generator) -> None:
     views = pair(rng)
     views["right"] = [(f, turned(view) if int(f) % 2 else view) for f, view in views["right"]]
-    assert re.search("turned by half a turn in frames '[12]', '[34]', '[56]' and 2 more", cause(views))
+    assert re.search("rotated by 180 degrees in frames '[12]', '[34]', '[56]' and 2 more", cause(views))
 
 
 def test_one_picture_under_two_names(rng: np.random.Generator) -> None:
@@ -158,9 +158,9 @@ def test_one_picture_under_two_names(rng: np.random.Generator) -> None:
             ]
         }
 
-    with pytest.raises(InputError, match="'left' and 'right' have the same pictures in all 10 frames"):
+    with pytest.raises(InputError, match="'left' and 'right' have identical images in all 10 frames"):
         calibrated(instead(set(left)))
     rig = calibrated(instead({"4", "5"}))
     assert rig.verdicts[0].severity is Severity.BAD
-    assert "'left' and 'right' have the same picture in frames '4', '5' of 10 frames" in rig.verdicts[0].message
-    assert not any("same picture" in str(finding) for finding in calibrated(views).verdicts)
+    assert "'left' and 'right' have identical images in frames '4', '5' of 10 frames" in rig.verdicts[0].message
+    assert not any("identical images" in str(finding) for finding in calibrated(views).verdicts)
