@@ -30,7 +30,7 @@ SAME_CHANCE = 0.01
 COVARIANCE_FLOOR_PX = 0.05
 """Smallest standard deviation of a mode of the projection: a covariance from images is not more accurate than that."""
 TYPICAL_SHARE = 0.9
-"""Part of the differences of one camera between the limits `usual_px`."""
+"""Part of the differences of one camera between the limits `interval_px`."""
 IMPORTANT_PX = 0.1
 """A smaller difference is of no importance, however significant: corners of real images are hardly better."""
 
@@ -53,7 +53,7 @@ class CalibrationComparison:
     predicted_px : median of the rms difference of two calibrations of one camera, over the same pixels and after the
         best rotation. The mean square would be dominated by a few large differences: most of a difference is one mode
         (the focal length, which correlates with the boards' distances), so that it varies like a single number.
-    usual_px : limits that contain 90 % of such differences; one above the second has a probability below 0.1.
+    interval_px : limits that contain 90 % of such differences; one above the second has a probability below 0.1.
     chance : probability of a difference at least this large if both were calibrations of the same, unchanged camera,
         each in its own model.
     same_model : both are of one model and size.
@@ -61,7 +61,7 @@ class CalibrationComparison:
 
     difference: CameraDifference
     predicted_px: float
-    usual_px: tuple[float, float]
+    interval_px: tuple[float, float]
     chance: float
     same_model: bool
 

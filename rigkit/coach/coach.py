@@ -26,7 +26,7 @@ MAX_PICTURE_PX = 12000
 LOOK_S = 0.06
 """Where a look takes longer, the next image is reduced: with it ten looks a second are possible."""
 MAX_SHRINK = 4
-MIN_WORTH = 0.05
+MIN_FRAME_GAIN = 0.05
 """Least gain, relative to that of a board in the outline, for which a frame of a recording is taken."""
 
 Image = NDArray[Any]
@@ -58,7 +58,7 @@ class Take(Enum):
     """Whether a frame is kept: never, where its gain is large enough, or wherever it shows a board."""
 
     NO = "look"
-    WORTH = "offer"
+    IF_USEFUL = "offer"
     YES = "take"
 
 
@@ -71,16 +71,16 @@ class Coach:
         options: GuideOptions,
         keeper: Keeper,
         finish: Callable[[], str],
-        tell: Callable[[str], None] = ignored,
+        report: Callable[[str], None] = ignored,
         executor: Executor | None = None,
     ) -> None:
-        """Resume with the frames of the keeper. `finish` calibrates the session and returns a summary; `tell` gets a
+        """Resume with the frames of the keeper. `finish` calibrates the session and returns a summary; `report` gets a
         line for every frame kept, every photo not taken, and the summary; `executor` runs intermediate calibrations, by
         default in the foreground."""
         self.guide, self.keeper = RigGuide(keeper.names, options, executor), keeper
         self._executor = executor
         self.finished: str | None = None
-        self._finish, self._tell = finish, tell
+        self._finish, self._report = finish, report
         self._lock = threading.Lock()
         self._last: list[FrameObservation | None] = [None] * len(keeper.names)
         self._shrink = [1] * len(keeper.names)
@@ -121,7 +121,7 @@ class Coach:
             advice = self.guide.advise(frame_observations, photo=photo)
             # When the coach is restarted, a folder is read from its beginning again.
             again = self._marks.get(_mark(images)) if photo else None
-            kept = take is Take.YES or (take is Take.WORTH and advice.take and again is None)
+            kept = take is Take.YES or (take is Take.IF_USEFUL and advice.take and again is None)
             taken = None
             if kept and any(frame_observation.view is not None for frame_observation in frame_observations):
                 if not whole:
@@ -134,7 +134,7 @@ class Coach:
             self._show(frame_observations, advice, taken=taken)
             if photo and not taken:
                 reason = f"it is {again} already" if again else _reason(frame_observations, advice)
-                self._tell(f"{source or 'photo'}: not taken, as {reason}")
+                self._report(f"{source or 'photo'}: not taken, as {reason}")
                 self.say(f"Not taken, as {reason}. {self._shown['words']}")
             return self._shown
 
@@ -142,7 +142,7 @@ class Coach:
         """Write a frame and add it to the guide; return its name."""
         name = self.keeper.keep(images)
         self._add(name, frame_observations, images)
-        self._tell(f"{source}: taken as {name}" if source else f"{name} taken")
+        self._report(f"{source}: taken as {name}" if source else f"{name} taken")
         return name
 
     def _add(self, name: str, frame_observations: Sequence[FrameObservation], images: Sequence[Image]) -> None:
@@ -211,9 +211,9 @@ class Coach:
             frame_observations.append(self._observe(images, whole=True, photo=True))
         while left:
             advice = [self.guide.advise(frame_observations[k]) for k in left]
-            if advice[0].enough or max(a.worth for a in advice) < MIN_WORTH:
+            if advice[0].enough or max(a.frame_gain for a in advice) < MIN_FRAME_GAIN:
                 return
-            best = left.pop(int(np.argmax([a.worth for a in advice])))
+            best = left.pop(int(np.argmax([a.frame_gain for a in advice])))
             with self._lock:
                 self._keep(frames[best], frame_observations[best], "")
                 show(frames[best])
@@ -225,7 +225,7 @@ class Coach:
         with self._lock:
             if not self._names:
                 raise InputError("coach: there is no frame to undo")
-            self._tell(f"{self._names[-1]} set aside")
+            self._report(f"{self._names[-1]} set aside")
             dropped = self._names.pop()
             self.keeper.drop(dropped)
             self._marks = {mark: name for mark, name in self._marks.items() if name != dropped}
@@ -240,7 +240,7 @@ class Coach:
         """Calibrate the session, and return its summary followed by the message `missing`."""
         with self._lock:
             self.finished = self._finish() + missing
-            self._tell(self.finished)
+            self._report(self.finished)
             return self.finished
 
 
@@ -257,4 +257,4 @@ def _reason(frame_observations: Sequence[FrameObservation], advice: RigAdvice) -
         return "no board is seen"
     if wrong:
         return f"it is not good enough ({wrong})"
-    return f"it adds little: {100.0 * max(advice.worth, 0.0):.0f} % of what the place asked for would"
+    return f"it adds little: {100.0 * max(advice.frame_gain, 0.0):.0f} % of what the place asked for would"

@@ -98,7 +98,7 @@ class Advice:
     ----------
     words : what to do now.
     target_px : (K, 2) outline to hold the board into.
-    worth : gain of this frame, relative to that of a board in the outline.
+    frame_gain : gain of this frame, relative to that of a board in the outline.
     take : whether to take this frame.
     enough : there are enough frames.
     waits : no instruction, until a calibration shows whether there are enough.
@@ -108,7 +108,7 @@ class Advice:
 
     words: str
     target_px: Pixels
-    worth: float
+    frame_gain: float
     take: bool
     enough: bool
     waits: bool
@@ -181,7 +181,7 @@ class CaptureGuide:
         plan = self._planned(frame_observation.size_px)
         target = self.asked(frame_observation.size_px)
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
-        worth, min_gain = self._gain(frame_observation.view, plan, photo=photo), min_gain_of(photo=photo)
+        frame_gain, min_gain = self._gain(frame_observation.view, plan, photo=photo), min_gain_of(photo=photo)
         left = () if self.calibration is None else self._left_now
         would_do = bool(left) and self.has_many
         would_do = would_do and (all(own.reached for own in left) or plan.gain < MIN_GAIN_TO_CONTINUE)
@@ -191,15 +191,15 @@ class CaptureGuide:
             words = CHECKING
         elif steady:
             words = enough_words(left, plan.gain, plan.knowledge.camera)
-        elif frame_observation.view is not None and worth >= min_gain and frame_observation.complaint:
+        elif frame_observation.view is not None and frame_gain >= min_gain and frame_observation.complaint:
             words = frame_observation.complaint.capitalize()
         elif would_do:
             words = f"One more as confirmation: {where}"
         return Advice(
             words=words,
             target_px=where.outline_px,
-            worth=worth,
-            take=not frame_observation.complaint and worth >= min_gain and steady is False,
+            frame_gain=frame_gain,
+            take=not frame_observation.complaint and frame_gain >= min_gain and steady is False,
             enough=steady is True,
             waits=steady is None,
             left=left,
@@ -296,9 +296,9 @@ class CaptureGuide:
             return 0.0
         known = plan.knowledge
         more = known.of_views(held_view(view, pose), view.board.board_id)[0]
-        worth = relative_gain(plan, float(plan.goal.error(covariance_of(known.information + more))), photo=photo)
+        frame_gain = relative_gain(plan, float(plan.goal.error(covariance_of(known.information + more))), photo=photo)
         # With so few frames the gain of others cannot be predicted.
-        return max(worth, MIN_GAIN_OF_PHOTO) if photo and not self.has_many else worth
+        return max(frame_gain, MIN_GAIN_OF_PHOTO) if photo and not self.has_many else frame_gain
 
 
 def relative_gain(plan: Plan, after: float, *, photo: bool) -> float:

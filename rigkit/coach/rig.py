@@ -56,7 +56,7 @@ class RigAdvice:
     ----------
     lenses : advice of each camera's guide.
     mount_px : error of the mounts; None before it can be estimated.
-    worth : gain of the frame, relative to that of a board in the outline.
+    frame_gain : gain of the frame, relative to that of a board in the outline.
     enough, waits : whether there are enough frames; whether there is no instruction until that is known.
     advised_camera : index of the camera that the words are about.
     targets : for each camera the outline (K, 2) to hold the board into, or None.
@@ -67,7 +67,7 @@ class RigAdvice:
     lenses: tuple[Advice, ...]
     mount_px: float | None
     words: str = ""
-    worth: float = 0.0
+    frame_gain: float = 0.0
     take: bool = False
     enough: bool = False
     waits: bool = False
@@ -126,7 +126,7 @@ class RigGuide:
             advice = self._of_mount(replace(advice, advised_camera=advised_camera), frame_observations)
         seeing, min_gain = [g for g in frame_observations if g.view is not None], min_gain_of(photo=photo)
         complaint = next((g.complaint for g in seeing if g.complaint), "")
-        if advice.enough or advice.waits or not seeing or advice.worth < min_gain:
+        if advice.enough or advice.waits or not seeing or advice.frame_gain < min_gain:
             return advice
         return replace(advice, take=not complaint, words=complaint.capitalize() or TAKING)
 
@@ -139,9 +139,9 @@ class RigGuide:
         return replace(
             advice,
             words=own.words if len(lenses) == 1 else f"{self.names[advised_camera]}: {own.words}",
-            worth=max(
+            frame_gain=max(
                 [
-                    a.worth
+                    a.frame_gain
                     for a, g in zip(lenses, frame_observations, strict=True)
                     if not (a.enough or a.waits) and g.view
                 ],
@@ -159,7 +159,7 @@ class RigGuide:
         if c not in self._asked:
             self._asked[c] = self._shared_target(c)
         words, targets = self._asked[c]
-        return replace(advice, words=words, targets=tuple(targets), worth=self._mount_gain(c, frame_observations))
+        return replace(advice, words=words, targets=tuple(targets), frame_gain=self._mount_gain(c, frame_observations))
 
     def _of_rig(self, advice: RigAdvice, frame_observations: Sequence[FrameObservation], *, photo: bool) -> RigAdvice:
         """Return the advice by the rig's calibration, once lenses and mounts seem good enough."""
@@ -182,8 +182,8 @@ class RigGuide:
             words = f"One more as confirmation: {words[0].lower()}{words[1:]}"
         frame = [frame_observation.view for frame_observation in frame_observations]
         new = any(view is not None and not lens.repeats(view) for lens, view in zip(self.lenses, frame, strict=True))
-        worth = known.worth(frame, photo=photo) if new else 0.0
-        return replace(advice, words=words, targets=tuple(targets), worth=worth)
+        frame_gain = known.gain_of(frame, photo=photo) if new else 0.0
+        return replace(advice, words=words, targets=tuple(targets), frame_gain=frame_gain)
 
     def _rig_is_enough(self, lenses: Sequence[Advice]) -> bool:
         """Say whether the rig's calibration is good enough although a lens alone is not: cameras help each other."""

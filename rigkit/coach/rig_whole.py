@@ -113,7 +113,7 @@ class RigKnown:
         together = f" where {' and '.join(asked.seen_by)} see it" if len(asked.seen_by) > 1 else ""
         return f"Hold the board{together}: {where} of {names[first]}", targets
 
-    def worth(self, frame: Views, *, photo: bool) -> float:
+    def gain_of(self, frame: Views, *, photo: bool) -> float:
         """Return the gain of a frame, relative to that of the view asked for."""
         monitored, plan = self.monitored, self.plan
         for camera, mount, view in zip(monitored.cameras, monitored.cam_from_rig, frame, strict=True):

@@ -169,10 +169,10 @@ def _corner_boards(board: Board) -> tuple[Points, Normals]:
     Rows, columns and so diagonals lead away from the corner of the room on all three boards, so that estimators that
     use the diagonal treat the planes alike.
     """
-    away = -np.eye(3)
+    outwards = -np.eye(3)
     flat = board.points()[:, :2] + (1.0 + MARGIN_SQUARES) * np.array([board.square_x_mm, board.square_y_mm])
-    corners = [flat @ away[[i, j]] for i, j in ((0, 1), (0, 2), (2, 1))]
-    return np.concatenate(corners), away[[2, 1, 0]]
+    corners = [flat @ outwards[[i, j]] for i, j in ((0, 1), (0, 2), (2, 1))]
+    return np.concatenate(corners), outwards[[2, 1, 0]]
 
 
 def _octant_eyes(corners: Points, facing: Normals, board: Board, rng: np.random.Generator) -> Points:

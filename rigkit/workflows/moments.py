@@ -79,14 +79,14 @@ def _by_names(names: Sequence[str], images: Sequence[Path]) -> ImagesByMoment:
     return [[moment[name] for name in names] for moment in found.values()]
 
 
-def _sides(names: Sequence[str], text: str, beside: str) -> dict[str, tuple[str, str]]:
-    """Return for each camera whose name is in `text` the text without the name, and `beside`."""
+def _sides(names: Sequence[str], text: str, other: str) -> dict[str, tuple[str, str]]:
+    """Return for each camera whose name is in `text` the text without the name, and `other`."""
     out = {}
     for name in names:
         more = r"\d" if name[-1].isdigit() else "[a-z]"
         parts = re.split(rf"(?<![a-z]){re.escape(name)}(?!{more})", text, maxsplit=1, flags=re.IGNORECASE)
         if len(parts) == 2:
-            out[name] = ("*".join(parts), beside)
+            out[name] = ("*".join(parts), other)
     return out
 
 

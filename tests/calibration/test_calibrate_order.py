@@ -35,8 +35,8 @@ def test_shuffled_images_have_the_same_lens(name: str, seed: int) -> None:
         assert other.heldout_rms_px == pytest.approx(found[0].heldout_rms_px, rel=SAME)
         rays, _ = found[0].camera.unproject(np.concatenate([view.pixels for view in views]))
         assert np.abs(other.camera.project(rays)[0] - found[0].camera.project(rays)[0]).max() < SAME
-        typical = FarProjection.of(found[0], from_boards=True).usual_px
-        assert FarProjection.of(other, from_boards=True).usual_px == pytest.approx(typical, rel=1e-3)
+        typical = FarProjection.of(found[0], from_boards=True).typical_px
+        assert FarProjection.of(other, from_boards=True).typical_px == pytest.approx(typical, rel=1e-3)
 
 
 def boards_at(centres: FloatArray, rng: np.random.Generator) -> list[FloatArray]:

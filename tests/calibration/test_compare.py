@@ -135,7 +135,7 @@ def test_nine_of_ten_differences_are_not_significant(calibrations: list[Calibrat
     for k in range(100):
         moved = replace(a, camera=b.camera.with_parameters(b.camera.parameters + np.sqrt(2.0) * step[k]))
         result = compare_calibrations(moved, b, grid=(24, 18))
-        low, high = result.usual_px
+        low, high = result.interval_px
         assert low < result.predicted_px < high
         inside += low <= result.difference.rms_px <= high
         assert result.difference.rms_px <= high or result.chance <= 0.1 + 2e-3

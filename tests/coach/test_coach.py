@@ -51,7 +51,7 @@ def test_a_frame_is_taken_when_it_is_still_sharp_and_helps(pictures: list[np.nda
     again = observe_frame(pictures[0], [BOARD], "b", first)
     assert again.still and again.sharp and guide.advise(again).take
     guide.add(again.view, again.size_px)  # type: ignore[arg-type]
-    assert guide.advise(again).worth == 0.0, "the same once more counts as one"
+    assert guide.advise(again).frame_gain == 0.0, "the same once more counts as one"
     blurred = observe_frame(picture(poses[1], np.random.default_rng(2), blur_px=4.0), [BOARD], "c").as_photo()
     assert blurred.view is None or (not blurred.sharp and not guide.advise(blurred).take)
     empty = observe_frame(np.full((480, 640, 3), 90, np.uint8), [BOARD], "d")
@@ -69,7 +69,7 @@ def test_a_photo_that_is_there_needs_to_bring_less_than_a_frame_that_may_be_wait
         size_px=SIZE, view=BoardView("far", coarse, coarse.grid(), pixels, np.full(len(pixels), 0.1)), contrast=100.0
     )
     photo = far.as_photo()
-    assert MIN_GAIN_OF_PHOTO < guide.advise(photo).worth < MIN_GAIN
+    assert MIN_GAIN_OF_PHOTO < guide.advise(photo).frame_gain < MIN_GAIN
     assert not guide.advise(photo).take and guide.advise(photo, photo=True).take
 
 

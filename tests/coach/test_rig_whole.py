@@ -157,7 +157,7 @@ def test_what_the_rig_is_less_sure_of_is_asked_for(
     assert not now.enough and not now.waits and now.words.startswith("Hold the board where ")
     assert all(target is not None for target in now.targets), "outlines in both images"
     seen = guide.advise(frame(3, rng))
-    assert seen.worth > 0.2 and guide.advise(frames[-1]).worth == 0.0, "the board was not moved"
+    assert seen.frame_gain > 0.2 and guide.advise(frames[-1]).frame_gain == 0.0, "the board was not moved"
 
 
 def test_a_held_out_error_of_the_rig_that_changes_asks_for_one_more(

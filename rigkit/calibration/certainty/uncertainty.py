@@ -260,7 +260,7 @@ class FarProjection:
         return out
 
     @property
-    def usual_px(self) -> float:
+    def typical_px(self) -> float:
         """Standard deviation where the boards were: rms over the corners; infinite if none has a ray."""
         known = self.at_corners_px[np.isfinite(self.at_corners_px)]
         return float(np.sqrt(np.mean(known**2))) if known.size else float("inf")

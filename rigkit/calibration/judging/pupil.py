@@ -174,15 +174,15 @@ def moving_pupil(calibration: Calibration, correlation: float, far: FarProjectio
     if pupil is None or pupil.chance > BY_CHANCE:
         return []
     off = pupil.far_px(far)
-    if off <= max(far.usual_px, SMALL_PX):
+    if off <= max(far.typical_px, SMALL_PX):
         return []
-    near, away, rim = _shown(calibration)
+    nearest, farthest, rim = _shown(calibration)
     moved = abs(pupil.mm_per_rad2) * rim**2
     return [
         Finding.look(
             f"{NOT_ONE_POINT}: its entrance pupil moves by at least {moved:.1f} mm between the optical axis and the "
-            f"outermost corners (boards {near:.0f} to {away:.0f} mm away), which is not modelled; distant points are "
-            f"projected with an error of at least {off:.2f} px",
+            f"outermost corners (boards {nearest:.0f} to {farthest:.0f} mm away), which is not modelled; distant "
+            f"points are projected with an error of at least {off:.2f} px",
             "calibrate at the distance of what is to be measured (with a larger board)",
         )
     ]
@@ -192,14 +192,14 @@ def modelled_pupil(calibration: Calibration) -> list[Finding]:
     """Return a finding with the movement of a pupil that is part of the calibration."""
     if calibration.pupil is None:
         return []
-    near, away, rim = _shown(calibration)
+    nearest, farthest, rim = _shown(calibration)
     mm, sigma = calibration.pupil.shift_mm(rim)
     return [
         Finding.good(
             f"{NOT_ONE_POINT}, which is modelled: its entrance pupil moves by {mm:.2f} +- "
             f"{calibration.widening * sigma:.2f} mm between the optical axis and the outermost corners "
-            f"({np.degrees(rim):.0f} degrees; boards {near:.0f} to {away:.0f} mm away); exports to central models omit "
-            "it and are exact for distant points only"
+            f"({np.degrees(rim):.0f} degrees; boards {nearest:.0f} to {farthest:.0f} mm away); exports to central "
+            "models omit it and are exact for distant points only"
         )
     ]
 
@@ -219,5 +219,5 @@ def _shown(calibration: Calibration) -> tuple[float, float, float]:
     """Return the DISTANCES of the corners, mm, and their largest angle from the axis, rad."""
     points = calibration.corners.in_cam(np.flatnonzero(calibration.corners.kept))
     distance = np.linalg.norm(points, axis=1)
-    near, away = np.quantile(distance, DISTANCES).tolist()
-    return near, away, float(np.arccos(np.clip(points[:, 2] / distance, -1.0, 1.0)).max())
+    nearest, farthest = np.quantile(distance, DISTANCES).tolist()
+    return nearest, farthest, float(np.arccos(np.clip(points[:, 2] / distance, -1.0, 1.0)).max())

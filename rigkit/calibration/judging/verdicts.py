@@ -354,7 +354,7 @@ def _overfit(c: Calibration) -> list[Finding]:
 
 
 def _uncertain(c: Calibration, far: FarProjection) -> list[Finding]:
-    typical, worst, inside = far.usual_px, far.worst_px, far.at_corners_px
+    typical, worst, inside = far.typical_px, far.worst_px, far.at_corners_px
     if worst <= UNCERTAIN_PX:
         error = c.rms_px if c.heldout_rms_px is None else c.heldout_rms_px
         if typical <= max(error, SMALL_PX):

@@ -43,19 +43,19 @@ def assemble_rig(
     layout = state.layout(observations)
     known, sigma = frame_covariance(observations, joint.solution, joint.sigma_px, joint.frames)
     overdispersion = known.clustered.overdispersion
-    beside = _error_of_held(joint, layout, normal.covariance[0])
+    extra = _error_of_held(joint, layout, normal.covariance[0])
     off = shape_error(observations, state, sigma * overdispersion)
-    beside[: len(off), : len(off)] += np.outer(off, off)
+    extra[: len(off), : len(off)] += np.outer(off, off)
     by_readouts, readout_sigmas = readout_error(joint)
-    beside += by_readouts
+    extra += by_readouts
     covariance = known.covariance
-    beside += between_rig_models(joint, np.sqrt(np.diag(covariance + beside)))
-    covariance += beside
+    extra += between_rig_models(joint, np.sqrt(np.diag(covariance + extra)))
+    covariance += extra
     boards = observations.cameras[0].boards
     points = observations.shape.points(state.unknowns)
     first_row = observations.cameras[0].first_row
     shapes = {b.board_id: points[first_row[i] : first_row[i + 1]] for i, b in enumerate(boards)}
-    cameras, squared = _cameras(joint, heldout[1], known, beside)
+    cameras, squared = _cameras(joint, heldout[1], known, extra)
     everything = np.concatenate(squared)
     reported = _lenses_and_mounts(layout, state)
     # All boards were measured with one ruler: its error does not average out.
@@ -104,17 +104,17 @@ def _pupils(joint: JointRig, layout: Layout, covariance: FloatArray, reported: I
 
 
 def _cameras(
-    joint: JointRig, heldout: Sequence[float | None], known: GlobalCovariance, beside: FloatArray
+    joint: JointRig, heldout: Sequence[float | None], known: GlobalCovariance, extra: FloatArray
 ) -> tuple[list[RigCamera], list[FloatArray]]:
-    """Return the cameras in the rig's solution, and the squared residuals of the corners of each, px^2; `beside` (G, G)
-    is the covariance of the globals beside that from the scatter between frames."""
+    """Return the cameras in the rig's solution, and the squared residuals of the corners of each, px^2; `extra` (G, G)
+    is the covariance of the globals that the scatter between frames does not include."""
     observations, state = joint.observations, joint.solution.state
     layout = state.layout(observations)
     cameras, squared = [], []
     for c, (name, own) in enumerate(zip(joint.views.names, observations.cameras, strict=True)):
         alone = state.of_camera(c, observations)
         parts = pose_jacobians(observations, state, c, alone.translation_mm)
-        frame = known.of_camera(layout.cameras[c], parts, alone.translation_mm, beside)
+        frame = known.of_camera(layout.cameras[c], parts, alone.translation_mm, extra)
         residuals, kept = joint.solution.normal.residuals[c], observations.weights[c] > 0.0
         squared.append((residuals.px**2).sum(axis=-1)[kept])
         lens, frame, pupil = without_pupil(alone.camera, frame)

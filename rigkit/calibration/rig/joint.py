@@ -159,10 +159,10 @@ def solve_jointly(
         mounts = [Rigid3(r, t) for r, t in zip(state.mount_rotation, state.mount_mm, strict=True)]
     progress("rig", MAX_ROUNDS, MAX_ROUNDS)
     typical_sigmas = float(np.sqrt(typical) / max(sigma, MIN_PX))
-    usual_px, size_px = typical_distance_px(observations, cost), _boards_px(seen)
-    if usual_px > NOTHING_IN_COMMON * size_px:
+    typical_px, size_px = typical_distance_px(observations, cost), _boards_px(seen)
+    if typical_px > NOTHING_IN_COMMON * size_px:
         raise DegenerateError(
-            f"rig: the views of a frame disagree by {usual_px:.0f} px on the boards' poses (boards are {size_px:.0f} "
+            f"rig: the views of a frame disagree by {typical_px:.0f} px on the boards' poses (boards are {size_px:.0f} "
             f"px large); {_advice(seen)}"
         )
     if typical_sigmas > DISAGREES:
@@ -170,7 +170,7 @@ def solve_jointly(
         if known is not None:
             observations = known.hold(observations, solution.state, views.names)
         solution = solve_rig(observations, solution.state, sigma)
-        also = (_disagreement(cost, sigma, (usual_px, typical_sigmas), several=len(seen) > 1),)
+        also = (_disagreement(cost, sigma, (typical_px, typical_sigmas), several=len(seen) > 1),)
     return JointRig(
         views=views,
         observations=observations,
@@ -226,7 +226,7 @@ def _boards_px(seen: Sequence[FrameObservations]) -> float:
 
 def _disagreement(cost: Mapping[Key, float], sigma: float, typical: tuple[float, float], *, several: bool) -> Finding:
     """Return the finding where the typical cost of sharing poses, `typical` px a corner and sigmas, is not chance."""
-    usual_px, typical_sigmas = typical
+    typical_px, typical_sigmas = typical
     worst = sorted(cost, key=lambda key: -cost[key])[:NAMED]
     times = {frame: np.sqrt(cost[frame, target]) / max(sigma, MIN_PX) for frame, target in worst}
     frames = ", ".join(f"'{frame}' ({value:.0f})" for frame, value in times.items())
@@ -235,7 +235,7 @@ def _disagreement(cost: Mapping[Key, float], sigma: float, typical: tuple[float,
     if not several:
         what, remedy = "the boards are not rigidly mounted: one pose for all of them", "fasten the boards"
     message = (
-        f"{what} leaves residuals of {typical_sigmas:.1f} times the corner noise ({usual_px:.2g} px), most in frames "
+        f"{what} leaves residuals of {typical_sigmas:.1f} times the corner noise ({typical_px:.2g} px), most in frames "
         f"{frames}; intrinsics are held near those of each camera alone, and the rig's sigmas follow from the "
         "disagreement between frames"
     )

@@ -77,8 +77,8 @@ class TomlTable(Mapping[str, Any]):
             self.allow_only(known, values)
         for key, value in values.items():
             self._values[key] = self._checked(key, value, known.get(key, others))
-        for key, beside in schema.get("dependentRequired", {}).items():
-            self._require(beside if key in values else (), values)
+        for key, required in schema.get("dependentRequired", {}).items():
+            self._require(required if key in values else (), values)
 
     def __getitem__(self, key: str) -> Any:
         self._require([key], self._values)
@@ -119,7 +119,7 @@ class TomlTable(Mapping[str, Any]):
                 remedy = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
                 raise self.error(f"unknown key {_value_in_words(key)}; {remedy}")
 
-    def beside(self, name: str) -> Path:
+    def path_of(self, name: str) -> Path:
         """Return the absolute path of `name`, relative to the folder of the file; links are not resolved."""
         with self.located():
             path = usable_path(self.path.parent / name)

@@ -254,7 +254,7 @@ def load_dataset(path: str | Path) -> Dataset:
         cameras=cameras,
         pairs=pairs,
         sources=tuple(
-            t.beside(t[key]) for t, key in (*((b, "file") for b in top["boards"]), (top, "truth_table")) if key in t
+            t.path_of(t[key]) for t, key in (*((b, "file") for b in top["boards"]), (top, "truth_table")) if key in t
         ),
         images=top.get("images"),
     )
@@ -273,14 +273,14 @@ def _board(entry: TomlTable) -> Board:
         return measured_board(entry, entry["id"])
     entry.allow_only(("id", "file"))
     with entry.located():
-        return replace(load_board(entry.beside(entry["file"])), board_id=entry["id"])
+        return replace(load_board(entry.path_of(entry["file"])), board_id=entry["id"])
 
 
 def _camera(entry: TomlTable) -> CameraEntry:
-    calibration = entry.beside(entry["calibration"])
+    calibration = entry.path_of(entry["calibration"])
     session: Path | None = calibration.with_name(SESSION_NAME)
     if "session" in entry:
-        session = entry.beside(entry["session"])
+        session = entry.path_of(entry["session"])
         if not session.is_file():
             raise entry.error(f"session '{session}' does not exist; correct the path")
     elif session is not None and not session.is_file():
@@ -307,8 +307,8 @@ def _pair(entry: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEnt
         pair_id=entry["id"],
         camera1=camera1,
         camera2=camera2,
-        image1=entry.beside(entry["image1"]),
-        image2=entry.beside(entry["image2"]),
+        image1=entry.path_of(entry["image1"]),
+        image2=entry.path_of(entry["image2"]),
         pose_type=pose_type,
         level_sigma_deg=level,
         boards=chosen,
@@ -335,7 +335,7 @@ def _level(
 
 def _with_table(top: TomlTable, pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
     """Return the pairs with the truth of the spreadsheet; a pair's truth must not be in both."""
-    source = top.beside(top["truth_table"])
+    source = top.path_of(top["truth_table"])
     stated = load_truth_csv(source, {pair.pair_id: pair.boards for pair in pairs})
     for pair in pairs:
         if pair.truth.count and pair.pair_id in stated:

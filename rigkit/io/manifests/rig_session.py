@@ -140,7 +140,7 @@ def load_rig_session(path: str | Path) -> RigSession:
         if name in cameras:
             raise entry.error("its id must be its own; give it another")
         if "calibration" in entry:
-            lenses[name] = entry.beside(entry["calibration"])
+            lenses[name] = entry.path_of(entry["calibration"])
         own = options_of(entry, options)
         cameras[name] = Session(path=source, images=images_of(entry), boards=boards, camera=name, **own)
     return RigSession(
@@ -150,7 +150,7 @@ def load_rig_session(path: str | Path) -> RigSession:
         baselines=tuple(_baseline(entry, list(cameras)) for entry in table.get("baselines", ())),
         rigid_boards=rigid,
         lenses=lenses,
-        known_rig=table.beside(table["rig"]) if "rig" in table else None,
+        known_rig=table.path_of(table["rig"]) if "rig" in table else None,
     )
 
 

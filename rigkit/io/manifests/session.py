@@ -177,7 +177,7 @@ def images_of(table: TomlTable) -> tuple[Path, ...]:
     found: dict[Path, Path] = {}
     absent = []
     for pattern in patterns:
-        table.beside(pattern)
+        table.path_of(pattern)
         # The root is no pattern: its name may have brackets.
         root = table.path.parent
         matches = [root / m for m in sorted(glob.glob(pattern, root_dir=root))]
@@ -201,17 +201,17 @@ def files_of_session(path: str | Path) -> tuple[Path, ...]:
     """
     source = Path(path)
     table = read_toml(source, SESSION_FILE)
-    out = [source, *_board_files(table), *([table.beside(table["rig"])] if "rig" in table else [])]
+    out = [source, *_board_files(table), *([table.path_of(table["rig"])] if "rig" in table else [])]
     for entry in table.get("cameras", (table,)):
         out += images_of(entry)
-        out += [entry.beside(entry["calibration"])] if "calibration" in entry else []
+        out += [entry.path_of(entry["calibration"])] if "calibration" in entry else []
         name = f"-{entry['id']}" if entry is not table else ""
         out.append(beside_session(source, f"corners{name}.json"))
     return tuple(out)
 
 
 def _board_files(table: TomlTable) -> list[Path]:
-    return [table.beside(name) for name in (table["boards"] if "boards" in table else (table["board"],))]
+    return [table.path_of(name) for name in (table["boards"] if "boards" in table else (table["board"],))]
 
 
 def boards_of(table: TomlTable) -> tuple[Board, ...]:

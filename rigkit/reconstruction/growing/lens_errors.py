@@ -73,9 +73,9 @@ def error_modes(camera: Camera, pixels: Pixels, *, free_to_turn: bool) -> ErrorM
 
 def _modes(pixels: Pixels, centre: FloatArray, radius: float, size_px: tuple[int, int]) -> tuple[FloatArray, IntArray]:
     """Return displacements (N, 2, K) and their families; the variance decreases with the wave number."""
-    away = pixels - centre
-    distance = np.linalg.norm(away, axis=1)
-    outwards = away / np.maximum(distance, 1e-9)[:, None]
+    offset = pixels - centre
+    distance = np.linalg.norm(offset, axis=1)
+    outwards = offset / np.maximum(distance, 1e-9)[:, None]
     around = np.stack([-outwards[:, 1], outwards[:, 0]], axis=1)
     x = distance[:, None] / radius
     number = np.arange(max(RADIAL_WAVES, TILTED_WAVES))

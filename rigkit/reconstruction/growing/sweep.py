@@ -139,18 +139,18 @@ class Sweep:
         # The census cannot distinguish surfaces that are closer than a sample.
         step_levels = np.maximum(self.step_px / (slope * spacing), 1.0)
         surfaces = np.stack([level, below - level, right - level, step_levels], axis=1)
-        out, beside = np.full(len(plane), np.inf), self.near_winner(level, at, slope)
+        out, near = np.full(len(plane), np.inf), self.near_winner(level, at, slope)
         own, other = swept_rivals(
             self.costs,
             len(self.inverse),
             self.samples1,
-            np.stack(at, axis=1)[beside],
-            surfaces[beside],
+            np.stack(at, axis=1)[near],
+            surfaces[near],
             radius=RIVAL_RADIUS,
             alike=ALIKE_LEVELS,
         ).T
         with np.errstate(divide="ignore", invalid="ignore"):
-            out[beside] = np.nan_to_num(own / other, nan=1.0)
+            out[near] = np.nan_to_num(own / other, nan=1.0)
         return out
 
 

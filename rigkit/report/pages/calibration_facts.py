@@ -100,7 +100,7 @@ def _reach(c: Calibration) -> str:
     grid = uncertainty_map(c, grid=MAP_GRID)
     beyond = grid.worst_px[np.isfinite(grid.worst_px) & ~covered_by_boards(c, grid.pixels)]
     words = (
-        f"Projection of distant points: ±{digits(far.usual_px)} px where boards were seen (at worst "
+        f"Projection of distant points: ±{digits(far.typical_px)} px where boards were seen (at worst "
         f"±{digits(far.worst_px)} px; one standard deviation)"
     )
     if not beyond.size:

@@ -41,10 +41,10 @@ def heat_drift(temperature_c: FloatArray, value: FloatArray, sigma: FloatArray) 
 
     weight = sigma**-2.0
     mean, middle = (float((weight * x).sum() / weight.sum()) for x in (temperature_c, value))
-    away = temperature_c - mean
-    spread = float((weight * away**2).sum())
-    slope = float((weight * away * value).sum()) / spread
+    deviation_c = temperature_c - mean
+    spread = float((weight * deviation_c**2).sum())
+    slope = float((weight * deviation_c * value).sum()) / spread
     freedom = len(value) - 2
-    excess = float((weight * (value - middle - slope * away) ** 2).sum()) / freedom
+    excess = float((weight * (value - middle - slope * deviation_c) ** 2).sum()) / freedom
     own = float(np.sqrt(max(excess, 1.0) / spread))
     return HeatDrift(mean, middle, slope, own, float(2.0 * stdtr(freedom, -abs(slope) / own)))

@@ -99,11 +99,11 @@ def counted_alike(monitored: Monitored, fresh: FreshView, before: Sequence[Fresh
     here = monitored.cam_from_rig[c] @ monitored.cam_from_rig[first.camera].inverse() @ pose
     turned = replace(view, grid=grid_turned(view.grid, view.board.size, 2))
 
-    def apart(one: BoardView) -> float:
+    def distance_px(one: BoardView) -> float:
         pixels, seen = monitored.cameras[c].project(here.apply(one.points()))
         return float(np.median(np.linalg.norm(pixels - one.pixels, axis=1)[seen])) if seen.any() else np.inf
 
-    return replace(fresh, view=turned) if apart(turned) < apart(view) else fresh
+    return replace(fresh, view=turned) if distance_px(turned) < distance_px(view) else fresh
 
 
 def _fits(monitored: Monitored, views: Sequence[FreshView]) -> bool:

@@ -199,9 +199,9 @@ def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = (
                 best, (amounts, fixed, after) = rival, other
                 break
         step = best.hypothesis.directions @ amounts
-        unsure = best.hypothesis.directions @ best.covariance @ best.hypothesis.directions.T
-        covariance = monitored.covariance + unsure
-        size_px, max_px = _sizes_px(monitored, evidence, step, unsure)
+        step_covariance = best.hypothesis.directions @ best.covariance @ best.hypothesis.directions.T
+        covariance = monitored.covariance + step_covariance
+        size_px, max_px = _sizes_px(monitored, evidence, step, step_covariance)
         change = replace(best, amounts=amounts, size_px=size_px, max_px=max_px)
     goals = cost or lens_goals(monitored)
     # Goals are of lenses and mounts, which come first.
@@ -314,16 +314,16 @@ def _fitted(whitened: Whitened, hypothesis: Hypothesis) -> Change | None:
 
 
 def _sizes_px(
-    monitored: Monitored, evidence: FreshEvidence, step: FloatArray, unsure: FloatArray
+    monitored: Monitored, evidence: FreshEvidence, step: FloatArray, step_covariance: FloatArray
 ) -> tuple[float, float]:
-    """Return the size of a change of theta (T,) whose estimate has the covariance `unsure`, and an upper bound. The
+    """Return the size of a change `step` (T,) of theta with covariance `step_covariance`, and an upper bound. The
     size is the largest rms displacement of: the projection of any one camera, after the best rotation; distant points
     seen by any one camera that turned on its mount; the corners. The square of an estimate is biased by its variance,
     which is subtracted for the size, but not for the bound."""
     shown = evidence.information.sum(axis=0) / evidence.corners
     turns = [_turn_weight(monitored, c) for c in range(1, len(monitored.cameras))]
     weights = [shown, *(goal.weight for goal in lens_goals(monitored)), *turns]
-    squares = np.array([(step @ weight @ step, (weight * unsure).sum()) for weight in weights])
+    squares = np.array([(step @ weight @ step, (weight * step_covariance).sum()) for weight in weights])
     return float(np.sqrt(max(0.0, *(squares[:, 0] - squares[:, 1])))), float(np.sqrt(max(0.0, *squares[:, 0])))
 
 

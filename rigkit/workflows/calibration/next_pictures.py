@@ -63,8 +63,8 @@ def next_frames(
     reach = reach or Reach()
     frames = Frames.of(watched, boards, reach)
     if length is None:
-        away = float(np.median(np.linalg.norm(frames.translation_mm, axis=-1)))
-        goal = rig_goal(watched.cameras, watched.cam_from_rig, away, reach.field_deg)
+        distance_mm = float(np.median(np.linalg.norm(frames.translation_mm, axis=-1)))
+        goal = rig_goal(watched.cameras, watched.cam_from_rig, distance_mm, reach.field_deg)
     elif len(watched.cameras) != 2:
         raise InputError("plan: --length needs one camera or a rig of two; leave it out")
     else:

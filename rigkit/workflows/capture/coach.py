@@ -76,8 +76,10 @@ class CoachOptions(NamesFiles):
     """Other machines in this network may use the page."""
 
 
-def open_coach(options: CoachOptions, tell: Callable[[str], None] = ignored, executor: Executor | None = None) -> Coach:
-    """Return the coach of a session's folder, which is made, or gone on with; `tell` and `executor` as in `Coach`.
+def open_coach(
+    options: CoachOptions, report: Callable[[str], None] = ignored, executor: Executor | None = None
+) -> Coach:
+    """Return the coach of a session's folder, which is made, or gone on with; `report` and `executor` as in `Coach`.
 
     Raises InputError where the folder holds another session, or cannot be one.
     """
@@ -95,7 +97,7 @@ def open_coach(options: CoachOptions, tell: Callable[[str], None] = ignored, exe
             return length_goals(cameras, cam_from_rig, length)
 
         guide = replace(guide, measured=measured)
-    return Coach(guide, keeper, lambda: finished_words(options.folder, guide), tell, executor)
+    return Coach(guide, keeper, lambda: finished_words(options.folder, guide), report, executor)
 
 
 def _names(options: CoachOptions) -> tuple[str, ...]:
@@ -142,7 +144,7 @@ def coach_frames(
     """Offer frames to the coach until there are enough, or no more, or somebody finished it."""
     for images, source in frames:
         try:
-            state = coach.look(images, take=Take.WORTH, photo=photos, source=source, show=show)
+            state = coach.look(images, take=Take.IF_USEFUL, photo=photos, source=source, show=show)
         except RigkitError as error:
             _log.warning("%s: %s", source or "frame", error)
             coach.say(str(error))
@@ -166,12 +168,12 @@ def coach_recording(
     sources, boards = dict(zip(coach.keeper.names, videos, strict=True)), coach.guide.options.boards
     times = timestamps_next_to(videos)
 
-    def tell(what: str, done: int, total: int) -> None:
+    def report(what: str, done: int, total: int) -> None:
         coach.say(f"{what.capitalize()}: {done} of {total}")
         progress(what, done, total)
 
     with TemporaryDirectory(prefix="rigkit-coach-") as place:
-        kept = frames_of_videos(sources, Path(place) / "frames", boards, timestamps=times, progress=tell)
+        kept = frames_of_videos(sources, Path(place) / "frames", boards, timestamps=times, progress=report)
     numbers = {int(path.stem) for paths in kept.images.values() for path in paths}
     frames = [[moment[name] for name in sources] for moment in moments_of_videos(sources, numbers, times)]
     coach.choose(frames, show)

@@ -163,15 +163,15 @@ def _rigs(a: Path, b: Path) -> RigPair:
     names = list(first.cameras)
     if names != list(second.cameras):
         raise InputError(
-            f"diff: '{a}' has the cameras {', '.join(names)}, '{b}' {', '.join(second.cameras)}; "
-            "give rigs of the same cameras"
+            f"diff: '{a}' has the cameras {', '.join(names)}, '{b}' {', '.join(second.cameras)}; give rigs of the same "
+            "cameras"
         )
     mounts = compare_mounts(_mounted(first), _mounted(second))
     cameras = {}
     for name in names:
-        beside = [path.with_name(f"{path.stem}-{name}.json") for path in (a, b)]
-        if all(path.is_file() for path in beside):
-            cameras[name] = _cameras(*beside)
+        paths = [path.with_name(f"{path.stem}-{name}.json") for path in (a, b)]
+        if all(path.is_file() for path in paths):
+            cameras[name] = _cameras(*paths)
         else:
             cameras[name] = CameraPair(compare_cameras(first.cameras[name][0], second.cameras[name][0]), None)
     return RigPair(mounts, cameras)

@@ -114,7 +114,7 @@ def _camera_figures(pair: CameraPair) -> dict[str, Any]:
         "rotation_deg": difference.rotation_deg,
         "coverage": difference.coverage,
         "predicted_px": None if judged is None else judged.predicted_px,
-        "usual_px": None if judged is None else list(judged.usual_px),
+        "usual_px": None if judged is None else list(judged.interval_px),
         "ratio": None if judged is None else judged.ratio,
         "chance": None if judged is None else judged.chance,
         "verdict": None if judged is None else str(judged.verdict),

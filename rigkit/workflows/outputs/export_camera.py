@@ -129,14 +129,14 @@ def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence
     return ExportedRig(kind=kind, max_error_px=foreign.max_error_px, written=tuple(files))
 
 
-def foreign_rig_files(rig: Rig, beside: Path, kinds: Sequence[str], outlines: Outlines) -> dict[Path, str]:
+def foreign_rig_files(rig: Rig, result: Path, kinds: Sequence[str], outlines: Outlines) -> dict[Path, str]:
     """Return the files (path -> content) of a rig in each of the formats `kinds` that can hold it.
 
-    They are named after the rig's file `beside` and fitted inside the `outlines` of the images that corners covered.
+    They are named after the rig's file `result` and fitted inside the `outlines` of the images that corners covered.
     Notes for their users go to the log; so does a warning about a format that cannot represent this rig.
     """
     files: dict[Path, str] = {}
-    for kind, places in foreign_rig_paths(list(rig), beside, kinds).items():
+    for kind, places in foreign_rig_paths(list(rig), result, kinds).items():
         try:
             foreign = write_rig(rig, kind, outlines)
         except InputError as error:
@@ -147,13 +147,13 @@ def foreign_rig_files(rig: Rig, beside: Path, kinds: Sequence[str], outlines: Ou
     return files
 
 
-def foreign_rig_paths(names: Sequence[str], beside: Path, kinds: Sequence[str]) -> dict[str, list[Path]]:
+def foreign_rig_paths(names: Sequence[str], result: Path, kinds: Sequence[str]) -> dict[str, list[Path]]:
     """Return the paths of `foreign_rig_files` by format, for cameras of these names."""
     out = {}
     for kind in kinds:
         known = RIG_FORMATS.get(kind)
         if known is not None and not (known.stereo_only and len(names) != 2):
-            whole = beside.with_name(f"{beside.stem}-{kind}{RIG_ENDINGS.get(kind, FOREIGN_ENDINGS[kind])}")
+            whole = result.with_name(f"{result.stem}-{kind}{RIG_ENDINGS.get(kind, FOREIGN_ENDINGS[kind])}")
             out[kind] = [_camera_path(whole, key) for key in known.keys(names)]
     return out
 
@@ -163,15 +163,15 @@ def _camera_path(path: Path, name: str) -> Path:
     return path.with_name(f"{path.stem}-{name}{path.suffix}") if name else path
 
 
-def foreign_files(calibration: Calibration, beside: Path, kinds: Sequence[str]) -> dict[Path, str]:
+def foreign_files(calibration: Calibration, result: Path, kinds: Sequence[str]) -> dict[Path, str]:
     """Return the files (path -> content) of a camera in other tools' formats, named after its calibration's file
-    `beside`. Notes for their users go to the log.
+    `result`. Notes for their users go to the log.
 
     Raises InputError for a format that cannot represent the camera.
     """
     files = {}
     outline = outline_of_corners(calibration) if kinds else None
-    for kind, path in zip(kinds, foreign_paths(beside, kinds), strict=True):
+    for kind, path in zip(kinds, foreign_paths(result, kinds), strict=True):
         warn_of_pupil(path, calibration)
         done = _written_camera(calibration.camera, kind, outline)
         files[path] = done.text
@@ -180,12 +180,12 @@ def foreign_files(calibration: Calibration, beside: Path, kinds: Sequence[str]) 
     return files
 
 
-def foreign_paths(beside: Path, kinds: Sequence[str]) -> list[Path]:
+def foreign_paths(result: Path, kinds: Sequence[str]) -> list[Path]:
     """Return the paths of `foreign_files`; raises InputError for an unknown format."""
     unknown = [kind for kind in kinds if kind not in FOREIGN_ENDINGS]
     if unknown:
         raise InputError(f"export: '{unknown[0]}' is none of the known formats {', '.join(FOREIGN_ENDINGS)}")
-    return [beside.with_name(f"{beside.stem}-{kind}{FOREIGN_ENDINGS[kind]}") for kind in kinds]
+    return [result.with_name(f"{result.stem}-{kind}{FOREIGN_ENDINGS[kind]}") for kind in kinds]
 
 
 def _written_camera(camera: Camera, kind: str, outline: Pixels | None) -> Written:

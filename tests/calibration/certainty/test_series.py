@@ -77,7 +77,7 @@ def test_terms_left_out_add_little_where_boards_were(sessions: list[Calibration]
         with_terms = FarProjection.of(found)
         assert with_terms.remainder is not None
         alone = replace(with_terms, remainder=None)
-        assert alone.usual_px <= with_terms.usual_px < 1.3 * alone.usual_px
+        assert alone.typical_px <= with_terms.typical_px < 1.3 * alone.typical_px
 
 
 def test_a_displacement_keeps_the_part_that_images_cannot_determine(sessions: list[Calibration]) -> None:

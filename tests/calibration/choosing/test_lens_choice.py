@@ -250,7 +250,7 @@ def test_boards_in_doubt_widen_the_sigmas_by_what_they_make_of_the_lens(monkeypa
     np.testing.assert_array_equal(found.camera.parameters, alone.camera.parameters)
     more = np.linalg.eigvalsh(found.frame_covariance - alone.frame_covariance)
     assert more.max() > 0.0 and more.min() > -1e-9 * more.max()
-    assert FarProjection.of(found).usual_px > 1.1 * FarProjection.of(alone).usual_px
+    assert FarProjection.of(found).typical_px > 1.1 * FarProjection.of(alone).typical_px
 
 
 def test_solutions_that_left_out_other_images_are_compared_on_those_of_both(

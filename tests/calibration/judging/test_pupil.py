@@ -146,7 +146,7 @@ def test_a_pupil_that_moves_is_solved_for(folds: int) -> None:
     off = found.pupil.terms - [MM_PER_RAD2, 0.0]
     assert (np.abs(off) < 3.0 * np.sqrt(np.diag(found.pupil.covariance))).all()
     far = FarProjection.of(found)
-    assert off_far_away(found) < 2.0 * far.usual_px < 0.2
+    assert off_far_away(found) < 2.0 * far.typical_px < 0.2
     assert off_far_away(session(NEAR, MM_PER_RAD2, 0)) > 1.0
     assert found.rms_px < 1.1 * NOISE_PX * np.sqrt(2.0)
     (printed,) = (one for one in found.verdicts if MESSAGE in one.message)
@@ -196,7 +196,7 @@ def test_the_pupil_widens_the_uncertainty_of_far_points() -> None:
         calibrate(views, SIZE, model="kannala_brandt", board="flat", folds=0, pupil=pupil)
         for pupil in ("central", "moving")
     )
-    assert FarProjection.of(moving).usual_px > 1.05 * FarProjection.of(central).usual_px
+    assert FarProjection.of(moving).typical_px > 1.05 * FarProjection.of(central).typical_px
     near = projection_uncertainty(moving, np.array([[800.0, 600.0], [1100.0, 700.0]]), range_mm=120.0)
     assert near.valid.all() and (near.worst_px < 0.1).all()
 

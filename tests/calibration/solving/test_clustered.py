@@ -71,7 +71,7 @@ def test_a_moved_principal_point_is_found_behind_an_uncertain_focal_length(name:
     touched = replace(results[1], camera=results[1].camera.with_parameters(moved))
     found = compare_calibrations(results[0], touched)
     assert found.verdict is CameraVerdict.OTHER
-    assert found.difference.rms_px < 2.0 * found.usual_px[1]
+    assert found.difference.rms_px < 2.0 * found.interval_px[1]
 
 
 def test_one_cluster_leaves_the_covariance_unchanged() -> None:

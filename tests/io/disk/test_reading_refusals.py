@@ -94,10 +94,10 @@ def test_a_path_is_shown_as_it_is_written(tmp_path: Path) -> None:
     (tmp_path / "far/other/b.toml").write_text(BOARD)
     (tmp_path / "here/boards").symlink_to(tmp_path / "far/store")
     table = TomlTable({}, {}, tmp_path / "here/session.toml")
-    assert table.beside("boards/b.toml") == tmp_path / "here/boards/b.toml"
-    assert load_board(table.beside("boards/../other/b.toml")).size == (9, 6)
+    assert table.path_of("boards/b.toml") == tmp_path / "here/boards/b.toml"
+    assert load_board(table.path_of("boards/../other/b.toml")).size == (9, 6)
     with pytest.raises(InputError, match="here/boards"):
-        load_board(table.beside("boards/b.toml"))
+        load_board(table.path_of("boards/b.toml"))
 
 
 def test_a_file_has_a_size_that_it_may_have(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from rigkit.calibration.rig.certainty.frame_covariance import frame_covariance, residual_sigma
 from rigkit.calibration.rig.solving.flatness import STEP_DAMPING
-from rigkit.calibration.rig.solving.moments import Lag, Moments, ways_through
+from rigkit.calibration.rig.solving.moments import Lag, Moments, trajectories_through
 from rigkit.calibration.rig.solving.pose_jacobians import at_own_moment
 from rigkit.calibration.rig.solving.shutters import read_on, readout_steps
 from rigkit.calibration.rig.solving.solver import rig_normal, solve_rig
@@ -86,7 +86,7 @@ def with_lags(
     if (
         timing == "trigger"
         or cameras < 2
-        or not start.ways.any()
+        or not start.trajectories.any()
         or not _asked(observations, solution.state, start, sigma_px)
     ):
         return observations, solution
@@ -161,7 +161,7 @@ def lags_of(names: Sequence[str], state: RigState, covariance: FloatArray, lags:
 def _through(moments: Moments, state: RigState, observations: RigObservations, times: FloatArray) -> Moments:
     """Return the moments with trajectories through the poses of a state."""
     targets = [target for _, target in observations.keys]
-    return replace(moments, ways=ways_through(state.frame_rotation, state.frame_mm, targets, times))
+    return replace(moments, trajectories=trajectories_through(state.frame_rotation, state.frame_mm, targets, times))
 
 
 def _asked(observations: RigObservations, state: RigState, start: Moments, sigma_px: float) -> bool:
@@ -253,8 +253,8 @@ def _chance_of_scatter(state: RigState, observations: RigObservations, start: Mo
     to do with the views, gain as much by chance."""
     by_target, rng = _by_target(state, observations), np.random.default_rng(0)
     free, known = _free(by_target), (sigma_px / FIRST_SPREAD) ** 2
-    ways = start.ways[:, 0]
-    moving = np.flatnonzero(ways.any(axis=1))
+    trajectories = start.trajectories[:, 0]
+    moving = np.flatnonzero(trajectories.any(axis=1))
 
     def gain(own: FloatArray) -> float:
         products = _with_times(by_target, np.broadcast_to(own, (free.shape[1], *own.shape)))
@@ -265,9 +265,9 @@ def _chance_of_scatter(state: RigState, observations: RigObservations, start: Mo
         system, right = products[..., :-1] + held[:, :, None] * np.eye(held.shape[1]), products[..., -1:]
         return float((right * np.linalg.solve(system, right)).sum())
 
-    found, better = gain(ways), 0
+    found, better = gain(trajectories), 0
     for _ in range(ORDERS_DRAWN):
-        other = ways.copy()
-        other[moving] = ways[rng.permutation(moving)]
+        other = trajectories.copy()
+        other[moving] = trajectories[rng.permutation(moving)]
         better += gain(other) >= found
     return (better + 1.0) / (ORDERS_DRAWN + 1.0)

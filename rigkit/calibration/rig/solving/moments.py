@@ -2,7 +2,7 @@
 
 Each camera has a constant lag behind the first, and each of its images a small deviation from it. Meanwhile a target
 moves along a polynomial in time through its poses in the frames before and after: at time t after key f its pose has
-changed by the step  s(t) = sum_k ways[f, k] t^(k + 1).  The unit of time is that between two frames.
+changed by the step  s(t) = sum_k trajectories[f, k] t^(k + 1).  The unit of time is that between two frames.
 
 The deviation of each image is eliminated from its view before the solution, with u the derivative of the pose by it:
 the products M of the columns of a view become  M - (M u) (M u)^T / (u^T M u + information).
@@ -45,14 +45,14 @@ class Moments:
     Attributes
     ----------
     lags : (n,) of the cameras, the first zero.
-    ways : (F, K, 6) coefficients of the targets' trajectories, in the rig.
+    trajectories : (F, K, 6) coefficients of the targets' trajectories, in the rig.
     own : (n, F) deviation from the camera's lag in the frame of a key.
     information : (n, F) px^2 per squared unit, prior of `own` around zero; infinite where `own` is fixed at zero.
     readouts : (n,) readout times of the cameras (`shutters`).
     """
 
     lags: FloatArray
-    ways: FloatArray
+    trajectories: FloatArray
     own: FloatArray
     information: FloatArray
     readouts: FloatArray
@@ -63,23 +63,25 @@ class Moments:
 
     def turned(self, turn: Mat3) -> Moments:
         """Return the same in a rig rotated by `turn` (3, 3)."""
-        return replace(self, ways=(self.ways.reshape(-1, 3) @ turn.T).reshape(self.ways.shape))
+        return replace(self, trajectories=(self.trajectories.reshape(-1, 3) @ turn.T).reshape(self.trajectories.shape))
 
     def targets(self, c: int, key: IntArray, poses: tuple[Mat3, Points]) -> tuple[Mat3, Points]:
         """Return rig_from_target of views (V,) of camera `c` at their own times, from the `poses` of their keys."""
-        powers = self._times(c, key) ** np.arange(1.0, self.ways.shape[1] + 1.0)
-        rotation, place = stepped(poses, np.einsum("vks,vk->vs", self.ways[key], powers))
+        powers = self._times(c, key) ** np.arange(1.0, self.trajectories.shape[1] + 1.0)
+        rotation, place = stepped(poses, np.einsum("vks,vk->vs", self.trajectories[key], powers))
         return rotation, place
 
     def speeds(self, c: int, key: IntArray) -> FloatArray:
         """Return the speeds of the targets of views of camera `c` at their times, (V, 6) per unit of time."""
-        order = np.arange(float(self.ways.shape[1]))
-        speeds: FloatArray = np.einsum("vks,vk->vs", self.ways[key], (order + 1.0) * self._times(c, key) ** order)
+        order = np.arange(float(self.trajectories.shape[1]))
+        speeds: FloatArray = np.einsum(
+            "vks,vk->vs", self.trajectories[key], (order + 1.0) * self._times(c, key) ** order
+        )
         return speeds
 
     def speeds_at_all(self) -> FloatArray:
         """Return the speeds of all targets at the times of all cameras, (n, F, 6)."""
-        keys = np.arange(len(self.ways))
+        keys = np.arange(len(self.trajectories))
         return np.array([self.speeds(c, keys) for c in range(len(self.lags))])
 
     def _times(self, c: int, key: IntArray) -> FloatArray:
@@ -124,10 +126,10 @@ def without_own_times(
     )
 
 
-def ways_through(rotation: Mat3, place: Points, targets: Sequence[str], times: FloatArray) -> FloatArray:
+def trajectories_through(rotation: Mat3, place: Points, targets: Sequence[str], times: FloatArray) -> FloatArray:
     """Return the trajectories (F, POINTS - 1, 6) through the poses (F, 3, 3) and (F, 3) of `targets`, at `times` (F,):
     zeros where times are unknown, or where fewer than MIN_POINTS poses are within WAY_REACH."""
-    ways = np.zeros((len(times), POINTS - 1, 6))
+    trajectories = np.zeros((len(times), POINTS - 1, 6))
     for target in dict.fromkeys(targets):
         own = np.array([f for f, t in enumerate(targets) if t == target and np.isfinite(times[f])], dtype=np.int64)
         own = own[np.argsort(times[own])]
@@ -140,5 +142,5 @@ def ways_through(rotation: Mat3, place: Points, targets: Sequence[str], times: F
                 continue
             here = (np.repeat(rotation[f : f + 1], len(near), 0), np.repeat(place[f : f + 1], len(near), 0))
             powers = (times[near] - times[f])[:, None] ** np.arange(1.0, len(near) + 1.0)
-            ways[f, : len(near)] = np.linalg.solve(powers, steps_between(here, (rotation[near], place[near])))
-    return ways
+            trajectories[f, : len(near)] = np.linalg.solve(powers, steps_between(here, (rotation[near], place[near])))
+    return trajectories
