@@ -1,13 +1,13 @@
-/* How much less, or more, certain corners are than if the noise of neighbouring pixels were independent. The definitions in
- * numpy are in tests/kernels/reference/correlation.py, the numbers and their meaning in rigkit.detection.subpixel.correlation. */
+/* Factors of the corners' sigmas for correlated noise of neighbouring pixels. The definitions in
+ * numpy are in tests/kernels/reference/correlation.py, the constants in rigkit.detection.subpixel.correlation. */
 #include "kernels.h"
 
-/* What is known of a board: sums over its corners, then their means. */
+/* Sums over the corners of a board, then their means. */
 typedef struct {
     double products[LAGS], pairs[LAGS], sides[4], blur, used, blend[3];
 } known_t;
 
-/* How far, in rows and columns, the two pixels of each of the LAGS lie apart. */
+/* Displacement, in rows and columns, of the two pixels of each of the LAGS. */
 INLINE void set_lags(double rows[LAGS], double columns[LAGS])
 {
     for (int up = 0, k = 0; up <= LAG; up++)
@@ -17,7 +17,7 @@ INLINE void set_lags(double rows[LAGS], double columns[LAGS])
         }
 }
 
-/* Return which of the LAGS has two pixels so far apart, -1 where none has. */
+/* Return the index of the LAG with this displacement, -1 if there is none. */
 INLINE int lag_at(int row, int column)
 {
     if (row > 0 || (row == 0 && column < 0)) {
@@ -107,7 +107,7 @@ static double set_influence(
     return 4.0 * lost;
 }
 
-/* Return the factor that the means over `count` corners tell (reference.correlation.factors). */
+/* Return the factor estimated from the means over `count` corners (reference.correlation.factors). */
 static double factor_of(const known_t *mean, double count, const factor_rules_t *rules)
 {
     double rows[LAGS], columns[LAGS], influence[LAGS], weight[LAGS], matrix[LAGS][LAGS], pairs[LAGS], change[LAGS];
@@ -131,14 +131,14 @@ static double factor_of(const known_t *mean, double count, const factor_rules_t 
     for (int k = 1; k < LAGS; k++)
         chance += weight[k] * weight[k] / (count * pairs[k]);
     chance *= change[0] / left * (change[0] / left);
-    /* What is not known of `left` goes with the quotient: small windows, of which the fit takes most, say nothing. */
+    /* The uncertainty of `left` is in the quotient: small windows, where the fit absorbs most noise, have no information. */
     const double unsure = (1.0 + excess) * rules->lost_error * share / left, squared = excess * excess;
     const double sure = 1.0 - (chance + unsure * unsure) / (squared > 1e-12 ? squared : 1e-12);
     const double times = 1.0 + (sure > 0.0 ? sure : 0.0) * excess, least = rules->min_factor * rules->min_factor;
     return sqrt(times > least ? times : least);
 }
 
-/* Add what a corner says: as much as its pixels do. */
+/* Add a corner, weighted by its number of pixels. */
 INLINE void add_known(
     const double *products, const double *pairs, double noise, const double *pixel, const double *sides, double blur, double used,
     known_t *sum)

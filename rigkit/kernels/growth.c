@@ -5,7 +5,7 @@
 
 enum { MAX_TERMS = 10, MAX_DEGREE = 3, MAX_RADIUS = 3, MAX_TRIED = 16 };
 
-/* The smallest pull on any term: no pivot of the exact normal equations is smaller, whatever rounding makes of it. */
+/* The smallest ridge on any term: no exact pivot of the normal equations is smaller, so that rounding cannot make one. */
 static const double MIN_PULL = 1e-12;
 static const double LINEAR_PULL = 1e-9;
 
@@ -207,7 +207,7 @@ int64_t squares_memory(int64_t count)
     return SQUARES_MEMORY(count);
 }
 
-/* Find the (at most `most`) nearest points within `reach` of (u, v), the nearest first; return how many. */
+/* Find the (at most `most`) nearest points within `reach` of (u, v), the nearest first; return their number. */
 static int64_t nearest_points(const squares_t *squares, double u, double v, double reach, int64_t most, int64_t *found)
 {
     double distance[MAX_TRIED];
@@ -380,7 +380,7 @@ FOR_EACH_PROCESSOR int64_t grow_lattice(
             sheet->pixels[2 * where[k]] = fresh[3 * k];
             sheet->pixels[2 * where[k] + 1] = fresh[3 * k + 1];
             sheet->contrast[where[k]] = fresh[3 * k + 2];
-            /* What failed before may be foretold otherwise now, within the reach of the fits. */
+            /* Predictions that failed before may have changed within the reach of the fits. */
             const int64_t row = where[k] / columns, column = where[k] % columns;
             for (int64_t r = row - MAX_RADIUS; r <= row + MAX_RADIUS; r++)
                 for (int64_t c = column - MAX_RADIUS; c <= column + MAX_RADIUS; c++)

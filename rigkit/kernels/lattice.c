@@ -1,12 +1,12 @@
-/* What is judged of whole lattices: how evenly their rows run, how much their corners scatter about smooth rows, where
- * the edges between them lie.
+/* Quality measures of whole lattices: regularity of their rows, scatter of their corners about smooth surfaces, offsets
+ * of the edges between them.
  *
  * The definitions in numpy are in tests/kernels/reference/lattice.py, the numbers in rigkit.detection: lattice.spacing,
  * subpixel.scatter, checks.validate. */
 #include "kernels.h"
 
-/* Set `typical` to the median of how neighbouring steps differ at each inner column of `rows` x `columns` pixels, so many
- * doubles apart, and `seen` to how many steps these are; return the upper median of all, NaN for none. */
+/* Set `typical` to the median difference of neighbouring steps at each inner column of `rows` x `columns` pixels, with these
+ * strides, and `seen` to the number of steps; return the upper median of all, NaN for none. */
 static double uneven_columns(
     const double *pixels, int64_t rows, int64_t columns, int64_t row_stride, int64_t column_stride, double *scratch,
     double *typical, int64_t *seen)
@@ -43,8 +43,8 @@ void uneven_steps(
     every[1] = uneven_columns(pixels, columns, rows, 2, 2 * columns, scratch, typical + inner, seen + inner);
 }
 
-/* Set `out` to how far the neighbouring column and row lines lie from those through `count` cells, before and after, from first
- * and second derivatives along columns and rows (detection.lattice.local_fit.LocalFit.gaps). */
+/* Set `out` to the distances of the neighbouring column and row lines from those through `count` cells, before and after, from
+ * first and second derivatives along columns and rows (detection.lattice.local_fit.LocalFit.gaps). */
 void line_gaps(const double *sides, const double *curvatures, int64_t count, double *out)
 {
     for (int64_t i = 0; i < count; i++, sides += 4, curvatures += 4, out += 4) {
@@ -120,7 +120,7 @@ INLINE double product(const double *a, const double *b, int64_t count)
     return sum;
 }
 
-/* Take from `values` what of them lies along the unit vector `along`. */
+/* Subtract from `values` their component along the unit vector `along`. */
 INLINE void take_away(double *values, const double *along, int64_t count)
 {
     const double part = product(values, along, count);
@@ -128,7 +128,7 @@ INLINE void take_away(double *values, const double *along, int64_t count)
         values[i] -= part * along[i];
 }
 
-/* Set `out` to how far corners lie off surfaces of both degrees (the second one at most 4) over what their sigmas say (rms), NaN
+/* Set `out` to the residuals of surfaces of both degrees (the second at most 4) over the corners' sigmas (rms), NaN
  * where these fit any (reference.lattice.surface_scatter), or where rows and columns have differences enough. `scratch` holds
  * 20 numbers for each corner: the 15 terms are kept. */
 void surface_scatter(
@@ -170,12 +170,12 @@ void surface_scatter(
                 for (int64_t k = 0; k < degree; k++)
                     term[i] *= k < up ? y[i] : x[i];
             }
-            /* Twice: once leaves rounding of what was large. */
+            /* Twice: once leaves rounding errors of large components. */
             for (int twice = 0; twice < 2; twice++)
                 for (int64_t k = 0; k < found; k++)
                     take_away(term, terms + k * size, count);
             const double left = product(term, term, count);
-            /* A term that few rows cannot tell from those before it. */
+            /* A term that depends linearly on the previous ones, for few rows. */
             if (!(left > least))
                 continue;
             for (int64_t i = 0; i < count; i++)
@@ -267,8 +267,8 @@ static void flatten(const part_t part)
     }
 }
 
-/* Set `out` to how much more the corners of each of `count` parts of a sheet, `width` corners wide, scatter than their
- * sigmas say (reference.lattice.excess_scatter). `parts` are top, left, rows, columns; `scratch` has room for seven numbers
+/* Set `out` to the scatter of the corners of each of `count` parts of a sheet, `width` corners wide, over that predicted by their
+ * sigmas (reference.lattice.excess_scatter). `parts` are top, left, rows, columns; `scratch` has room for seven numbers
  * for each corner of a part. */
 void excess_scatter(
     const double *pixels, const double *sigma, int64_t height, int64_t width, const int64_t *parts, int64_t count,
@@ -310,7 +310,7 @@ static int square_of(
     return isfinite(sum);
 }
 
-/* Set `out` to how far the edges of a lattice lie on the dark side of their corners' line, at `parts` places `along` it
+/* Set `out` to the offsets of the edges of a lattice to the dark side of the line of their corners, at `parts` places `along` it
  * (reference.lattice.shifts_of_edges). `sign` is that of the first corner; `sums` has room for parts x (steps + 1). */
 FOR_EACH_PROCESSOR
 void edge_shifts(

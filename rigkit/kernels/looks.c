@@ -1,4 +1,4 @@
-/* Sparse looks at an image that tell whether it is the mosaic of a colour camera, and whether it has bad pixels. The definitions in
+/* Sparse tests of an image: whether it is the raw mosaic of a colour camera, and whether it has bad pixels. The definitions in
  * numpy are in tests/kernels/reference/looks.py. */
 #include "kernels.h"
 
@@ -7,9 +7,9 @@ INLINE double level_at(const void *grey, int64_t bytes, int64_t at)
     return bytes ? (double)((const uint8_t *)grey)[at] : (double)((const float *)grey)[at];
 }
 
-/* Return whether one of the four pixels of squares of 2 x 2, at least, is brighter or darker than the mean of its square by `share` of
- * that, in the upper median over those squares, of every `step`-th both ways, whose mean is above the upper median of all and above
- * `least`. */
+/* Return whether at least one of the four pixels of 2 x 2 squares is brighter or darker than the mean of its square by `share` of it,
+ * in the upper median over the squares whose mean is above the upper median of all and above `least`; every `step`-th square
+ * in both directions. */
 int64_t has_mosaic(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t step, double least, double share, double *scratch)
 {
@@ -24,7 +24,7 @@ int64_t has_mosaic(
             mean[k] = ranked_mean[k] = (upper + lower) / 4.0;
         }
     const double middle = ranked(ranked_mean, count, count / 2), above = middle > least ? middle : least;
-    /* Which side of a bound a median lies on is counted sooner than the median is found. */
+    /* Counting decides whether a median is above a bound faster than computing the median. */
     int64_t bright = 0, low[PLACES] = {0}, high[PLACES] = {0};
     for (int64_t row = 0, k = 0; row < down; row++)
         for (int64_t column = 0; column < across; column++, k++) {
@@ -44,8 +44,8 @@ int64_t has_mosaic(
     return bright > 0 && uneven;
 }
 
-/* Return how many inner pixels of every `apart`-th row, from `first` on, are brighter than all of their eight neighbours, or darker,
- * by more than `step`, or by `share` of the range of these rows if that is more, which goes into `span`. */
+/* Return the number of inner pixels of every `apart`-th row, from `first` on, that are brighter than all eight neighbours, or darker,
+ * by more than `step`, or by `share` of the range of these rows if that is larger; the range goes into `span`. */
 int64_t count_bad_pixels(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t first, int64_t apart, double step, double share,
     double *span)
@@ -65,7 +65,7 @@ int64_t count_bad_pixels(
             const int64_t at = v * width + u;
             const double own = level_at(grey, bytes, at), left = level_at(grey, bytes, at - 1),
                          above = level_at(grey, bytes, at - width);
-            /* Mostly it is like one of these two. */
+            /* Most pixels are rejected by one of these two. */
             if (fabs(own - left) <= least || fabs(own - above) <= least)
                 continue;
             double most = left > above ? left : above, fewest = left < above ? left : above;

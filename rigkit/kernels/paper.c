@@ -1,5 +1,5 @@
-/* What lies beyond the outermost squares of boards. The definition in numpy is in tests/kernels/reference/paper.py, what
- * it is for and the numbers are in rigkit.detection.subpixel.outer_squares. */
+/* The paper beyond the outermost squares of boards. The definition in numpy is in tests/kernels/reference/paper.py, the
+ * purpose and the constants are in rigkit.detection.subpixel.outer_squares. */
 #include "kernels.h"
 
 /* The board's own corners and what was fitted there, as `find_paper` is given them. */
@@ -14,7 +14,7 @@ typedef struct {
     int64_t width, height, bytes;
 } picture_t;
 
-/* Where each of the ends is (which line of which corner), and what is read there. */
+/* The ends of lines beyond the outermost corners (which line of which corner), and their measured values. */
 typedef struct {
     double end, bright, cell;
     int64_t who, which;
@@ -60,7 +60,7 @@ static double median_of(double *values, int64_t count)
     return count % 2 ? values[count / 2] : (values[count / 2 - 1] + values[count / 2]) / 2.0;
 }
 
-/* Set `near` to those of the `count` ends that tell of `end` what lies beyond it; return how many. */
+/* Set `near` to those of the `count` ends that are averaged for the paper beyond `end`; return their number. */
 static int64_t witnesses(
     const outer_t *all, const outer_end_t *ends, int64_t count, const outer_end_t *end, double reach, int64_t *near)
 {
@@ -68,7 +68,7 @@ static int64_t witnesses(
     const double column = sqrt(sides[0] * sides[0] + sides[1] * sides[1]);
     const double row = sqrt(sides[2] * sides[2] + sides[3] * sides[3]);
     const double limit = reach * (column > row ? column : row);
-    /* Singles from the front; if there are none, the others count, too. */
+    /* Singles come first; if there are none, the others are used, too. */
     for (int singles = 1; singles >= 0; singles--) {
         int64_t found = 0;
         for (int64_t k = 0; k < count; k++) {
@@ -85,11 +85,11 @@ static int64_t witnesses(
     return 0;
 }
 
-/* Set `one` and `other` to the brightness on both sides of the way out at each step, NaN outside the image. */
+/* Set `one` and `other` to the brightness on both sides of the line beyond the board at each step, NaN outside the image. */
 static void read_sides(
     const outer_t *all, const picture_t *image, const outer_end_t *end, const paper_rules_t *rules, float *one, float *other)
 {
-    /* Which way out, in cells (column, row), each of the ends of a corner is. */
+    /* Direction, in cells (column, row), of each of the ends of a corner. */
     static const double OUTWARDS[4][2] = {{0.0, -1.0}, {0.0, 1.0}, {1.0, 0.0}, {-1.0, 0.0}};
     const double *way = OUTWARDS[end->which], *pixel = all->pixels + 2 * end->who, *sides = all->sides + 4 * end->who;
     const double right = (double)(image->width - 1), bottom = (double)(image->height - 1);
@@ -105,7 +105,8 @@ static void read_sides(
         }
 }
 
-/* Set `end->end` to where, in squares, the differences (steps) that are 1 in the squares end; return whether they do. */
+/* Set `end->end` to the place, in squares, where the differences (steps), which are 1 inside the squares, end; return whether
+ * they do. */
 static int find_end(outer_end_t *end, const paper_rules_t *rules, double *differs)
 {
     const int64_t count = rules->step_count;
@@ -134,7 +135,7 @@ static int find_end(outer_end_t *end, const paper_rules_t *rules, double *differ
     return end->end < rules->last && !(goes_on && end->end > rules->cut);
 }
 
-/* Read `end`, where contrast and blur are mostly such: where the squares end, and how bright it is beyond them. */
+/* Measure `end` with the typical contrast and blur: where the squares end, and the brightness beyond them. */
 static void read_end(
     const outer_t *all, const picture_t *image, outer_end_t *end, const paper_rules_t *rules, double contrast, double blur,
     double *scratch)
@@ -143,8 +144,8 @@ static void read_end(
     float *one = (float *)scratch, *other = one + count;
     double *differs = scratch + count;
     read_sides(all, image, end, rules, one, other);
-    /* Beside the way out across line 1 lie squares of line 2, with their own edges and those of the next squares: what
-     * blur leaves of the difference of the two squares. */
+    /* On both sides of the line beyond line 1 are the squares of line 2, with their edges and those of the next squares:
+     * the difference of the two squares after blurring. */
     const double across = mean_gap(all, end->who, 1 - end->which / 2) / (sqrt(2.0) * blur);
     const double left = erf(rules->lateral * across) + erf((1.0 - rules->lateral) * across) - 1.0;
     for (int64_t k = 0; k < count; k++)
@@ -163,7 +164,7 @@ static void read_end(
     end->found = at <= (double)count - 1.0 && fabs(end->bright) < rules->max_paper;
 }
 
-/* Set `paper` and `out_gaps` of `count` corners to what `outer_squares.with_paper` says. `scratch` has room for 4 numbers
+/* Set `paper` and `out_gaps` of `count` corners as defined in `outer_squares.with_paper`. `scratch` has room for 4 numbers
  * a corner and 2 a step, `ends_scratch` for all ends, `near` for their numbers. */
 void find_paper(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
@@ -180,7 +181,7 @@ void find_paper(
         if (!ends[k])
             continue;
         const uint8_t *own = ends + k / 4 * 4;
-        /* The way out is as long as the cell's side, which is the mean of what lies before and behind the corner. */
+        /* The line beyond the corner is as long as the cell's side, the mean of the sides before and behind the corner. */
         every[number++] = (outer_end_t){
             .who = k / 4,
             .which = k % 4,
@@ -189,7 +190,7 @@ void find_paper(
     }
     double *values = scratch + 2 * rules->step_count;
     for (int64_t k = 0; k < number; k++) {
-        /* Out there, a corner that was fitted without what lies beyond is wrong in contrast and blur, some more than
+        /* Contrast and blur of an outer corner that was fitted without the paper are wrong, some more than
          * others. */
         const int64_t close = witnesses(&all, every, number, every + k, rules->near_witness, near);
         for (int64_t i = 0; i < close; i++)
@@ -200,7 +201,7 @@ void find_paper(
         read_end(&all, &image, every + k, rules, typical, median_of(values, close), scratch);
     }
     for (int64_t k = 0; k < number; k++) {
-        /* Sheets are cut straight, and paper is alike: what noise makes of a single reading, its neighbours do not say. */
+        /* Sheets are cut straight, and paper is uniform: a median over neighbours removes the noise of single measurements. */
         const int64_t close = witnesses(&all, every, number, every + k, rules->near_witness, near);
         int64_t found = 0;
         for (int64_t i = 0; i < close; i++)

@@ -1,16 +1,16 @@
-/* Where a lattice is two boards that touch: two smooth surfaces, but not the same one. The definitions in numpy are in
+/* Detection of lattices that are two touching boards: two different smooth surfaces. The definitions in numpy are in
  * tests/kernels/reference/discontinuity.py, the numbers and their meaning in rigkit.detection.checks.discontinuity. */
 #include "kernels.h"
 
 enum { CUBIC = 10, QUADRATIC = 6, MEETINGS = 5 };
 
-/* What polynomial surfaces through the corners of a column are made of, in cells: all are sums. */
+/* Sums over the corners of a column, in cells, for fits of polynomial surfaces. */
 typedef struct {
     double normal[CUBIC][CUBIC], right[CUBIC][2], square, variance, corners, columns;
 } sums_t;
 
-/* A lattice whose corners lie `along` doubles apart from column to column, and `across` from row to row; 2 of them of each
- * corner in `pixels`, 1 in `sigma`. */
+/* A lattice with a stride of `along` doubles from column to column and `across` from row to row; 2 doubles per corner in
+ * `pixels`, 1 in `sigma`. */
 typedef struct {
     const double *pixels, *sigma;
     int64_t rows, columns, across, along;
@@ -22,7 +22,7 @@ INLINE const double *corner_at(const sheet_view_t *view, int64_t row, int64_t co
     return view->pixels + 2 * (row * view->across + column * view->along);
 }
 
-/* Return rows or columns, of `count`, as numbers around 0 that are small where surfaces are fitted. */
+/* Return the index of a row or column, of `count`, shifted and scaled to small numbers around 0 for the fits. */
 INLINE double scaled(double number, int64_t count, const split_rules_t *rules)
 {
     return (number - 0.5 * ((double)count - 1.0)) / (double)rules->window;
@@ -66,8 +66,8 @@ INLINE void add_sums(const sums_t *part, sums_t *sum)
         to[k] += values[k];
 }
 
-/* Set `surface` to that of the first `terms`, and return the mean square that it leaves, times the number of corners (Gauss,
- * rows exchanged for the largest pivot). */
+/* Fit `surface` with the first `terms`, and return the sum of squared residuals (Gauss elimination with partial
+ * pivoting). */
 static double fitted(const sums_t *sums, int terms, double ridge, double surface[CUBIC][2])
 {
     double matrix[CUBIC][CUBIC + 2];
@@ -105,13 +105,13 @@ static double fitted(const sums_t *sums, int terms, double ridge, double surface
     return left > 0.0 ? 0.5 * left : 0.0;
 }
 
-/* Return how many terms of a quadratic surface so many columns determine. */
+/* Return the number of terms of a quadratic surface that so many columns determine. */
 INLINE double determined(double columns)
 {
     return columns < 1.0 ? 0.0 : columns < 2.0 ? 3.0 : columns < 3.0 ? 5.0 : 6.0;
 }
 
-/* Return whether some corner of a row lies in the columns `first` to `end` (exclusive). */
+/* Return whether a row has a corner in the columns `first` to `end` (exclusive). */
 INLINE int any_in_row(const sheet_view_t *view, int64_t row, int64_t first, int64_t end)
 {
     for (int64_t column = first; column < end; column++)
@@ -120,13 +120,13 @@ INLINE int any_in_row(const sheet_view_t *view, int64_t row, int64_t first, int6
     return 0;
 }
 
-/* Where a lattice may be split: how many times better the two sides fit alone, between which columns, what they leave. */
+/* A possible split: ratio by which the two sides fit better separately, its columns, and the residuals of both sides. */
 typedef struct {
     double ratio, start, end, alone;
 } split_t;
 
-/* Return whether the two sides, columns `first` to `start` and `end` to `last`, with surfaces that differ by `apart`, are as far
- * apart where they meet as two boards: nowhere between them nearer than a jump in the rows that they share, if there are any. */
+/* Return whether the surfaces of the two sides, columns `first` to `start` and `end` to `last`, which differ by `apart`, are
+ * discontinuous like two boards: in all rows that both sides have, they differ by at least a jump everywhere between them. */
 static int jumps(
     const sheet_view_t *view, int64_t first, int64_t start, int64_t end, int64_t last, double apart[QUADRATIC][2],
     const split_rules_t *rules)
@@ -178,7 +178,7 @@ static int split_at(
     const double least = rules->two_surfaces * rules->two_surfaces, more = both.corners - CUBIC;
     const double together = fitted(&both, CUBIC, rules->ridge, surface) / (more > 1.0 ? more : 1.0);
     const double floor = both.variance / both.corners + rules->floor_cells * rules->floor_cells;
-    /* Two surfaces leave no less than that. */
+    /* Lower limit of the residuals of two surfaces. */
     if (!several && !(together > least * floor))
         return 0;
     const double sides = fitted(&left, QUADRATIC, rules->ridge, one) + fitted(&right, QUADRATIC, rules->ridge, two);
@@ -201,7 +201,7 @@ static split_t clearest_split(const sheet_view_t *view, int64_t several, const s
     for (int64_t column = 0; column < view->columns; column++)
         set_column(view, column, rules, columns + column);
     int64_t count = 0;
-    /* Columns on the discontinuity, of neither side: the first shows every one, the others where it is. */
+    /* Columns on the discontinuity, of neither side: the first pass detects it, the others locate it. */
     const int64_t widths[] = {1, 0, 2};
     for (int k = 0; k < 3 && (k == 0 || count > 0); k++)
         for (int64_t start = 1; start < view->columns - widths[k]; start++)
@@ -209,7 +209,7 @@ static split_t clearest_split(const sheet_view_t *view, int64_t several, const s
     for (int64_t k = 0; k < count; k++)
         clearest = found[k].ratio > clearest.ratio ? found[k] : clearest;
     best = clearest;
-    /* Corners that either side is as smooth with are not on the discontinuity. */
+    /* Corners that fit one of the sides are not on the discontinuity. */
     for (int64_t k = 0; k < count; k++) {
         const double narrower = (best.end - best.start) - (found[k].end - found[k].start);
         if (found[k].alone <= rules->as_smooth * clearest.alone
@@ -219,7 +219,7 @@ static split_t clearest_split(const sheet_view_t *view, int64_t several, const s
     return best;
 }
 
-/* Set `view` to how its corners are scaled: the middle of the known ones, and the median of the steps between them. */
+/* Set the centre and scale of `view`: the mean of the known corners, and the median of the steps between them. */
 static void set_scale(sheet_view_t *view, double *steps)
 {
     int64_t count = 0, known = 0;
@@ -244,7 +244,7 @@ static void set_scale(sheet_view_t *view, double *steps)
     view->cell_px = count ? quick_median(steps, count) : NAN;
 }
 
-/* Return how many doubles of scratch `clearest_splits` needs. */
+/* Return the number of doubles of scratch that `clearest_splits` needs. */
 int64_t splits_scratch(int64_t rows, int64_t columns)
 {
     const int64_t longer = rows > columns ? rows : columns, steps = 2 * rows * columns;

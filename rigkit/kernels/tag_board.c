@@ -1,4 +1,4 @@
-/* The corners of a board of tags: their map, and the fit of all that are known. The definitions in numpy are in
+/* The corners of a board of tags: their map to the image, and the fit of all known corners. The definitions in numpy are in
  * tests/kernels/reference/tag_board.py, the numbers in rigkit.detection.tags.corners. */
 #include "tag_board.h"
 
@@ -112,7 +112,7 @@ void keep_marked(const tag_fit_t *fit, tag_room_t *room, const uint8_t *keep)
     room->count = kept;
 }
 
-/* Return how many terms there are up to the highest degree that has no more than `most`. */
+/* Return the number of polynomial terms of the highest degree that has at most `most`. */
 static int64_t terms_within(int64_t most)
 {
     int64_t terms = 1;
@@ -151,7 +151,7 @@ void map_tag_board(const tag_fit_t *fit)
             room.places, values, count, terms, rules->max_leverage, room.basis, room.left, room.unit, room.triangle,
             room.basis_values, room.misses, room.off, room.gain, numbers + MAP_SCATTER);
     }
-    /* What further terms add is noise. */
+    /* Further terms only fit noise. */
     int64_t plain = 0;
     while (plain < best && !(room.misses[plain] <= rules->hardly_more * room.misses[best]))
         plain++;
@@ -179,7 +179,7 @@ void see_marked(const tag_fit_t *fit, tag_room_t *room, int64_t most_certain)
         room->basis_values, room->misses, most_certain, room->surface);
 }
 
-/* Tell the fit of the corner of a lone tag in the image on which side of its lines that lies, and how dark it is. */
+/* Set, for a corner of a single tag, on which side of its lines the tag is, and how dark it is. */
 static void tell_side(const tag_fit_t *fit, tag_room_t *room, int64_t k)
 {
     const tag_board_t *board = fit->board;
@@ -200,7 +200,7 @@ static void tell_side(const tag_fit_t *fit, tag_room_t *room, int64_t k)
     room->contrast[k] = 0.5 * (step > fit->rules->min_contrast ? step : fit->rules->min_contrast);
 }
 
-/* Tell the fit what is known of the marked corners beside where they start. */
+/* Set what is known of the marked corners in addition to their start positions. */
 static void tell_marked(const tag_fit_t *fit, tag_room_t *room)
 {
     for (int64_t k = 0; k < room->count; k++) {
@@ -221,7 +221,7 @@ void fit_marked(const tag_fit_t *fit, tag_room_t *room, const edge_rules_t *rule
         rules, fit->windows, room->out);
 }
 
-/* Return s of the marked corners, by a quick fit of a few of them. */
+/* Return the blur s of the marked corners, from a quick fit of a few of them. */
 static double quick_blur(const tag_fit_t *fit, tag_room_t *room)
 {
     const int64_t some = (int64_t)((double)room->count / fit->rules->few_corners);
@@ -250,8 +250,8 @@ static void forget_marks(const tag_fit_t *fit)
     memset(marks_of(fit, MARK_WAITING), 0, (size_t)fit->board->count);
 }
 
-/* Fit all known corners, with lines that bend as they have it themselves, and forget those that fail. Where `blur` is not a
- * number, a quick fit tells it. The map of before is kept, for what it foretells. */
+/* Fit all known corners, with the curvatures of lines that they themselves determine, and remove those that fail. If `blur` is
+ * NaN, a quick fit estimates it. The previous map is kept for its predictions. */
 void fit_tag_board(const tag_fit_t *fit, double blur)
 {
     tag_room_t room = room_of(fit);
@@ -283,7 +283,7 @@ void fit_tag_board(const tag_fit_t *fit, double blur)
     forget_marks(fit);
 }
 
-/* Fit those corners again whose lines bend otherwise than when they were fitted, if that is known better now. */
+/* Fit those corners again whose curvatures have changed since their fit, if these are known better now. */
 void refit_tag_corners(const tag_fit_t *fit)
 {
     const tag_corner_rules_t *rules = fit->rules;
@@ -308,11 +308,11 @@ void refit_tag_corners(const tag_fit_t *fit)
             const double length = hypot(seen[SIDES + 2 * axis], seen[SIDES + 2 * axis + 1]);
             const double wide = reach * length < rules->last->radius_px ? reach * length : rules->last->radius_px;
             const double bend = fabs(seen[CURVATURE + axis] - fit->curvature[2 * cell + axis]);
-            /* What is not known is most. */
+            /* Unknown values count as the largest. */
             most = bend <= most ? most : bend;
             half = wide <= half ? half : wide;
         }
-        /* A line of curvature k lies off its chord by k w^2 / 6 in the mean over w to either side. */
+        /* A line of curvature k is off its tangent by k w^2 / 6 in the mean over w to either side. */
         const double off = most * half * half / 6.0;
         bent[k] = before > rules->rough_px || !(off < rules->bent_sigmas * (sigma > scatter ? sigma : scatter));
         count += bent[k];
@@ -360,7 +360,7 @@ double tag_sigma_factor(const tag_fit_t *fit, const factor_rules_t *rules)
     return factor;
 }
 
-/* Return how far corners usually lie off where the others have them, in their sigmas times `factor`. */
+/* Return the typical leave-one-out error of the corners in their sigmas times `factor`. */
 double tag_scatter(const tag_fit_t *fit, double factor)
 {
     tag_room_t room = room_of(fit);

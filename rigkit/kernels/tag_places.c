@@ -1,9 +1,9 @@
-/* Where the tags between the corners of a lattice lie on a board. The definitions in numpy are in
+/* Positions on a board of the tags between the corners of a lattice. The definitions in numpy are in
  * tests/kernels/reference/tag_board.py. */
 #include "kernels.h"
 
 /* Set `quads` to the corners of those squares of a lattice (rows, columns) whose row and column together are `odd`, or not, in order
- * of growing angle from u to v, and `cells` to the (column, row) of their first; return how many there are. */
+ * of growing angle from u to v, and `cells` to the (column, row) of their first corner; return their number. */
 int64_t squares_of_lattice(const double *pixels, int64_t rows, int64_t columns, int64_t odd, double *quads, int64_t *cells)
 {
     int64_t count = 0;
@@ -30,15 +30,15 @@ INLINE int is_before(const int64_t *one, const int64_t *other)
     return one[2] < other[2];
 }
 
-/* Set `place` to the quarter turns and the shift that take most of the tags at `cells` of a lattice of `columns` x `rows` corners,
- * turned by `turns` against it, to their `places` on the board, the lowest of several; return how many agree. */
+/* Set `place` to the quarter turns and the shift that map most of the tags at `cells` of a lattice of `columns` x `rows` corners,
+ * rotated by `turns` relative to it, to their `places` on the board, the lowest of several; return the number that agrees. */
 int64_t vote_place(
     const int64_t *cells, const int64_t *turns, const int64_t *places, int64_t count, int64_t columns, int64_t rows,
     int64_t *scratch, int64_t *place)
 {
     int64_t most = 0;
     for (int64_t n = 0; n < count; n++) {
-        /* A tag that stands upright in the lattice turned back stands on the board. A square has one corner less. */
+        /* A tag that is upright in the lattice rotated back is upright on the board. There is one square less than corners. */
         const int64_t back = (4 - turns[n] % 4) % 4;
         int64_t column = cells[2 * n], row = cells[2 * n + 1], wide = columns - 1, high = rows - 1;
         for (int64_t turn = 0; turn < back; turn++) {
@@ -54,7 +54,7 @@ int64_t vote_place(
         own[2] = places[2 * n + 1] - row;
         for (int64_t k = 0; k <= n; k++)
             votes += own[0] == scratch[3 * k] && own[1] == scratch[3 * k + 1] && own[2] == scratch[3 * k + 2];
-        /* The last of a place has all votes of it. */
+        /* The last entry of a place has its number of votes. */
         if (votes > most || (votes == most && is_before(own, place))) {
             most = votes;
             memcpy(place, own, 3 * sizeof(int64_t));

@@ -1,12 +1,12 @@
-/* The rounds in which the corners of a board of tags are added to and thinned out. The definitions in numpy are in
+/* Rounds that add corners to a board of tags and remove outliers. The definitions in numpy are in
  * tests/kernels/reference/tag_board.py, the numbers in rigkit.detection.tags.corners. */
 #include "tag_board.h"
 
-/* A corner that was not seen where it was foretold is sought again when one so near is found, in rows and columns: of its tag, or
- * of one beside it. */
+/* A corner not found at its predicted position is searched again after a corner within so many rows and columns was found: of
+ * its own or of a neighbouring tag. */
 enum { NEAR_NEW = 2 };
 
-/* Mark the missing corners that can be sought now, with where the map has them; return how many. */
+/* Mark the missing corners that can be searched now, with the positions predicted by the map; return their number. */
 static int64_t mark_missing(const tag_fit_t *fit, tag_room_t *room)
 {
     const tag_corner_rules_t *rules = fit->rules;
@@ -32,7 +32,7 @@ INLINE double lesser_height(const double *seen)
     return seen[HEIGHTS] < seen[HEIGHTS + 1] ? seen[HEIGHTS] : seen[HEIGHTS + 1];
 }
 
-/* Fit the marked missing corners, from places that a rough fit finds where the map is not sure of them. */
+/* Fit the marked missing corners, starting from a rough fit where the map's prediction is uncertain. */
 static void fit_missing(const tag_fit_t *fit, tag_room_t *room, double blur)
 {
     const double scatter = fit->numbers[MAP_SCATTER];
@@ -54,7 +54,7 @@ static void fit_missing(const tag_fit_t *fit, tag_room_t *room, double blur)
     fit_marked(fit, room, fit->rules->last);
 }
 
-/* Mark in `own` (count) the corners of tags that are read in their places as those that the board has there, by all corners `at`. */
+/* Mark in `own` (count) the corners of tags whose code, read with all corners at `at`, is the board's code at that place. */
 static void read_own(const tag_fit_t *fit, tag_room_t *room, const double *at, uint8_t *own)
 {
     const tag_board_t *board = fit->board;
@@ -87,8 +87,8 @@ static void read_own(const tag_fit_t *fit, tag_room_t *room, const double *at, u
 
 enum { NOT_SEEN, SEEN_ODD, SEEN_CODED, SEEN_CLEAN };
 
-/* Return how the corner that was fitted where the board lies as `seen` says looks beside the typical `contrast` and `residual`. The
- * code is in the windows of narrow borders, but says itself that the tag is there. */
+/* Classify a corner fitted at the prediction `seen` by its contrast and residual relative to the typical `contrast` and `residual`.
+ * With narrow borders the window contains a part of the code, which is then evidence for the tag itself. */
 static uint8_t looks_of(
     const tag_fit_t *fit, const double *seen, const double *outcome, double contrast, double residual, double blur)
 {
@@ -103,7 +103,7 @@ static uint8_t looks_of(
     return fit->board->border * lesser_height(seen) < rules->narrow_blurs * blur ? SEEN_CODED : SEEN_ODD;
 }
 
-/* Set `there` to which of the fitted corners are those that the map foretells; return how many. */
+/* Set `there` to which of the fitted corners agree with the map's prediction; return their number. */
 static int64_t corners_there(const tag_fit_t *fit, tag_room_t *room, double blur, uint8_t *there)
 {
     const double contrast = usual_of(fit, room, CORNER_CONTRAST), residual = usual_of(fit, room, CORNER_RESIDUAL);
@@ -131,7 +131,7 @@ static int64_t corners_there(const tag_fit_t *fit, tag_room_t *room, double blur
     return good;
 }
 
-/* Let the corners around `cell` be sought again. */
+/* Allow the corners around `cell` to be searched again. */
 static void wake_around(const tag_fit_t *fit, int64_t cell)
 {
     const int64_t rows = fit->board->rows, columns = fit->board->columns, row = cell / columns, column = cell % columns;
@@ -142,7 +142,7 @@ static void wake_around(const tag_fit_t *fit, int64_t cell)
                 waiting[cell + down * columns + right] = 0;
 }
 
-/* Add the missing corners that are seen where the map has them; return how many. */
+/* Add the missing corners that are found at the positions predicted by the map; return their number. */
 static int64_t add_round(const tag_fit_t *fit, int64_t by_this_map)
 {
     tag_room_t room = room_of(fit);
@@ -159,7 +159,7 @@ static int64_t add_round(const tag_fit_t *fit, int64_t by_this_map)
     const int64_t good = corners_there(fit, &room, blur, there);
     for (int64_t k = 0; k < room.count; k++) {
         const int64_t cell = (int64_t)room.cell[k];
-        /* What was foretold as well as corners are known is not there; other corners may be foretold by those new. */
+        /* A corner predicted as precisely as corners are measured does not exist; the new corners may predict others. */
         vain[cell] = room.surface[SURFACE_COLUMNS * k + GAIN] <= 1.0;
         waiting[cell] = 1;
         if (there[k])
@@ -172,8 +172,8 @@ static int64_t add_round(const tag_fit_t *fit, int64_t by_this_map)
     return good;
 }
 
-/* Add missing corners, those of each of at most `rounds` foretold by the ones before, or by the map that is there; return how
- * many were added. */
+/* Add missing corners in at most `rounds` rounds, each predicted by the previous one, the first by the current map; return the
+ * number added. */
 int64_t add_tag_corners(const tag_fit_t *fit, int64_t rounds, int64_t by_this_map)
 {
     int64_t added = 0;
@@ -184,10 +184,10 @@ int64_t add_tag_corners(const tag_fit_t *fit, int64_t rounds, int64_t by_this_ma
     return added;
 }
 
-/* Any number of pixels that is beyond all of them. */
+/* A distance, px, larger than any in an image. */
 #define FAR 1e300
 
-/* Forget the corners that lie furthest off where those around them have them; return how many. */
+/* Remove the corners with the largest leave-one-out errors; return their number. */
 static int64_t drop_round(const tag_fit_t *fit)
 {
     const tag_corner_rules_t *rules = fit->rules;
@@ -217,7 +217,7 @@ static int64_t drop_round(const tag_fit_t *fit)
         off[k] = room.gain[k] < rules->judging_gain ? off[k] / (allowed[k] > least ? allowed[k] : least) : 0.0;
         most = off[k] > most ? off[k] : most;
     }
-    /* Those that contradict the most go first: they may be all that speaks against their neighbours. */
+    /* The largest errors are removed first: they may cause those of their neighbours. */
     const double worst = 0.5 * most > 1.0 ? 0.5 * most : 1.0;
     int64_t dropped = 0;
     for (int64_t k = 0; k < room.count; k++)
@@ -229,7 +229,7 @@ static int64_t drop_round(const tag_fit_t *fit)
     return dropped;
 }
 
-/* Forget the corners that lie where those around them cannot have them, in `rounds` at most; return how many. */
+/* Remove the corners that are inconsistent with their neighbours, in at most `rounds` rounds; return their number. */
 int64_t drop_tag_corners(const tag_fit_t *fit, int64_t rounds)
 {
     int64_t dropped = 0;
