@@ -14,7 +14,13 @@ from dataclasses import replace
 from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.choosing.begun import BegunCalibration, about_camera, begin
-from rigkit.calibration.choosing.between_models import rival_fits, rival_shapes, with_rivals
+from rigkit.calibration.choosing.between_models import (
+    rival_fits,
+    rival_shapes,
+    same_model,
+    with_other_lens,
+    with_rivals,
+)
 from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut, choose, described, models_of
 from rigkit.calibration.choosing.lens_choice import ModelChoice, best_sizes, choose_lenses, twins
 from rigkit.calibration.choosing.models_tried import Request
@@ -23,6 +29,8 @@ from rigkit.calibration.judging.moved import moved_lens
 from rigkit.calibration.judging.pupil import may_move
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration, Candidate
+from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.with_pupil import (
     against_central,
     kept_central,
@@ -158,7 +166,7 @@ def _result(
     """Return the result of a camera with its verdicts, with a moving pupil where that is asked for or confirmed."""
     (central, far), request = _assembled(begun, found, tried, rivals, likely), begun.request
     if request.pupil == "central" or (request.pupil == "auto" and not may_move(central)):
-        return _with_verdicts(begun, found, central, far)
+        return _with_verdicts(begun, found, tried, central, far)
     moving = solved_with_pupil(found, begun.observations, request)
     compared: list[Candidate] = []
     if moving is not None:
@@ -171,14 +179,14 @@ def _result(
             if result.pupil is not None and (
                 request.pupil == "moving" or (better and pupil_moves_significantly(result))
             ):
-                return _with_verdicts(begun, moving, result, far_of_moving)
+                return _with_verdicts(begun, moving, tried, result, far_of_moving)
     if request.pupil == "moving":
         raise DegenerateError(
             "calibration: the images do not determine how the entrance pupil moves; take boards near and far, up to "
             "the "
             'rim of the image, or pupil = "auto"'
         )
-    central = _with_verdicts(begun, found, central, far)
+    central = _with_verdicts(begun, found, tried, central, far)
     return replace(central, candidates=(*central.candidates, *compared))
 
 
@@ -211,12 +219,16 @@ def _assembled(
 
 
 def _with_verdicts(
-    begun: BegunCalibration, found: ModelOutcome, result: Calibration, far: FarProjection
+    begun: BegunCalibration,
+    found: ModelOutcome,
+    tried: Sequence[FittedModel],
+    result: Calibration,
+    far: FarProjection,
 ) -> Calibration:
     """Return what `_assembled` returns of a solution with its verdicts."""
     request, fit = begun.request, found.chosen.fit
     in_force = [name for name, value in (("model", request.model), ("board_shape", request.board)) if value == "auto"]
-    moved = moved_lens(found.observations, fit) if request.folds else ()
+    moved = _moved(found.observations, fit, tried) if request.folds else ()
     verdicts = judge(
         result,
         [*moved, *_largest_size_chosen(found.beyond, result, in_force)],
@@ -227,6 +239,18 @@ def _with_verdicts(
         order=begun.observations.images,
     )
     return replace(result, verdicts=verdicts)
+
+
+def _moved(observations: Observations, fit: Fit, tried: Sequence[FittedModel]) -> tuple[Finding, ...]:
+    """Return a finding where the lens changed during the session by the chosen model, or else by the model with the
+    least scatter: of images of two lenses a small model may predict best, whose error differs with the boards' places
+    and hides the change."""
+    moved, camera = moved_lens(observations, fit), far_camera(fit.state.camera)
+    best = far_camera(min(tried, key=lambda option: option.fit.sigma_px).fit.state.camera)
+    if moved or same_model(best, camera):
+        return moved
+    other = with_other_lens(observations, fit, best)
+    return () if other is None else moved_lens(observations, other)
 
 
 def _others(tried: Sequence[FittedModel], model: str) -> list[Candidate]:

@@ -62,13 +62,20 @@ def rival_fits(
     for option, camera, same in zip(options, cameras, alike, strict=True):
         if same or likely.get(option.name, 0.0) < MIN_LIKELY:
             continue
-        start = replace(chosen.state.with_corners_held(), camera=with_pupil_of(camera, chosen.state.camera))
-        try:
-            fit = fit_other_lens(observations, start, chosen.kept)
-        except (InputError, DegenerateError):
-            continue
-        found.append(RivalFit(Rival(option.name, far_camera(fit.state.camera), likely[option.name]), fit.state))
+        fit = with_other_lens(observations, chosen, camera)
+        if fit is not None:
+            found.append(RivalFit(Rival(option.name, far_camera(fit.state.camera), likely[option.name]), fit.state))
     return found
+
+
+def with_other_lens(observations: Observations, chosen: Fit, camera: Camera) -> Fit | None:
+    """Return the fit of another model to the inliers of the chosen fit with its released corners held, starting from a
+    `camera` of that model; None where it fails."""
+    start = replace(chosen.state.with_corners_held(), camera=with_pupil_of(camera, chosen.state.camera))
+    try:
+        return fit_other_lens(observations, start, chosen.kept)
+    except (InputError, DegenerateError):
+        return None
 
 
 def same_model(one: Camera, other: Camera) -> bool:

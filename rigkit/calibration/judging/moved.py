@@ -114,6 +114,17 @@ class _ImageScores:
         """Return the number of images in this order (N,) before the split with the largest decrease."""
         return self.min_images + int(np.argmax(self.gains(order)))
 
+    def split_by(self, values: FloatArray) -> BoolArray:
+        """Return the images above the threshold of these `values` (N,) with the largest decrease; none if there is no
+        threshold. Equal values are not split: they would be in the order of the images."""
+        order = np.argsort(values, kind="stable")
+        ranked = values[order]
+        below = ranked[self.min_images - 1 : len(order) - self.min_images]
+        above = ranked[self.min_images : len(order) - self.min_images + 1]
+        gains = np.where(below < above, self.gains(order), -np.inf)
+        best = int(np.argmax(gains))
+        return np.asarray(values > (below[best] if np.isfinite(gains[best]) else np.inf))
+
     def gain_of(self, second: BoolArray) -> float:
         """Return the decrease for separate lenses of the images `second` (N,) and the others."""
         return float(self._gain(self.information[second].sum(axis=0)[None], self.score[second].sum(axis=0)[None])[0])
@@ -171,12 +182,10 @@ def _lens_difference_sigmas(
     distance = _cost_difference(observations, fit, state, second[number])
     if not distance > MIN_HALF_SIGMAS:
         return None
-    alone, place = scores.gain_of(second), np.empty(len(second), np.int64)
+    alone = scores.gain_of(second)
     for values in (*_places(observations, state), number % 2):
-        order = np.argsort(np.bincount(number, values) / np.bincount(number), kind="stable")
-        place[order] = np.arange(len(order))
-        other = place >= scores.split_at(order)
-        if (other == second).all() or (other != second).all():
+        other = scores.split_by(np.bincount(number, values) / np.bincount(number))
+        if not other.any() or (other == second).all() or (other != second).all():
             continue
         both = scores.gain_of_both(second, other)
         if both - scores.gain_of(other) < AGAINST_PLACE**2 * (both - alone):

@@ -14,9 +14,10 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging import verdicts
 from rigkit.calibration.judging.captured import stretched_images
 from rigkit.calibration.judging.changing import CHANGES
+from rigkit.calibration.judging.moved import _ImageScores
 from rigkit.calibration.judging.verdicts import diagnose_session
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.solving.fit import fit_model, identifiable
+from rigkit.calibration.solving.fit import Fit, fit_model, identifiable
 from rigkit.calibration.solving.linearise import normal_equations
 from rigkit.calibration.solving.normal_equations import NormalEquations
 from rigkit.calibration.solving.solver import with_priors
@@ -26,7 +27,7 @@ from rigkit.calibration.views.usable import OTHER_GRIDS
 from rigkit.cameras.eucm import EUCM
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
-from rigkit.core.findings import Severity, worst
+from rigkit.core.findings import Finding, Severity, worst
 from rigkit.io.manifests.session import Session
 from rigkit.workflows.calibration.calibrate_rig import judged
 
@@ -73,6 +74,35 @@ def test_moved_lens(rng: np.random.Generator) -> None:
     later, _, _ = random_views(second, 10, rng, reach_deg=33.0)
     views += [replace(v, image=f"later{v.image}") for v in later]
     assert printed(calibrate(views, SIZE, model="brown", board="flat"), "from 'later000.png' on")
+
+
+def test_equal_places_are_not_split_in_the_order_of_the_images() -> None:
+    """Otherwise a split by place is one in time, which then explains the change of a lens."""
+    number = np.arange(14)
+    score = np.where(number < 7, 1.0, -1.0)[:, None]
+    scores = _ImageScores(np.ones((14, 1, 1)), score, np.full((1, 1), 1e-9), 3)
+    assert (scores.split_by(number % 2) == (number % 2 == 1)).all()
+    assert (scores.split_by(number.astype(np.float64)) == (number >= 7)).all()
+    assert not scores.split_by(np.zeros(14)).any()
+
+
+def test_a_lens_that_moved_is_looked_for_with_two_models(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The chosen one, and that with the least scatter, on the same images."""
+    asked: list[Fit] = []
+
+    def moved(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
+        asked.append(fit)
+        return (Finding.bad("moved"),) if len(asked) == 2 else ()
+
+    monkeypatch.setattr("rigkit.calibration.calibrate.moved_lens", moved)
+    views, _, _ = random_views(lens("reg"), 10, rng, reach_deg=33.0)
+    result = calibrate(views, SIZE, model="auto", board="flat")
+    assert len(asked) == 2 and printed(result, "moved")
+    assert asked[0].state.camera.model == result.camera.model
+    assert asked[1].sigma_px < asked[0].sigma_px
+    assert (asked[0].kept == asked[1].kept).all()
 
 
 def test_a_bent_board_shown_in_order_is_no_moved_lens(rng: np.random.Generator) -> None:
