@@ -38,7 +38,7 @@ MIN_PRODUCTS = 16
 
 SIGNIFICANT = 3.0
 """Smallest ratio of the mean product of moves to its standard error: of 18 RENDERED boards, whose blur is symmetric, it
-is at most 2.1; of REAL ones with excessive errors 4.7 to 13.5, of the others at most 1.4."""
+is at most 2.1; of REAL ones with excessive errors 4.7 to 18.7, of the others at most 1.4."""
 
 
 def blur_shift_px(image: GreyImage, refined: RefinedLattice, board: Board) -> float:
