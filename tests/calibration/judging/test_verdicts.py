@@ -81,7 +81,7 @@ def test_equal_places_are_not_split_in_the_order_of_the_images() -> None:
     number = np.arange(14)
     score = np.where(number < 7, 1.0, -1.0)[:, None]
     scores = _ImageScores(np.ones((14, 1, 1)), score, np.full((1, 1), 1e-9), 3)
-    assert (scores.split_by(number % 2) == (number % 2 == 1)).all()
+    assert (scores.split_by((number % 2).astype(np.float64)) == (number % 2 == 1)).all()
     assert (scores.split_by(number.astype(np.float64)) == (number >= 7)).all()
     assert not scores.split_by(np.zeros(14)).any()
 
