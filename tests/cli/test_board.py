@@ -60,7 +60,7 @@ def test_a_board_keeps_its_name(board: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "printed"),
     [
-        (["--ruler-x-mm", "249"], "both rulers"),
+        (["--ruler-x-mm", "249"], "both --ruler-x-mm and --ruler-y-mm"),
         (["--ruler-x-mm", "24.9", "--ruler-y-mm", "16.9"], "cannot measure"),
         (["--ruler-x-mm", "249", "--ruler-y-mm", "159"], "check the readings"),
     ],

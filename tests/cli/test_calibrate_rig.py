@@ -180,6 +180,17 @@ def test_boards_on_one_mount(tmp_path: Path, rng: np.random.Generator, capsys: p
     assert "look alike" in capsys.readouterr().err
 
 
+def test_images_without_common_names_are_refused_before_the_search(
+    session: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched: list[object] = []
+    monkeypatch.setattr("rigkit.workflows.calibration.calibrate_rig.corners_of", searched.append)
+    for name in ("reg_a", "wide_b"):
+        (session.parent / f"{name}.png").write_bytes(b"")
+    assert main(["calibrate", str(session)]) == 2
+    assert "same name or number" in capsys.readouterr().err and not searched
+
+
 def test_a_camera_without_views_is_named(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (session.parent / "corners-wide.json").unlink()
     assert main(["calibrate", str(session)]) == 2

@@ -51,7 +51,7 @@ def test_a_calibration_and_a_rig_show_their_boards_and_the_verdict(rng: np.rando
         assert len(html) < MAX_HTML and "held-out RMS" in html
         assert str(result.verdicts[0])[:20] in html
         assert sum(e.tag.endswith("text") for e in drawing(html).iter()) == cameras
-    assert "apart" in rig._repr_html_()
+    assert "Baseline reg to wide: " in rig._repr_html_()
     kept: dict[str, Any] = {"session": None, "unreadable": {}, "written": ()}
     session = SessionCalibration(calibration=alone, **kept)
     assert session._repr_html_() == alone._repr_html_()

@@ -248,4 +248,4 @@ def test_one_board_is_no_case_for_pycolmap() -> None:
     report = crosscheck(made(CAMERAS["brown"], keep=(2,)))
     assert report.passed
     assert [method.name for method in report.methods] == [PNP]
-    assert "one board" in report.skipped[0]
+    assert "on one plane" in report.skipped[0]

@@ -191,7 +191,8 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
     images : camera -> names of its images, in their order.
     how : "name", "number", "time" or "order" (see above); None: chosen automatically.
     """
-    if how is None and all(TIME.fullmatch(PurePath(image).stem) for own in images.values() for image in own):
+    stems = [PurePath(image).stem for own in images.values() for image in own]
+    if how is None and stems and all(TIME.fullmatch(stem) for stem in stems):
         how = "time"
     if how == "order":
         counts = {name: len(own) for name, own in images.items()}

@@ -79,10 +79,10 @@ def calibrate_rig_session(
     with about(session.path):
         session = with_known_first(with_known(session, options.known))
         known_cameras(session)  # complaints before the work
-        if len(session.cameras) > 1 and session.frames != "order":
-            frames_of_images(
-                {n: [str(image) for image in own.images] for n, own in session.cameras.items()}, session.frames
-            )
+        images = {name: [str(image) for image in own.images] for name, own in session.cameras.items()}
+        # Without images, the corners that were kept are used.
+        if len(images) > 1 and all(images.values()) and session.frames != "order":
+            frames_of_images(images, session.frames)
         require_distinct(session)
     targets = _targets(session, options)
     ensure_writable(targets, force=options.force, inputs=session_inputs(session, options))
