@@ -114,7 +114,7 @@ def test_diff_has_a_verdict_on_rigs_and_their_cameras(
     assert main(["diff", str(folder / "rig.json"), str(folder / "rig-reg.json")]) == 2
 
 
-def test_a_camera_in_a_rig_has_smaller_sigmas_than_alone(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_camera_of_a_rig_is_surer_than_alone(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Its file is a whole calibration: what `validate` needs to count its share."""
     assert main(["calibrate", str(session), "--json"]) == 0
     reported = json.loads(capsys.readouterr().out)
