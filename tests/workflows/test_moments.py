@@ -110,6 +110,7 @@ def test_other_names_leave_images_moment_by_moment(names: tuple[str, ...], tmp_p
         ("image_00/data/{}", "image_01/data/{}", ["image_00", "image_01"]),
         ("infra1/{}", "infra2/{}", ["infra1", "infra2"]),
         ("img_L_{}", "img_R_{}", ["l", "r"]),
+        ("img_left{}", "img_right{}", ["left", "right"]),
         ("L{}", "R{}", ["l", "r"]),
         ("{}_L", "{}_R", ["l", "r"]),
         ("room [1]_left_{}", "room [1]_right_{}", ["left", "right"]),
@@ -137,6 +138,14 @@ def test_a_letter_or_a_word_within_is_a_side_only_where_both_have_the_same_image
     sides = ("L", "R") if form == "{}" else ("left", "right")
     _images(tmp_path, *(f"{form.format(sides[k > 2])}{k}" for k in range(1, 6)))
     assert list(cameras_in([tmp_path])) == [""]
+
+
+def test_the_cameras_folders_may_be_links(tmp_path: Path) -> None:
+    for name in ("left", "right"):
+        _images(tmp_path / "disk" / name, "001", "002")
+        (tmp_path / "rig").mkdir(exist_ok=True)
+        (tmp_path / "rig" / name).symlink_to(tmp_path / "disk" / name, target_is_directory=True)
+    assert list(cameras_in([tmp_path / "rig"])) == ["left", "right"]
 
 
 def test_the_only_folder_with_images_is_meant(tmp_path: Path) -> None:

@@ -149,11 +149,18 @@ def images_of_folder(folder: Path, pattern: str = "*") -> list[Path]:
 
 
 def images_below(folder: Path) -> list[Path]:
-    """Return the images of a folder and its subfolders, sorted; unreadable subfolders and hidden ones are skipped."""
-    out: list[Path] = []
-    for place, inside, names in os.walk(folder):
-        inside[:] = [name for name in inside if not name.startswith(".")]
-        out += [path for name in names if is_image(path := Path(place) / name) and path.is_file()]
+    """Return the images of a folder and its subfolders, sorted; unreadable subfolders and hidden ones are skipped, and
+    links to folders are followed unless these are below, too."""
+    out, walked = list[Path](), set[Path]()
+    for place, inside, names in os.walk(folder, followlinks=True):
+        here = Path(place)
+        if here.resolve() in walked:  # A link may lead to a folder above.
+            inside.clear()
+            continue
+        walked.add(here.resolve())
+        shown = sorted(((here / name).is_symlink(), name) for name in inside if not name.startswith("."))
+        inside[:] = [name for _, name in shown]
+        out += [path for name in names if is_image(path := here / name) and path.is_file()]
     return sorted(out)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import last_number
 from rigkit.io.disk.reading import csv_table
-from rigkit.io.media.images import IMAGE_ENDINGS, Image, quiet_opencv, require_pixels
+from rigkit.io.media.images import Image, is_image, quiet_opencv, require_pixels
 
 _log = logging.getLogger(__name__)
 
@@ -41,13 +41,12 @@ def is_video(source: str | Path) -> bool:
 
 
 def videos_inside(place: Path) -> list[Path]:
-    """Return the videos of a folder that has videos but no images, else `place` itself."""
+    """Return the videos of a folder that has videos but no images, else `place` itself; hidden files are neither."""
     if is_video(place) or not place.is_dir():
         return [place]
-    inside = sorted(path for path in place.iterdir() if path.is_file())
-    if any(path.suffix.lower() in IMAGE_ENDINGS for path in inside):
-        return [place]
-    return [path for path in inside if path.suffix.lower() in VIDEO_ENDINGS] or [place]
+    inside = sorted(path for path in place.iterdir() if path.is_file() and not path.name.startswith("."))
+    videos = [path for path in inside if path.suffix.lower() in VIDEO_ENDINGS]
+    return [place] if any(map(is_image, inside)) or not videos else videos
 
 
 class Video:

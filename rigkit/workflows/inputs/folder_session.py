@@ -25,9 +25,9 @@ SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
 NAMED_FIRST = re.compile(rf"(?P<side>{SIDE})(?P<gap>[_-]?)(?P<rest>\d+|(?<=[_-]).*\d)", re.IGNORECASE)
 NAMED_LAST = re.compile(r"(?P<rest>.*\d)(?P<gap>[_-]?)(?P<side>left|right|(?<=[_-])[lr])", re.IGNORECASE)
 NAMED_WITHIN = re.compile(
-    r"(?P<before>|.*[_-])(?P<side>left|right|[lr])(?P<gap>[_-]?)(?P<rest>(?<=[lr_-])\d+|(?<=[_-]).*\d)", re.IGNORECASE
+    r"(?P<before>|.*[_-])(?P<side>left|right|[lr])(?P<gap>[_-]?)(?P<rest>(?<=[lrt_-])\d+|(?<=[_-]).*\d)", re.IGNORECASE
 )
-"""A side behind what all images begin with, or of one letter: img_left_01, img_L_01, L01."""
+"""A side behind what all images begin with, or of one letter: img_left01, img_L_01, L01."""
 NAMES = (NAMED_FIRST, NAMED_LAST, NAMED_WITHIN)
 MIN_IN_COMMON = 0.5
 """Fraction of the image names that another camera must have too, apart from the side. Names such as "left_tilted_1" and

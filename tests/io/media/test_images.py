@@ -238,6 +238,16 @@ def test_hidden_files_are_no_images(tmp_path: Path) -> None:
     assert images_of_camera([(tmp_path, "*.jpg")]) == own
 
 
+def test_links_to_folders_are_followed_once(tmp_path: Path) -> None:
+    for name in ("disk/a/1.jpg", "disk/b/1.jpg", "session/c/1.jpg"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).touch()
+    session = tmp_path / "session"
+    for name, target in (("left", "disk/a"), ("right", "disk/b"), ("c/up", "session"), ("also", "session/c")):
+        (session / name).symlink_to(tmp_path / target, target_is_directory=True)
+    assert images_below(session) == [session / "c" / "1.jpg", session / "left" / "1.jpg", session / "right" / "1.jpg"]
+
+
 def test_an_unreadable_subfolder_does_not_end_the_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As in /proc, whose folders of processes vanish while they are read."""
     (tmp_path / "gone").mkdir()

@@ -10,7 +10,7 @@ import pytest
 
 from rigkit.core.errors import InputError
 from rigkit.io.media.images import read_image
-from rigkit.io.media.video import Video, is_video, read_timestamps
+from rigkit.io.media.video import Video, is_video, read_timestamps, videos_inside
 
 
 def video(path: Path, levels: list[int]) -> Path:
@@ -53,6 +53,15 @@ def test_sources_that_are_no_videos_are_refused(tmp_path: Path) -> None:
     (tmp_path / "bad.mp4").write_bytes(b"no video at all")
     with pytest.raises(InputError, match="cannot be decoded"):
         Video(tmp_path / "bad.mp4")
+
+
+def test_hidden_files_of_a_folder_are_no_videos_and_no_images(tmp_path: Path) -> None:
+    """A Mac writes ._a.mp4 beside a.mp4 on disks that cannot hold its attributes."""
+    for name in ("a.mp4", "._a.mp4", "._cover.jpg"):
+        (tmp_path / name).touch()
+    assert videos_inside(tmp_path) == [tmp_path / "a.mp4"]
+    (tmp_path / "b.jpg").touch()
+    assert videos_inside(tmp_path) == [tmp_path]
 
 
 def test_timestamps_count_from_the_first_frame_of_each_camera(tmp_path: Path) -> None:
