@@ -102,15 +102,17 @@ def _predicting(
     every: RigViews, options: _Options, progress: Progress
 ) -> tuple[JointRig, tuple[float | None, tuple[float | None, ...]]]:
     """Return the joint solution and its held-out errors, as `heldout_rms`. Rolling shutters, and then lags, are a part
-    of it unless held-out frames are predicted better without them."""
+    of it unless held-out frames are predicted better without them; without held-out errors, where significant."""
     joint = solve_jointly(every, progress, options.known)
-    heldout = heldout_rms(joint, options.folds)
+    best = heldout_rms(joint, options.folds)
     for timing in TIMINGS[: TIMINGS.index(joint.timing)][::-1]:
+        if best[0] is None:
+            break
         simpler = solve_jointly(every, progress, options.known, timing=timing)
-        rms, each = heldout_rms(simpler, options.folds)
-        if rms is not None and heldout[0] is not None and rms < heldout[0]:
-            joint, heldout = simpler, (rms, each)
-    return joint, heldout
+        heldout = heldout_rms(simpler, options.folds)
+        if heldout[0] is not None and heldout[0] < best[0]:
+            joint, best = simpler, heldout
+    return joint, best
 
 
 def _on_rigid_boards(

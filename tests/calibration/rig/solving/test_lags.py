@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from helpers.calibration_scenes import BOARD, SIZE, lens
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.heldout import heldout_rms
-from rigkit.calibration.rig.joint import JointRig
+from rigkit.calibration.rig.joint import JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.lags import Timing, times_of
 from rigkit.calibration.rig.solving.shutters import read_on
@@ -127,6 +128,19 @@ def test_timing_that_predicts_worse_is_left_out(best: Timing, monkeypatch: pytes
     assert not rig.readouts
     assert bool(rig.lags) == (best == "lags")
     assert rig.heldout_rms_px == 0.2
+
+
+def test_without_heldout_errors_the_rig_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    solved = list[Timing]()
+
+    def counted(*args: Any, **options: Any) -> JointRig:
+        joint = solve_jointly(*args, **options)
+        solved.append(joint.timing)
+        return joint
+
+    monkeypatch.setattr("rigkit.calibration.rig.calibrate.solve_jointly", counted)
+    assert rig_of(0.05, 0).lags
+    assert solved == ["lags"]
 
 
 def test_heldout_frames_do_not_choose_their_readouts() -> None:
