@@ -95,7 +95,7 @@ def test_a_wrongly_declared_pose_type_is_named(monkeypatch: pytest.MonkeyPatch) 
     scene = trihedral_pair(boards, regular_lens(30.0), PoseType.GENERAL, rng, parallax_deg=(10.0, 20.0))
     first, second = (noisy(d, rng) for d in scene.detections())
     pair = match_pair("held out", scene.camera1, scene.camera2, first, second, boards)
-    words = r"declared 'standard'.* speak for 'general'"
+    words = r"declared 'standard'.* support 'general'"
 
     def no_scale(*_: object) -> None:
         raise DegenerateError("no scale")

@@ -55,7 +55,7 @@ def test_a_wrong_declaration_is_contradicted_with_the_figure(rng):
     printed = evidence.contradiction("standard")
     assert printed is not None
     assert re.search(r"(2\.9|3\.0)\d deg", printed)
-    assert "speak for 'general'" in printed
+    assert "support 'general'" in printed
     assert evidence.contradiction("general") is None
     assert evidence.contradiction("auto") is None
     turned, _ = board_pair(rng, POSES["planar"], 0.1)
