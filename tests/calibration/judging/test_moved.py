@@ -34,7 +34,7 @@ def test_a_zoom_is_told_with_its_moment_and_no_other_cause(
     found = calibrate(zoomed(range(moment, 20), longer, rng), SIZE, model="brown", board="flat")
     assert f"the lens (or the board) changed at image '{moment:03d}.png'" in first(found)
     assert "stated uncertainties are invalid" in first(found)
-    assert not any(words in str(found.verdicts) for words in ("rolling shutter", "from image to image", "two kinds"))
+    assert not any(words in str(found.verdicts) for words in ("rolling shutter", "from image to image", "two groups"))
 
 
 @pytest.mark.parametrize(("moment", "words"), [(6, "before '006.png'"), (15, "from '015.png' on")])

@@ -112,7 +112,7 @@ def test_a_stabilised_picture_is_not_turned(spread: str, rng: np.random.Generato
         views = seen(camera, 16, rng)
         moved = [replace(v, pixels=v.pixels + np.array([far, -far])) for v, far in zip(views, amounts, strict=True)]
         _, every = reported([on_image(v, camera) for v in moved], rng)
-        assert not any("half a turn" in verdict for verdict in every)
+        assert not any("180 degrees" in verdict for verdict in every)
 
 
 @pytest.mark.parametrize("spread", ["normal", "even"])

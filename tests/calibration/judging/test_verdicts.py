@@ -41,7 +41,7 @@ def test_sound_views_are_called_good(rng: np.random.Generator) -> None:
     result = calibrate(views, SIZE, model="brown")
     assert str(result.verdicts[0]).startswith("good: held-out RMS")
     assert worst(result.verdicts) is not Severity.BAD
-    assert not printed(result, "neighbouring") and not printed(result, "unlike") and not printed(result, "retake")
+    assert not printed(result, "neighbouring") and not printed(result, "inconsistent") and not printed(result, "retake")
 
 
 def test_too_few_tilts_and_empty_corners(rng: np.random.Generator) -> None:
