@@ -225,6 +225,7 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
 
 def _frames_by_time(images: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]:
     """Return the frames of images whose names are times: each is of the nearest moment of the cameras before, if near.
+    A frame has the name of its first image.
 
     Raises InputError for a name that is no time, or if no two cameras share a moment.
     """
@@ -236,6 +237,7 @@ def _frames_by_time(images: Mapping[str, Sequence[str]]) -> dict[str, dict[str, 
     gaps = [b - a for own in times.values() for a, b in pairwise(sorted(own.values()))]
     near = MAX_PART_OF_GAP * min(gaps, default=Decimal(0))
     moments: list[Decimal] = []
+    called: dict[Decimal, str] = {}
     frames: dict[str, dict[str, str]] = {}
     for name, time_of in times.items():
         frames[name] = {}
@@ -247,13 +249,13 @@ def _frames_by_time(images: Mapping[str, Sequence[str]]) -> dict[str, dict[str, 
             if gap > near:
                 moment = time
                 insort(moments, time)
-            frames[name][image] = str(moment)
+            frames[name][image] = called.setdefault(moment, PurePath(image).stem)
     if twice := _duplicate_frame(frames):
         raise InputError(f"{twice} are of one time by their names; rename one")
     if sum(map(len, frames.values())) == len(moments):
         raise InputError(
             "no two cameras have images that were taken at the same moment, by the times in their names; "
-            'write frames = "order" if the sorted lists belong together one by one'
+            'write frames = "order" if the sorted lists correspond one by one'
         )
     return frames
 

@@ -123,7 +123,10 @@ def session_of_folders(
 
 def _cameras_in_words(cameras: Mapping[str, Sequence[tuple[Path, str]]], place: Path, known: Known) -> list[str]:
     """Return the lines for several cameras of a session in folder `place`."""
-    lines = ["# Those of one moment have the same name, or the same number at its end.", ""]
+    lines = [
+        "# Those of one moment have the same name, the same number at its end, or nearly the same time as name.",
+        "",
+    ]
     if known.rig is not None:
         rig = toml_text(relative_path(known.rig, place))
         lines += ["# Its cameras stay as they are, lens and mount.", f"rig = {rig}", ""]

@@ -109,6 +109,8 @@ def test_times_nearly_the_same_are_of_one_moment() -> None:
     assert len(set(frames["cam0"].values())) == 4
     seconds = frames_of_images({"a": ["1700000000.25.png", "1700000001.5.png"], "b": ["1700000000.4.png"]})
     assert seconds["a"]["1700000000.25.png"] == seconds["b"]["1700000000.4.png"]
+    counted = [f"{k:010d}.png" for k in range(2)]
+    assert frames_of_images({"image_00": counted, "image_01": counted})["image_01"][counted[1]] == "0000000001"
     with pytest.raises(InputError, match="by the times in their names"):
         frames_of_images({"a": ["1700000000.0.png", "1700000001.0.png"], "b": ["1700000000.5.png"]})
     with pytest.raises(InputError, match="are of one time"):
