@@ -90,7 +90,9 @@ def changed(module: ModuleType, name: str, factor: float) -> Iterator[bool]:
     """Multiply a constant in its module and all that import it; yields whether that is another number."""
     value = vars(module)[name]
     new = value * factor if isinstance(value, float) else round(value * factor)
-    users = [one for key, one in sys.modules.items() if key.startswith("rigkit.") and vars(one).get(name) is value]
+    alike = [one for key, one in sys.modules.items() if key.startswith("rigkit.") and vars(one).get(name) is value]
+    # Another module may have an own constant of the same name and integer.
+    users = [one for one in alike if one is module or name not in constants_of(one)]
     for user in users:
         setattr(user, name, new)
     try:

@@ -6,7 +6,8 @@ import measure_constants
 from measure_constants import Outcome, changed, constants_of, margin
 
 from rigkit.detection import doubtful
-from rigkit.detection.checks import evidence
+from rigkit.detection.checks import evidence, validate
+from rigkit.detection.subpixel import whole_board
 
 
 def test_a_constant_is_changed_wherever_it_is_used_and_comes_back() -> None:
@@ -17,6 +18,10 @@ def test_a_constant_is_changed_wherever_it_is_used_and_comes_back() -> None:
     with changed(evidence, "OFFSET", 2.0) as differs:
         assert differs and all(2.0 * before == module.OFFSET for module in users)
     assert all(before == module.OFFSET for module in users)
+    # Equal small integers are one object, and two constants of one name may be equal.
+    own = whole_board.MIN_ROWS
+    with changed(validate, "MIN_ROWS", 2.0):
+        assert own == validate.MIN_ROWS // 2 == whole_board.MIN_ROWS
 
 
 def test_the_margin_is_the_first_factor_that_loses_corners_or_finds_false_boards() -> None:

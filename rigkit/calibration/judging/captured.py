@@ -183,7 +183,7 @@ def stretched_images(c: Calibration, *, upright: bool) -> list[Finding]:
     return [
         Finding.look(
             f"focal lengths are {100.0 * (1.0 - np.exp(-abs(stretch))):.1f} % smaller along {narrower} than along "
-            f"{other}, but sensors have square pixels: a program or the camera has stretched the images{squares}",
+            f"{other}, although sensors have square pixels: a program or the camera has stretched the images{squares}",
             "give the images as the sensor has them, or use the calibration only for images stretched in the same way",
         )
     ]

@@ -46,7 +46,7 @@ class Whitened:
             scaled = information * scale[:, None] * scale
         if not np.isfinite(scaled).all():
             raise DegenerateError(
-                "check: the pictures and the lens do not go together; check the calibration's numbers"
+                "check: the images do not fit this lens at all; check the parameters in the calibration file"
             )
         values, vectors = np.linalg.eigh(scaled)
         seen = values > NULL_RANK * values[-1]
@@ -56,8 +56,8 @@ class Whitened:
         covariance = np.eye(len(own)) + left.T @ monitored.covariance @ left
         if not len(own) or np.linalg.cond(covariance) > MAX_CONDITION_NUMBER:
             raise DegenerateError(
-                "check: beside these pictures, what the calibration says of its own numbers is worth nothing (its "
-                "covariance, or the lens); calibrate again"
+                "check: the calibration's covariance, or its lens, is implausible compared with these images; "
+                "calibrate again"
             )
         freedom = min(
             effective_freedom(known.freedom, known.overdispersion, len(own), COMMON_FREEDOM)
