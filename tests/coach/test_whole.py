@@ -190,7 +190,7 @@ def test_what_came_of_one_camera_is_said_as_its_calibration_states_it(
     monkeypatch.setattr("rigkit.workflows.capture.coach.calibrate_session_file", lambda *_: done)
     reported: list[str] = []
     wanted = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=100.0)
-    coach = Coach(wanted, Keeper(tmp_path, {}), lambda: finished_words(tmp_path, wanted), tell=reported.append)
+    coach = Coach(wanted, Keeper(tmp_path, {}), lambda: finished_words(tmp_path, wanted), report=reported.append)
     words = coach.finish(". What it lacks: nothing")
     assert words.startswith(f"Done: {whole.calibration.camera.model}, {wanted.stated(whole.calibration)}, held-out ")
     assert "(as wanted)" in words and "calibration.json written" in words and words.endswith("What it lacks: nothing")
