@@ -115,8 +115,8 @@ def test_a_lens_unlike_its_model_is_no_pupil_that_moves(model: str, rng: np.rand
 def test_a_moving_pupil_is_not_reported_as_a_change_between_images() -> None:
     """A pupil of 4 mm per rad^2 leaves residuals that each image's own shear follows as well as that of a motion."""
     found = session(NEAR, 4.0, 4)
-    assert "row by row" in str(changing(found, neighbour_correlation(found)))
-    assert MESSAGE in found.verdicts[0].message and "row by row" not in str(found.verdicts)
+    assert "rolling shutter" in str(changing(found, neighbour_correlation(found)))
+    assert MESSAGE in found.verdicts[0].message and "rolling shutter" not in str(found.verdicts)
 
 
 def test_distant_boards_do_not_determine_a_moving_pupil() -> None:

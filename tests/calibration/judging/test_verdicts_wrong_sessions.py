@@ -245,7 +245,7 @@ def changed_views(way: str, rng: np.random.Generator) -> list[BoardView]:
     [
         ("focus", "the focal length differs from image to image"),
         ("shift", "the principal point differs from image to image"),
-        ("rows", "(rolling shutter)"),
+        ("rows", "motion with a rolling shutter"),
         ("bend", "the board bends differently in every image"),
     ],
 )
@@ -280,7 +280,7 @@ def test_boards_in_hand_that_move_while_rows_are_read(how: dict[str, Any], rng: 
             noisy = np.clip(pixels + 0.02 * rng.normal(size=pixels.shape), -0.5, np.array(SIZE) - 0.5)
             views.append(replace(view, pixels=noisy))
         found = changing_in(calibrate(views, SIZE, **how))
-        assert all("(rolling shutter)" in finding.message for finding in found)
+        assert all("rolling shutter" in finding.message for finding in found)
         named += len(found)
     assert named >= 7
 

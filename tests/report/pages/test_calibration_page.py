@@ -195,7 +195,7 @@ def test_numbers_on_the_uncertainty_map(calibration: Calibration) -> None:
 
 def test_residual_patterns_separate_chance_from_a_lens_that_does_not_fit(calibration: Calibration) -> None:
     def coloured(c: Calibration) -> tuple[int, int]:
-        found = re.search(r"(\d+) of (\d+) coloured", pattern_svg(c))
+        found = re.search(r"(\d+) of (\d+) significant", pattern_svg(c))
         assert found is not None
         return int(found[1]), int(found[2])
 
