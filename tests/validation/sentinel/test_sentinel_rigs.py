@@ -172,8 +172,8 @@ def test_pictures_too_far_off_to_linearise_are_not_of_these_cameras(tmp_path: Pa
     assert check.unexplained and not check.holds and check.change is None
     assert "no change of the camera or rig explains it" in check_facts(check).headline
     assert HistoryEntry.of_check(check, tmp_path).verdict == "no change of the camera or rig explains it"
-    # Where nothing is off, it is the calibration's numbers that are.
-    with pytest.raises(DegenerateError, match="calibration's numbers"):
+    # Where residuals are small, the calibration's parameters are wrong.
+    with pytest.raises(DegenerateError, match="parameters in the calibration file"):
         evaluate_evidence(rig, lambda _: replace(far, rms_px=0.1))
 
 
