@@ -46,8 +46,8 @@ class Whitened:
             scaled = information * scale[:, None] * scale
         if not np.isfinite(scaled).all():
             raise DegenerateError(
-                "check: the derivatives of these images by the calibration's parameters are not finite; check the parameters "
-                "in the calibration file"
+                "check: the derivatives of these images by the calibration's parameters are not finite; check "
+                "the parameters in the calibration file"
             )
         values, vectors = np.linalg.eigh(scaled)
         seen = values > NULL_RANK * values[-1]
