@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import argparse
 
-from rigkit.cli.console import note, print_json, progress_on_stderr
+from rigkit.cli.console import print_json, progress_on_stderr
 from rigkit.cli.dataset_arguments import add_dataset_arguments, dataset_options, exit_code_of, failed_pairs
+from rigkit.cli.validation_words import note_skipped
 from rigkit.core.errors import ExitCode
 
 
@@ -33,7 +34,5 @@ def run(args: argparse.Namespace) -> int:
         for report in done.reports:
             for words in report.diagnosis:
                 print(f"{report.pair_id}: suspect {words}")
-    for report in done.reports:
-        for words in report.skipped:
-            note(f"{report.pair_id}: {words}")
+    note_skipped(done.reports)
     return exit_code_of(done.failures, ExitCode.WELL if done.passed else ExitCode.CHECK_FAILED)

@@ -70,9 +70,14 @@ def _print_failures(reports: Sequence[ValidationReport], compared: Sequence[Cros
         print(" ".join(filter(None, [fact.what, fact.pair_id, ",".join(fact.methods), fact.words])))
 
 
-def _print_notes(reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport]) -> None:
+def note_skipped(compared: Sequence[CrossCheckReport]) -> None:
+    """Log the independent methods that could not be used, and why."""
     for other in compared:
         for words in other.skipped:
             note(f"{other.pair_id}: not cross-checked by {words}")
+
+
+def _print_notes(reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport]) -> None:
+    note_skipped(compared)
     for words in dict.fromkeys(f"{report.pair_id}: {n}" for report in reports for n in report.notes):
         note(words)

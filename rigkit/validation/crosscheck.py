@@ -172,7 +172,7 @@ def crosscheck(
         except DegenerateError as error:
             skipped.append(f"{name}: {error}")
     if any(method.name == TWO_VIEW and np.isnan(method.covariance).all() for method in methods):
-        skipped.append(f"{TWO_VIEW}: its own bundle adjustment changes it by more than its uncertainty; not compared")
+        skipped.append(f"{TWO_VIEW}: its own bundle adjustment changes it by more than its uncertainty")
     if other_chain is not None:
         methods.append(compare_chains(reconstruction, other_chain, OTHER_CHAIN))
     measured = measure(reconstruction)

@@ -149,10 +149,16 @@ def images_of_folder(folder: Path, pattern: str = "*") -> list[Path]:
 
 
 def images_below(folder: Path) -> list[Path]:
-    """Return the images of a folder and its subfolders, sorted; unreadable subfolders and hidden ones are skipped, and
-    links to folders are followed unless these are below, too."""
+    """Return the images of a folder and its subfolders, sorted; hidden subfolders are skipped, unreadable ones with a
+    warning, and links to folders are followed unless these are below, too."""
     out, walked = list[Path](), set[Path]()
-    for place, inside, names in os.walk(folder, followlinks=True):
+
+    def warn(error: OSError) -> None:
+        _log.warning(
+            "folder '%s' cannot be read and is left out: %s; check its permissions", error.filename, error.strerror
+        )
+
+    for place, inside, names in os.walk(folder, onerror=warn, followlinks=True):
         here = Path(place)
         if here.resolve() in walked:  # A link may lead to a folder above.
             inside.clear()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.disk.reading import about, read_bytes, read_text, usable_path
 from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.manifests.rig_session import RigSession, is_rig_session, load_rig_session
-from rigkit.io.manifests.session import SESSION_NAME, Session, load_session
+from rigkit.io.manifests.session import SESSION_NAME, Session, beside_session, load_session
 from rigkit.io.media.images import IMAGE_ENDINGS
 from rigkit.io.media.video import is_video, videos_inside
 from rigkit.workflows.calibration.calibrate import (
@@ -25,7 +25,7 @@ from rigkit.workflows.calibration.calibrate import (
     session_inputs,
 )
 from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration, calibrate_rig_session
-from rigkit.workflows.inputs.folder_session import boards_seen, session_of_folders
+from rigkit.workflows.inputs.folder_session import boards_seen, cameras_in, session_of_folders
 from rigkit.workflows.inputs.frames import (
     frames_folder,
     frames_of_videos,
@@ -90,15 +90,13 @@ def calibrate_session_file(
     Raises as `calibrate_session` and `calibrate_rig_session`.
     """
     listed = load_rig_session(path) if is_rig_session(path) else load_session(path)
-    session = with_frames(listed, progress)
-    output = options.output or session.result_path
-    report = output.with_suffix(".html") if options.report == Path() else options.report
-    options = replace(options, output=output, report=report)
-    if session is not listed:
-        # The videos are inputs as well as the frames that replace them.
-        ensure_writable((output, report), force=options.force, inputs=session_inputs(listed, options))
-    if isinstance(session, Session) and options.known.files:
+    if isinstance(listed, Session) and options.known.files:
         raise InputError("one camera has no extrinsics to solve for; `rigkit pose` gives its pose relative to a board")
+    output = options.output or listed.result_path
+    options = replace(options, output=output, report=_report_path(options, output))
+    # Before the frames of videos are chosen, which takes minutes; the videos are inputs as well as these frames.
+    ensure_writable((output, options.report), force=options.force, inputs=session_inputs(listed, options))
+    session = with_frames(listed, progress)
     with about(options.corners) if options.corners else nullcontext():
         if isinstance(session, RigSession):
             return calibrate_rig_session(session, options, progress=progress)
@@ -122,19 +120,27 @@ def calibrate_folders(
     DegenerateError: the views do not determine a camera.
     """
     given = [inside for folder in folders for inside in videos_inside(Path(folder))]
+    videos = _videos_of(given, options.output)
+    places = list(videos) or given
+    session = _session_path(places, options.output)
+    declared = [*folders, *([folder_options.timestamps] if folder_options.timestamps else [])]
+    # Before boards are identified and frames chosen, which takes minutes.
+    name = "rig.json" if len(videos or cameras_in(places)) > 1 else "calibration.json"
+    output = options.output or beside_session(session, name)
+    results = [path for path in (output, _report_path(options, output)) if path is not None]
+    ensure_writable(results, force=options.force, inputs=declared)
     boards = _boards(given, folder_options, progress)
-    places = _folders_of(given, boards, folder_options.timestamps, options, progress)
+    if videos:
+        _choose_frames(videos, boards, folder_options.timestamps, progress)
     wanted = session_of_folders(
         places,
         boards,
-        _session_path(places, options.output),
+        session,
         model=folder_options.model or "auto",
         output=options.output,
         known=options.known,
     )
     new = {path: text for path, text in wanted.files.items() if not _has_content(path, text)}
-    results = [path for path in (options.output, options.report) if path not in (None, Path())]
-    declared = [*folders, *([folder_options.timestamps] if folder_options.timestamps else [])]
     ensure_writable([*new, *results], force=options.force, inputs=[*(set(wanted.files) - set(new)), *declared])
     before = {path: read_bytes(path, "session") for path in new if path.exists()}
     write_together(dict(new), force=options.force)
@@ -182,36 +188,46 @@ def _session_path(places: Sequence[Path], output: Path | None) -> Path:
     return place / SESSION_NAME
 
 
-def _folders_of(
-    places: Sequence[Path],
-    boards: Sequence[str],
-    timestamps: Path | None,
-    options: CalibrateOptions,
-    progress: Progress,
-) -> list[Path]:
-    """Return the folders of images; videos are replaced by folders of their frames."""
+def _report_path(options: CalibrateOptions, output: Path) -> Path | None:
+    """Return the path of the page; Path("") stands for one named after the output."""
+    return output.with_suffix(".html") if options.report == Path() else options.report
+
+
+def _videos_of(places: Sequence[Path], output: Path | None) -> dict[Path, Path]:
+    """Return the given videos by the folder of their frames, in that of `output` or of the videos; {} for folders."""
     videos = [place for place in places if is_video(place)]
     if not videos:
-        return list(places)
+        return {}
     if len(videos) < len(places):
         raise InputError(
             "calibrate: videos mixed with folders of images; give all cameras as videos, or all as folders"
         )
+    folder = frames_folder(videos)
+    if output is not None:
+        folder = output.parent / folder.name
+    out = {folder: videos[0]} if len(videos) == 1 else {folder / video.stem: video for video in videos}
+    if len(out) < len(videos):
+        raise InputError("calibrate: two videos have the same name, which names a camera; rename one")
+    return out
+
+
+def _choose_frames(
+    videos: Mapping[Path, Path], boards: Sequence[str], timestamps: Path | None, progress: Progress
+) -> None:
+    """Write selected frames of the videos into their folders."""
     if not boards:
         raise InputError(
             "calibrate: the square size is missing; give --square-mm, the side of one, or the board, such "
             "as --board 9x6x25; rigkit board identify shows which"
         )
     seen = [board_of_words(words) for words in boards]
-    folder = frames_folder(videos)
-    if options.output is not None:
-        folder = options.output.parent / folder.name
-    cameras = {"": videos[0]} if len(videos) == 1 else {video.stem: video for video in videos}
-    if len(cameras) < len(videos):
-        raise InputError("calibrate: two videos have the same name, which names a camera; rename one")
-    times = None if len(videos) == 1 else timestamps or timestamps_next_to(videos)
-    frames_of_videos(cameras, folder, seen, timestamps=times, progress=progress)
-    return [folder / name for name in cameras]
+    if len(videos) == 1:
+        ((folder, video),) = videos.items()
+        frames_of_videos({"": video}, folder, seen, progress=progress)
+        return
+    times = timestamps or timestamps_next_to(list(videos.values()))
+    cameras = {folder.name: video for folder, video in videos.items()}
+    frames_of_videos(cameras, next(iter(videos)).parent, seen, timestamps=times, progress=progress)
 
 
 def _has_content(path: Path, text: str) -> bool:

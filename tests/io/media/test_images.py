@@ -248,7 +248,9 @@ def test_links_to_folders_are_followed_once(tmp_path: Path) -> None:
     assert images_below(session) == [session / "c" / "1.jpg", session / "left" / "1.jpg", session / "right" / "1.jpg"]
 
 
-def test_an_unreadable_subfolder_does_not_end_the_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreadable_subfolder_is_named_and_does_not_end_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """As in /proc, whose folders of processes vanish while they are read."""
     (tmp_path / "gone").mkdir()
     (tmp_path / "images").mkdir()
@@ -262,3 +264,4 @@ def test_an_unreadable_subfolder_does_not_end_the_search(tmp_path: Path, monkeyp
 
     monkeypatch.setattr(os, "scandir", refuse)
     assert folder_of_images(tmp_path) == tmp_path / "images"
+    assert f"folder '{tmp_path / 'gone'}' cannot be read and is left out: Invalid argument" in caplog.text
