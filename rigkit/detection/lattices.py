@@ -35,7 +35,7 @@ from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
 from rigkit.detection.subpixel.subpixel import EvidenceScore, refine
 from rigkit.detection.subpixel.uniform_blur import LOOKED_AT_PX, with_uniform_blur
-from rigkit.detection.subpixel.whole_board import has_small_squares, placed_together
+from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.kernels.front import near_any
 
 IsPlausible = Callable[[GreyImage, Level, Lattice], bool]
@@ -256,9 +256,8 @@ def _fitted(
         )
         if len(parts) == 1:
             if large(own.lattice, sought.min_corners):
-                # Uniform squares are no model of squares with markers, whose corners are fitted again by their finder.
-                marked = sought.vouched is not None and has_small_squares(own) and sought.vouched(grey, own.lattice)
-                out.append(own if marked else _scattered(placed_together(grey, own)))
+                # Corners of squares with markers are fitted again by their finder.
+                out.append(_scattered(placed_together(grey, own, sought.vouched)))
             continue
         # The fits of these corners used edges on the other side of the discontinuity: fit them again.
         alone = [part.lattice.trimmed() for part in parts]

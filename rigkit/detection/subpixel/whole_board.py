@@ -9,7 +9,7 @@ smaller than those of separate windows.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, known_median
+from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells, predicted
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.board_window import BoardWindow, Surroundings, extended
@@ -123,23 +124,24 @@ class _SheetParameters:
     light: FloatArray
 
 
-def has_small_squares(item: RefinedLattice) -> bool:
-    """Return whether the squares of `item` are so small relative to the blur that it is fitted as a whole."""
+def placed_together(
+    image: GreyImage, item: RefinedLattice, marked: Callable[[GreyImage, Lattice], bool] | None = None
+) -> RefinedLattice:
+    """Return `item` with jointly fitted corners if its squares are small relative to the blur and the model fits; else
+    unchanged.
+
+    Nor is a lattice changed that is `marked`, asked last: uniform squares are no model of squares with markers.
+    """
     known = item.lattice.known
     few = min(known.shape) < MIN_ROWS or np.count_nonzero(~known) > MAX_HOLES * known.size
     blur = known_median(item.blur_px[known])
     if few or blur < MIN_BLUR_PX:
-        return False
-    return float(np.median(fit_cells(item.lattice.pixels, known).gaps())) <= SMALL_SQUARES * blur
-
-
-def placed_together(image: GreyImage, item: RefinedLattice) -> RefinedLattice:
-    """Return `item` with jointly fitted corners if its squares are small relative to the blur and the model fits; else
-    unchanged."""
-    if not has_small_squares(item):
         return item
-    lattice, known = item.lattice, item.lattice.known
-    start, blur, shape = lattice.pixels, known_median(item.blur_px[known]), fit_cells(lattice.pixels, known)
+    shape = fit_cells(item.lattice.pixels, known)
+    large = float(np.median(shape.gaps())) > SMALL_SQUARES * blur
+    if large or (marked is not None and marked(image, item.lattice)):
+        return item
+    lattice, start = item.lattice, item.lattice.pixels
     geometry = Geometry(shape.sides, np.zeros((lattice.count, 2)), shape.gaps(), ends_of(known, known))
     outer = np.full((*known.shape, 4), np.nan)
     fitted = start[known], lattice.contrast[known], item.blur_px[known], lattice.signs()[known]
