@@ -7,7 +7,7 @@ not every model alike: models are compared with flat boards first, and again wit
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -264,14 +264,12 @@ def _others(tried: Sequence[FittedModel], model: str) -> list[Candidate]:
 
 def _largest_size_chosen(
     beyond: Sequence[tuple[str, type[Camera], int | None]], result: Calibration, in_force: Sequence[str]
-) -> list[Finding]:
-    """Return a finding where the largest size of the model was chosen: the lens may need a larger one."""
+) -> Iterator[Finding]:
+    """Yield a finding where the largest size of the model was chosen: the lens may need a larger one."""
     if not beyond or "model" in in_force or not any(c.name == beyond[-1][0] and c.chosen for c in result.candidates):
-        return []
-    return [
-        Finding.look(
-            f"{beyond[-1][0]}, the largest size of this model, was chosen: the lens may need more parameters, mostly "
-            "near the image border",
-            'try model = "auto"',
-        )
-    ]
+        return
+    yield Finding.look(
+        f"{beyond[-1][0]}, the largest size of this model, was chosen: the lens may need more parameters, mostly "
+        "near the image border",
+        'try model = "auto"',
+    )

@@ -101,5 +101,5 @@ def test_two_cameras_are_found_or_not_in_any_order() -> None:
     printed = set()
     for _ in range(20):
         session = replace(found, views=tuple(both[k] for k in rng.permutation(len(both))))
-        printed.add(bool(two_cameras(session, np.arange(len(both)))))
+        printed.add(bool(list(two_cameras(session, np.arange(len(both))))))
     assert len(printed) == 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from rigkit.calibration.board_shape import BoardShape
@@ -19,58 +21,49 @@ millimetre of 50. A REAL board of 88 mm tags shows 0.001 at most, however it is 
 print is wrong by 0.05."""
 
 
-def diagnose_boards(c: Calibration, provided: str, *, sure: bool) -> list[Finding]:
-    """Return findings about the boards whose shape was solved for.
+def diagnose_boards(c: Calibration, provided: str, *, sure: bool) -> Iterator[Finding]:
+    """Yield findings about the boards whose shape was solved for.
 
     `provided` is the condition added to a finding about the squares' aspect ratio. That is omitted unless the lens is
     `sure`: otherwise it is correlated with the ratio of the focal lengths.
     """
-    out = []
     for board in c.boards:
         if board.kind == "flat":
             continue
         name = f"board '{board.board_id}'"
         extent = float(np.linalg.norm(np.ptp(board.points_mm, axis=0)))
         if board.bow_mm > BOW * extent:
-            out.append(
-                Finding.look(
-                    f"{name} is not flat: up to {board.bow_mm:.2f} mm off a plane",
-                    "its shape is solved for, but glue it to something flat: it may bend differently next time",
-                )
+            yield Finding.look(
+                f"{name} is not flat: up to {board.bow_mm:.2f} mm off a plane",
+                "its shape is solved for, but glue it to something flat: it may bend differently next time",
             )
         if sure and abs(board.aspect) > ASPECT:
             longer, other = ("x", "y") if board.aspect > 0 else ("y", "x")
-            out.append(
-                Finding.look(
-                    f"{name} has squares {100 * abs(board.aspect):.2f} % longer in {longer} relative to {other} than "
-                    f"declared{provided}",
-                    "measure square_x_mm and square_y_mm again",
-                )
+            yield Finding.look(
+                f"{name} has squares {100 * abs(board.aspect):.2f} % longer in {longer} relative to {other} than "
+                f"declared{provided}",
+                "measure square_x_mm and square_y_mm again",
             )
-        out += _spacing(name, board)
-    return out
+        yield from _spacing(name, board)
 
 
-def _spacing(name: str, board: BoardShape) -> list[Finding]:
-    """Return a finding where the gap between tags differs from the declared one: the solved shape absorbs that, but
+def _spacing(name: str, board: BoardShape) -> Iterator[Finding]:
+    """Yield a finding where the gap between tags differs from the declared one: the solved shape absorbs that, but
     lengths in mm are wrong."""
     pattern = None if board.declared is None else board.declared.pattern
     if board.declared is None or not isinstance(pattern, AprilGrid):
-        return []
+        return
     lattice = board.points_mm.reshape(board.declared.rows, board.declared.columns, 3)
     # Sides of tags and gaps between them alternate along both axes; a single tag has no gap.
     steps = [np.linalg.norm(np.diff(lattice, axis=axis), axis=-1) for axis in (1, 0)]
     sides = np.concatenate([steps[0][:, ::2].ravel(), steps[1][::2].ravel()])
     gaps = np.concatenate([steps[0][:, 1::2].ravel(), steps[1][1::2].ravel()])
     if not len(gaps):
-        return []
+        return
     found = float(gaps.mean() / sides.mean())
-    if abs(found - pattern.spacing) <= OFF_SPACING:
-        return []
-    return [
-        Finding.look(
+    if abs(found - pattern.spacing) > OFF_SPACING:
+        yield Finding.look(
             f"{name} has spacing = {found:.2f}, {pattern.spacing:g} is declared: its lengths in mm and those of all "
             "poses are wrong",
             "measure a tag's side and the gap, correct tag_mm and spacing, and calibrate again",
         )
-    ]

@@ -6,7 +6,7 @@ error.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,9 +82,9 @@ class Extent:
         )
 
 
-def diagnose_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]:
+def diagnose_capture(calibration: Calibration, clusters: IntArray, *, upright: bool) -> list[Finding]:
     """Return findings about how the images were taken, the most severe first; `clusters` (V,) are the cluster numbers
-    of the views' images, equal for near-duplicates."""
+    of the views' images, equal for near-duplicates; `upright`: no board was rotated about its normal."""
     images = [view.image for view in calibration.views]
     number = clusters.tolist()
     return [
@@ -92,7 +92,7 @@ def diagnose_capture(calibration: Calibration, clusters: IntArray) -> list[Findi
         *_too_few(images, number),
         *hardly_tilted(calibration),
         *_distances(calibration),
-        *stretched_images(calibration, upright=bool(boards_never_rotated(calibration))),
+        *stretched_images(calibration, upright=upright),
     ]
 
 
@@ -101,10 +101,11 @@ def hardly_tilted(c: Calibration) -> list[Finding]:
     return [*_tilts(c), *_parallel(c)]
 
 
-def few_repeated(calibration: Calibration, clusters: IntArray) -> list[Finding]:
-    """Return a finding about near-duplicate images where enough others are left."""
+def few_repeated(calibration: Calibration, clusters: IntArray) -> Iterator[Finding]:
+    """Yield a finding about near-duplicate images where enough others are left."""
     images, number = [view.image for view in calibration.views], clusters.tolist()
-    return [] if _hardly_any(images, number) else _repeated(images, number)
+    if not _hardly_any(images, number):
+        yield from _repeated(images, number)
 
 
 def _hardly_any(images: Sequence[str], number: Sequence[int]) -> bool:
@@ -117,136 +118,117 @@ def _axes(c: Calibration, axis: int) -> FloatArray:
     return c.corners.rotation[:, :, axis]
 
 
-def _tilts(c: Calibration) -> list[Finding]:
-    """Return a finding where few boards are tilted: boards parallel to the image do not determine the focal length."""
+def _tilts(c: Calibration) -> Iterator[Finding]:
+    """Yield a finding where few boards are tilted: boards parallel to the image do not determine the focal length."""
     tilted = int((np.abs(_axes(c, 2)[:, 2]) < np.cos(np.radians(TILTED_DEG))).sum())
-    if tilted >= min(TILTED_VIEWS, len(c.views)):
-        return []
-    return [
-        Finding.bad(
+    if tilted < min(TILTED_VIEWS, len(c.views)):
+        yield Finding.bad(
             f"the board is tilted by more than {TILTED_DEG:.0f} degrees in only {tilted} of {len(c.views)} views, so "
             "the focal length is poorly determined",
             f"take at least {TILTED_VIEWS} with the board tilted by 20 to 50 degrees, about different axes",
         )
-    ]
 
 
-def _parallel(c: Calibration) -> list[Finding]:
-    """Return a finding where all boards are parallel to each other: they have the same vanishing line."""
+def _parallel(c: Calibration) -> Iterator[Finding]:
+    """Yield a finding where all boards are parallel to each other: they have the same vanishing line."""
     normals = _axes(c, 2)
     middle = normals.sum(axis=0)
     cosines = normals @ middle / np.linalg.norm(middle)
     spread = float(np.degrees(np.sqrt(np.mean(np.arccos(np.clip(cosines, -1.0, 1.0)) ** 2))))
-    if len(c.views) < 2 or spread > PARALLEL_DEG:
-        return []
-    return [
-        Finding.look(
+    if len(c.views) >= 2 and spread <= PARALLEL_DEG:
+        yield Finding.look(
             f"all boards are nearly parallel to each other (within {spread:.1f} degrees, rms)",
             "tilt the board by 20 to 50 degrees, about different axes",
         )
-    ]
 
 
-def boards_never_rotated(c: Calibration) -> list[Finding]:
-    """Return a finding where no board was rotated about its normal: the aspect ratios of pixels and squares are then
+def boards_never_rotated(c: Calibration) -> Iterator[Finding]:
+    """Yield a finding where no board was rotated about its normal: the aspect ratios of pixels and squares are then
     correlated."""
     # Half a turn is equivalent to none: angles are doubled.
     along = _axes(c, 0) @ np.array([1.0, 1.0j, 0.0])
     doubled = (along / np.maximum(np.abs(along), np.finfo(float).tiny)) ** 2
     turned = 0.5 * np.degrees(np.abs(np.angle(doubled * np.conj(doubled.sum()))))
-    if len(c.views) < 2 or quantiles_of(turned, [NEARLY_ALL])[0] > UPRIGHT_DEG:
-        return []
-    return [
-        Finding.look(
+    if len(c.views) >= 2 and quantiles_of(turned, [NEARLY_ALL])[0] <= UPRIGHT_DEG:
+        yield Finding.look(
             "the board was never rotated in the image plane: squares that are longer in one direction are absorbed by "
             "fx / fy",
             "rotate the board by 90 degrees in half of the images",
         )
-    ]
 
 
-def stretched_images(c: Calibration, *, upright: bool) -> list[Finding]:
-    """Return a finding where pixels are not square; `upright`: no board was rotated about its normal."""
+def stretched_images(c: Calibration, *, upright: bool) -> Iterator[Finding]:
+    """Yield a finding where pixels are not square; `upright`: no board was rotated about its normal."""
     step = 1e-3 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     pixels, valid, _, by_parameters = c.camera.project_with_jacobians(np.column_stack([step, np.ones(4)]))
     along_x, along_y = pixels[0, 0] - pixels[1, 0], pixels[2, 1] - pixels[3, 1]
     if not valid.all() or min(along_x, along_y) <= 0.0:
-        return []
+        return
     stretch = float(np.log(along_x / along_y))
     gradient = (by_parameters[0, 0] - by_parameters[1, 0]) / along_x
     gradient = gradient - (by_parameters[2, 1] - by_parameters[3, 1]) / along_y
     sigma = c.widening * float(np.sqrt(max(gradient @ c.covariance @ gradient, 0.0)))
     if abs(stretch) <= max(SQUARE_WITHIN, STRETCH_SIGMAS * sigma):
-        return []
+        return
     narrower, other = ("x", "y") if stretch < 0.0 else ("y", "x")
     squares = ", or the board's squares are longer one way than the other" if upright else ""
-    return [
-        Finding.look(
-            f"focal lengths are {100.0 * (1.0 - np.exp(-abs(stretch))):.1f} % smaller along {narrower} than along "
-            f"{other}, although sensors have square pixels: a program or the camera has stretched the images{squares}",
-            "give the images as the sensor has them, or use the calibration only for images stretched in the same way",
-        )
-    ]
+    yield Finding.look(
+        f"focal lengths are {100.0 * (1.0 - np.exp(-abs(stretch))):.1f} % smaller along {narrower} than along "
+        f"{other}, although sensors have square pixels: a program or the camera has stretched the images{squares}",
+        "give the images as the sensor has them, or use the calibration only for images stretched in the same way",
+    )
 
 
-def _too_few(images: Sequence[str], number: Sequence[int]) -> list[Finding]:
+def _too_few(images: Sequence[str], number: Sequence[int]) -> Iterator[Finding]:
     count = len(set(number))
     if count >= FEW_IMAGES:
-        return []
+        return
     words = f"only {count} images" if count > 1 else "only 1 image"
     if len(set(images)) > count:
         where = f"only {count} different poses" if count > 1 else "a single pose"
         words = f"{len(set(images))} images show {where} of the boards"
-    return [
-        Finding(
-            severity=Severity.BAD if count < FAR_TOO_FEW else Severity.LOOK,
-            message=words,
-            remedy=f"take at least {FEW_IMAGES}, better 15",
-        )
-    ]
+    yield Finding(
+        severity=Severity.BAD if count < FAR_TOO_FEW else Severity.LOOK,
+        message=words,
+        remedy=f"take at least {FEW_IMAGES}, better 15",
+    )
 
 
-def _repeated(images: Sequence[str], number: Sequence[int]) -> list[Finding]:
-    """Return a finding about images that show the boards at the same place as another one."""
+def _repeated(images: Sequence[str], number: Sequence[int]) -> Iterator[Finding]:
+    """Yield a finding about images that show the boards at the same place as another one."""
     first = dict(reversed(list(zip(number, images, strict=True))))
     again = {image: first[n] for n, image in zip(number, images, strict=True) if first[n] != image}
     if not again:
-        return []
+        return
     one, other = next(iter(again.items()))
     what = f"image '{one}' shows" if len(again) == 1 else f"{len(again)} images, the first of them '{one}', show"
-    return [
-        Finding.look(
-            f"{what} the board at the pose of another image ('{other}'): near-duplicates count as one image",
-            "move the board between images",
-        )
-    ]
+    yield Finding.look(
+        f"{what} the board at the pose of another image ('{other}'): near-duplicates count as one image",
+        "move the board between images",
+    )
 
 
-def _distances(c: Calibration) -> list[Finding]:
-    """Return a finding where all boards were at one distance: only tilts then give depth."""
+def _distances(c: Calibration) -> Iterator[Finding]:
+    """Yield a finding where all boards were at one distance: only tilts then give depth."""
     if len(c.views) < 2:
-        return []
+        return
     near, far = quantiles_of(corner_ranges(c), [0.05, 0.95])
-    if far > ONE_DISTANCE * near:
-        return []
-    return [
-        Finding.look("all boards were at the same distance", "take some images at half and some at twice the distance")
-    ]
+    if far <= ONE_DISTANCE * near:
+        yield Finding.look(
+            "all boards were at the same distance", "take some images at half and some at twice the distance"
+        )
 
 
-def extrapolated(c: Calibration, extent: Extent, far: FarProjection) -> list[Finding]:
-    """Return a finding where much of the image is extrapolated and uncertain."""
+def extrapolated(c: Calibration, extent: Extent, far: FarProjection) -> Iterator[Finding]:
+    """Yield a finding where much of the image is extrapolated and uncertain."""
     if extent.share >= MIN_SHARE_COVERED or not len(extent.pixels):
-        return []
+        return
     worst = worst_direction(far.covariance(extent.rays[~extent.covered]))
     typical = float(np.sqrt(np.mean(worst**2)))
     error = c.rms_px if c.heldout_rms_px is None else c.heldout_rms_px
-    if typical <= MAX_TIMES_ERROR * max(error, SMALL_PX):
-        return []
-    return [
-        Finding.look(
+    if typical > MAX_TIMES_ERROR * max(error, SMALL_PX):
+        yield Finding.look(
             f"{100 - round(100.0 * extent.share)} % of the image has no board corners: there the lens model is "
             f"extrapolated, with an uncertainty of {digits(typical)} px (one standard deviation, rms)",
             "take images with the board there, up to the image corners",
         )
-    ]

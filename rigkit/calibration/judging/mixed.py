@@ -7,6 +7,8 @@ the start of the next.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from rigkit.calibration.result import Calibration
@@ -28,32 +30,29 @@ MAX_STARTS = 24
 """Number of views from which motions are tried, spread over the places of the boards, whatever their order."""
 
 
-def two_cameras(calibration: Calibration, number: IntArray) -> list[Finding]:
-    """Return a finding if the images are of two synchronous cameras; `number` (V,) are the `cluster_numbers` of the
+def two_cameras(calibration: Calibration, number: IntArray) -> Iterator[Finding]:
+    """Yield a finding if the images are of two synchronous cameras; `number` (V,) are the `cluster_numbers` of the
     views' images."""
     views = calibration.views
     images = [view.image for view in views]
     _, first = np.unique(number, return_index=True)
     if len(first) < 2 * MIN_PARTNERS:
-        return []
+        return
     rotation, centre = calibration.corners.rotation, calibration.corners.translation_mm
     boards = np.unique([view.board_id for view in views], return_inverse=True)[1]
     start, end = _partners(rotation, centre, boards, number)
     if len(start) < MIN_PARTNERS:
-        return []
+        return
     alike = len(np.unique(number[start]))
     together = np.unique(np.concatenate([number[start], number[end]]))
     chained = np.intersect1d(number[start], number[end])
     enough = len(together) >= MIN_SHARE_PAIRED * len(first)
-    if alike < MIN_PARTNERS or not enough or len(chained) > MAX_SHARE_CHAINED * len(together):
-        return []
-    return [
-        Finding.bad(
+    if alike >= MIN_PARTNERS and enough and len(chained) <= MAX_SHARE_CHAINED * len(together):
+        yield Finding.bad(
             f"images of two cameras are mixed: the board moves in the same way between '{images[start[0]]}' and "
             f"'{images[end[0]]}' and in {alike - 1} other pairs of images, as in stereo pairs",
             "calibrate each camera from its own images, or both as a rig with [[cameras]]",
         )
-    ]
 
 
 def _partners(

@@ -17,7 +17,7 @@ moving entrance pupil (the E terms of CAHVORE).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -166,42 +166,38 @@ def _following(gram: FloatArray, rows: IntArray, what: int) -> FloatArray:
     return np.asarray(np.linalg.lstsq(gram[np.ix_(rows, rows)], gram[rows, what], rcond=NOT_FOLLOWED)[0])
 
 
-def moving_pupil(calibration: Calibration, correlation: float, far: FarProjection) -> list[Finding]:
-    """Return a finding where the pupil moves significantly and by a relevant amount; `correlation` is the
+def moving_pupil(calibration: Calibration, correlation: float, far: FarProjection) -> Iterator[Finding]:
+    """Yield a finding where the pupil moves significantly and by a relevant amount; `correlation` is the
     `neighbour_correlation` of the residuals."""
     asked = calibration.pupil is None and correlation > MIN_NEIGHBOUR_CORRELATION
     pupil = MovingPupil.of(calibration) if asked else None
     if pupil is None or pupil.chance > BY_CHANCE:
-        return []
+        return
     off = pupil.far_px(far)
     if off <= max(far.typical_px, SMALL_PX):
-        return []
+        return
     nearest, farthest, rim = _shown(calibration)
     moved = abs(pupil.mm_per_rad2) * rim**2
-    return [
-        Finding.look(
-            f"{NOT_ONE_POINT}: its entrance pupil moves by at least {moved:.1f} mm between the optical axis and the "
-            f"outermost corners (boards {nearest:.0f} to {farthest:.0f} mm away), which is not modelled; distant "
-            f"points are projected with an error of at least {off:.2f} px",
-            "calibrate at the distance of what is to be measured (with a larger board)",
-        )
-    ]
+    yield Finding.look(
+        f"{NOT_ONE_POINT}: its entrance pupil moves by at least {moved:.1f} mm between the optical axis and the "
+        f"outermost corners (boards {nearest:.0f} to {farthest:.0f} mm away), which is not modelled; distant "
+        f"points are projected with an error of at least {off:.2f} px",
+        "calibrate at the distance of what is to be measured (with a larger board)",
+    )
 
 
-def modelled_pupil(calibration: Calibration) -> list[Finding]:
-    """Return a finding with the movement of a pupil that is part of the calibration."""
+def modelled_pupil(calibration: Calibration) -> Iterator[Finding]:
+    """Yield a finding with the movement of a pupil that is part of the calibration."""
     if calibration.pupil is None:
-        return []
+        return
     nearest, farthest, rim = _shown(calibration)
     mm, sigma = calibration.pupil.shift_mm(rim)
-    return [
-        Finding.good(
-            f"{NOT_ONE_POINT}, which is modelled: its entrance pupil moves by {mm:.2f} +- "
-            f"{calibration.widening * sigma:.2f} mm between the optical axis and the outermost corners "
-            f"({np.degrees(rim):.0f} degrees; boards {nearest:.0f} to {farthest:.0f} mm away); exports to central "
-            "models omit it and are exact for distant points only"
-        )
-    ]
+    yield Finding.good(
+        f"{NOT_ONE_POINT}, which is modelled: its entrance pupil moves by {mm:.2f} +- "
+        f"{calibration.widening * sigma:.2f} mm between the optical axis and the outermost corners "
+        f"({np.degrees(rim):.0f} degrees; boards {nearest:.0f} to {farthest:.0f} mm away); exports to central "
+        "models omit it and are exact for distant points only"
+    )
 
 
 def may_move(calibration: Calibration) -> bool:

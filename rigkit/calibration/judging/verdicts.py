@@ -6,7 +6,7 @@ All limits are constants; none depends on the result that is judged.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -99,13 +99,13 @@ def judge(
     """
     far = FarProjection.of(calibration) if far is None else far
     clusters = _clusters(calibration.views) if clusters is None else clusters
-    upright = boards_never_rotated(calibration)
+    upright = list(boards_never_rotated(calibration))
     extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
     mixed, change = _residuals(calibration, correlation, far, also, clusters, solved)
     # With the images of two cameras mixed, residuals are not informative about views, boards and model.
     unlike, unclear = ([], []) if mixed else _views(calibration)
-    pattern = [] if mixed else _pattern(calibration, correlation, in_force, bool(change))
-    effects = _uncertain(calibration, far)
+    pattern = [] if mixed else list(_pattern(calibration, correlation, in_force, bool(change)))
+    effects = list(_uncertain(calibration, far))
     # Images that contradict each other make the lens uncertain, however many there are.
     contradicting = worst(effects) is Severity.BAD
     # A cause found already explains why later images are of another lens than the first.
@@ -117,7 +117,7 @@ def judge(
         *_of_another_kind(calibration, order),
         *change,
         *unlike,
-        *diagnose_capture(calibration, clusters),
+        *diagnose_capture(calibration, clusters, upright=bool(upright)),
         *(pattern if contradicting else []),
         *upright,
         *extrapolated(calibration, extent, far),
@@ -153,7 +153,7 @@ def _residuals(
     solved: tuple[Observations, Fit] | None,
 ) -> tuple[list[Finding], list[Finding]]:
     """Return findings on two cameras mixed, and on other causes of the residuals."""
-    if mixed := two_cameras(c, clusters):
+    if mixed := list(two_cameras(c, clusters)):
         return mixed, []
     # If the lens changed at some image, the residuals of a common lens are no evidence for another change.
     but = CHANGES if worst(also) is Severity.BAD else ()
@@ -162,7 +162,7 @@ def _residuals(
         # Such boards do not determine the lens, and its errors look like shears and zooms that differ between images.
         change = [finding for finding in change if finding.severity is Severity.BAD]
     # A moving pupil looks a little like a zoom in every image, but no change between images looks like a pupil.
-    return [], change if worst(change) is Severity.BAD else moving_pupil(c, correlation, far) or change
+    return [], change if worst(change) is Severity.BAD else list(moving_pupil(c, correlation, far)) or change
 
 
 def diagnose_session(
@@ -191,16 +191,14 @@ def with_headline(
     return [named, *(finding for finding in found if finding is not first)]
 
 
-def _not_converged(c: Calibration, in_force: Collection[str]) -> list[Finding]:
+def _not_converged(c: Calibration, in_force: Collection[str]) -> Iterator[Finding]:
     if c.convergence.converged:
-        return []
+        return
     other = "" if "model" in in_force else 'try model = "auto", or '
-    return [
-        Finding.bad(
-            f"the solver did not converge ({c.convergence.reason}): the model may not fit this lens",
-            f"{other}add images with the board tilted",
-        )
-    ]
+    yield Finding.bad(
+        f"the solver did not converge ({c.convergence.reason}): the model may not fit this lens",
+        f"{other}add images with the board tilted",
+    )
 
 
 def _contradicting(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[str]:
@@ -210,16 +208,16 @@ def _contradicting(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResul
     return out if len(out) >= min_of_a_kind(len(used) + len(out)) else []
 
 
-def _of_another_kind(c: Calibration, order: Sequence[str]) -> list[Finding]:
-    """Return a finding if many images contradict the others: one of the groups is of another lens, setting or board.
+def _of_another_kind(c: Calibration, order: Sequence[str]) -> Iterator[Finding]:
+    """Yield a finding if many images contradict the others: one of the groups is of another lens, setting or board.
     `order` are the names of all images."""
     images = _contradicting(c.dropped, c.views)
     if not images:
-        return []
+        return
     used = {view.image for view in c.views}
     what = f"{len(images)} of {len(used) + len(images)} images are inconsistent with the others and left out, "
     at = moment([image for image in dict.fromkeys(order) if image in used or image in images], images)
-    return [Finding.look(what + (f"all {at}" if at else f"the first of them '{images[0]}'"), KINDS_REMEDY, images[0])]
+    yield Finding.look(what + (f"all {at}" if at else f"the first of them '{images[0]}'"), KINDS_REMEDY, images[0])
 
 
 def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[Finding]:
@@ -246,23 +244,22 @@ def _images_left_out(dropped: Sequence[tuple[str, str]]) -> list[Finding]:
     ]
 
 
-def _coverage(c: Calibration) -> list[Finding]:
-    """Return a finding with the cells of the image without corners, where the lens has an image."""
+def _coverage(c: Calibration) -> Iterator[Finding]:
+    """Yield a finding with the cells of the image without corners, where the lens has an image."""
     width, height = c.camera.size_px
     pixels = c.corners.pixels[c.corners.kept]
     size = np.array([width / CELLS[0], height / CELLS[1]])
     cell = np.clip((pixels / size).astype(np.int64), 0, np.array(CELLS) - 1)
     count = np.bincount(cell[:, 0] * CELLS[1] + cell[:, 1], minlength=CELLS[0] * CELLS[1]).reshape(CELLS)
     if count.min() >= CELL_CORNERS:
-        return []
+        return
     u, v = np.meshgrid((np.arange(CELLS[0]) + 0.5) * size[0], (np.arange(CELLS[1]) + 0.5) * size[1], indexing="ij")
     rays, valid = c.camera.unproject(np.stack([u, v], axis=-1))
     empty = (count < CELL_CORNERS) & valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(ASKED_DEG)))
-    if not empty.any():
-        return []
-    return [
-        Finding.look(f"no corners in the {_in_words(empty)} of the image", "take images with the board there, tilted")
-    ]
+    if empty.any():
+        yield Finding.look(
+            f"no corners in the {_in_words(empty)} of the image", "take images with the board there, tilted"
+        )
 
 
 def _in_words(cells: BoolArray) -> str:
@@ -323,66 +320,61 @@ def _medians(values: FloatArray, count: IntArray) -> FloatArray:
     return np.asarray(0.5 * (padded[row, (count - 1) // 2] + padded[row, count // 2]))
 
 
-def _pattern(c: Calibration, correlation: float, in_force: Collection[str], named: bool) -> list[Finding]:
-    """Return a finding where residuals of neighbours are correlated: an error of the lens or board model, unless a
+def _pattern(c: Calibration, correlation: float, in_force: Collection[str], named: bool) -> Iterator[Finding]:
+    """Yield a finding where residuals of neighbours are correlated: an error of the lens or board model, unless a
     cause is `named` already."""
     if correlation < PATTERN:
-        return []
+        return
     what = f"residuals of neighbouring corners are correlated ({correlation:.2f}): "
     shapes = "board_shape" in in_force or any(board.kind == "released" for board in c.boards)
     if not shapes:
-        return [
-            Finding.look(what + "the board is not flat, or the lens model does not fit", 'try board_shape = "auto"')
-        ]
-    if "model" not in in_force:
-        return [Finding.look(what + "the lens model or the board shape does not fit", 'try model = "auto"')]
-    what += "no lens model or board shape explains it, so something changes between images"
-    remedy = "fix the focus, switch stabilisation off, hold camera and board still, use a stiff board"
-    return [] if named else [Finding.look(what, remedy)]
+        yield Finding.look(what + "the board is not flat, or the lens model does not fit", 'try board_shape = "auto"')
+    elif "model" not in in_force:
+        yield Finding.look(what + "the lens model or the board shape does not fit", 'try model = "auto"')
+    elif not named:
+        yield Finding.look(
+            what + "no lens model or board shape explains it, so something changes between images",
+            "fix the focus, switch stabilisation off, hold camera and board still, use a stiff board",
+        )
 
 
-def _overfit(c: Calibration) -> list[Finding]:
-    if c.heldout_rms_px is None or c.heldout_rms_px <= OVERFIT * c.rms_px:
-        return []
-    return [
-        Finding.look(
+def _overfit(c: Calibration) -> Iterator[Finding]:
+    if c.heldout_rms_px is not None and c.heldout_rms_px > OVERFIT * c.rms_px:
+        yield Finding.look(
             f"held-out RMS is {c.heldout_rms_px / c.rms_px:.2f} times the training RMS (overfitting): too few images "
             "for this model, or an image inconsistent with the others",
             "take more images",
         )
-    ]
 
 
-def _uncertain(c: Calibration, far: FarProjection) -> list[Finding]:
+def _uncertain(c: Calibration, far: FarProjection) -> Iterator[Finding]:
     typical, worst, inside = far.typical_px, far.worst_px, far.at_corners_px
     if worst <= UNCERTAIN_PX:
         error = c.rms_px if c.heldout_rms_px is None else c.heldout_rms_px
         if typical <= max(error, SMALL_PX):
-            return []
-        return [
-            Finding.look(
-                f"the projection uncertainty where boards were seen, {typical:.2f} px (one standard deviation), "
-                f"exceeds the reprojection error, {error:.2f} px",
-                "take more images, with the board tilted",
-            )
-        ]
+            return
+        yield Finding.look(
+            f"the projection uncertainty where boards were seen, {typical:.2f} px (one standard deviation), "
+            f"exceeds the reprojection error, {error:.2f} px",
+            "take more images, with the board tilted",
+        )
+        return
     what = f"the projection uncertainty reaches {worst:.1f} px (one standard deviation) where boards were seen"
     if not np.isfinite(worst):
-        return [Finding.bad(what, "take more images, with the board tilted")]
+        yield Finding.bad(what, "take more images, with the board tilted")
+        return
     what += f", most in the {_cell(c, far.corners.pixels[np.nanargmax(inside[far.rays_valid])])} of the image"
-    return [Finding.bad(what, "take more images there, with the board tilted")]
+    yield Finding.bad(what, "take more images there, with the board tilted")
 
 
-def _outliers(c: Calibration, named: Collection[str | None]) -> list[Finding]:
-    """Return a finding about many outliers, not counting those of images that are `named` already."""
+def _outliers(c: Calibration, named: Collection[str | None]) -> Iterator[Finding]:
+    """Yield a finding about many outliers, not counting those of images that are `named` already."""
     far = [outlier for outlier in c.outliers if not (outlier.residual_px <= SMALL_PX or outlier.image in named)]
     share = len(far) / max(len(c.outliers) + c.corner_count, 1)
     if share <= OUTLIER_SHARE:
-        return []
+        return
     image, count = Counter(outlier.image for outlier in far).most_common(1)[0]
-    return [
-        Finding.look(
-            f"{100 * share:.1f} % of the corners are outliers, most ({count}) in image '{image}'",
-            "check exposure, focus and motion blur there",
-        )
-    ]
+    yield Finding.look(
+        f"{100 * share:.1f} % of the corners are outliers, most ({count}) in image '{image}'",
+        "check exposure, focus and motion blur there",
+    )

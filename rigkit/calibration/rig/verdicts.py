@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -37,7 +37,7 @@ def diagnose_rig(
         *_overdispersed(rig, in_force),
         *_few_shared(rig),
     ]
-    headline, *others = with_headline(rig, causes, _uncertain(rig, far))
+    headline, *others = with_headline(rig, causes, list(_uncertain(rig, far)))
     pupils = [
         replace(note, message=f"camera '{camera.name}': {note.message}")
         for camera in rig.cameras
@@ -46,12 +46,12 @@ def diagnose_rig(
     return (headline, *pupils, *_lags(rig), *others)
 
 
-def _lags(rig: RigCalibration) -> list[Finding]:
-    """Return what was estimated of the lags and readouts, as a finding."""
+def _lags(rig: RigCalibration) -> Iterator[Finding]:
+    """Yield a finding with the estimated lags and readouts."""
     if not rig.lags:
-        return []
+        return
     words = [*lag_words(rig), *_readout_words(rig)]
-    return [Finding.good(f"{'; '.join(words)}; board poses are interpolated to these times")]
+    yield Finding.good(f"{'; '.join(words)}; board poses are interpolated to these times")
 
 
 def lag_words(rig: RigCalibration) -> list[str]:
@@ -73,96 +73,68 @@ def _readout_words(rig: RigCalibration) -> list[str]:
     ]
 
 
-def _not_converged(rig: RigCalibration) -> list[Finding]:
-    if rig.convergence.converged:
-        return []
-    return [Finding.bad(f"the joint solution did not converge ({rig.convergence.reason})")]
+def _not_converged(rig: RigCalibration) -> Iterator[Finding]:
+    if not rig.convergence.converged:
+        yield Finding.bad(f"the joint solution did not converge ({rig.convergence.reason})")
 
 
-def _left_out(rig: RigCalibration) -> list[Finding]:
+def _left_out(rig: RigCalibration) -> Iterator[Finding]:
     total = rig.shared_count + len(rig.left_out)
-    if len(rig.left_out) <= MANY_LEFT_OUT * total:
-        return []
-    return [
-        Finding.look(
+    if len(rig.left_out) > MANY_LEFT_OUT * total:
+        yield Finding.look(
             f"{len(rig.left_out)} of {total} shared board poses are left out as outliers: the views disagree on them",
             "hold rig and boards still during the capture, and trigger the cameras together",
         )
-    ]
 
 
-def _few_shared(rig: RigCalibration) -> list[Finding]:
-    if len(rig.cameras) < 2 or rig.shared_count >= FEW_SHARED:
-        return []
-    return [
-        Finding.look(
+def _few_shared(rig: RigCalibration) -> Iterator[Finding]:
+    if len(rig.cameras) >= 2 and rig.shared_count < FEW_SHARED:
+        yield Finding.look(
             f"only {rig.shared_count} board poses are seen by several cameras at once",
             f"take at least {FEW_SHARED} frames in which several cameras see the board",
         )
-    ]
 
 
-def _uncertain(rig: RigCalibration, far: Sequence[FarProjection]) -> list[Finding]:
-    out = []
+def _uncertain(rig: RigCalibration, far: Sequence[FarProjection]) -> Iterator[Finding]:
     for camera, projection in zip(rig.cameras, far, strict=True):
         worst = projection.worst_px
         if worst > UNCERTAIN_PX:
-            out.append(
-                Finding.bad(
-                    f"the projection uncertainty of camera '{camera.name}' reaches {worst:.1f} px where boards were "
-                    "seen",
-                    "take more frames, with the boards tilted",
-                )
+            yield Finding.bad(
+                f"the projection uncertainty of camera '{camera.name}' reaches {worst:.1f} px where boards were seen",
+                "take more frames, with the boards tilted",
             )
     for a, b in combinations([c.name for c in rig.cameras], 2):
         transfer = transfer_uncertainty(rig, a, b)
         if transfer is not None and transfer.median_px > UNCERTAIN_PX:
-            out.append(
-                Finding.bad(
-                    f"points transferred from camera '{a}' to camera '{b}' are uncertain by {transfer.median_px:.1f} "
-                    "px",
-                    "take more frames in which both see the board, or that link them by other cameras",
-                )
+            yield Finding.bad(
+                f"points transferred from camera '{a}' to camera '{b}' are uncertain by {transfer.median_px:.1f} px",
+                "take more frames in which both see the board, or that link them by other cameras",
             )
-    return out
 
 
 def _timing(rig: RigCalibration) -> str:
-    """Return what may be wrong with the moments of the images, in words."""
-    if rig.lags:
-        return "the cameras' time lags vary"
-    return "the cameras were not exactly synchronised"
+    """Return what may be wrong with the times of the images, in words."""
+    return "the cameras' time lags vary" if rig.lags else "the cameras were not exactly synchronised"
 
 
-def _overdispersed(rig: RigCalibration, in_force: Collection[str]) -> list[Finding]:
+def _overdispersed(rig: RigCalibration, in_force: Collection[str]) -> Iterator[Finding]:
     if rig.overdispersion <= OVERDISPERSED:
-        return []
+        return
     automatic = " and ".join(f'{name} = "auto"' for name in ("board_shape", "model") if name not in in_force)
-    return [
-        Finding.look(
-            f"overdispersion: frames disagree {rig.overdispersion:.1f} times as much as corner noise explains "
-            f"(included in all sigmas): boards or lenses depart from their models, or {_timing(rig)}",
-            (f"try {automatic}, or " if automatic else "take ") + "a flatter board",
-        )
-    ]
+    yield Finding.look(
+        f"overdispersion: frames disagree {rig.overdispersion:.1f} times as much as corner noise explains "
+        f"(included in all sigmas): boards or lenses depart from their models, or {_timing(rig)}",
+        (f"try {automatic}, or " if automatic else "take ") + "a flatter board",
+    )
 
 
-def _worse(rig: RigCalibration) -> list[Finding]:
-    alone = [c.heldout_rms_px for c in rig.single]
+def _worse(rig: RigCalibration) -> Iterator[Finding]:
+    known = [c.heldout_rms_px for c in rig.single if c.heldout_rms_px is not None]
     together = rig.heldout_rms_px
-    known = [a for a in alone if a is not None]
-    if together is None or len(known) < len(alone):
-        return []
+    if together is None or len(known) < len(rig.single):
+        return
     typical = float(np.sqrt(np.mean(np.square(known))))
-    if together <= WORSE * typical:
-        return []
-    return [
-        Finding.look(
-            f"held-out RMS is {together / typical:.1f} times that of the cameras alone: "
-            + (
-                f"{_timing(rig)}, or the rig is not rigid"
-                if len(rig.cameras) > 1
-                else "the boards are not rigidly mounted"
-            )
-        )
-    ]
+    if together > WORSE * typical:
+        several = len(rig.cameras) > 1
+        cause = f"{_timing(rig)}, or the rig is not rigid" if several else "the boards are not rigidly mounted"
+        yield Finding.look(f"held-out RMS is {together / typical:.1f} times that of the cameras alone: {cause}")

@@ -34,7 +34,7 @@ def test_tags_nearer_than_declared_are_told(declared: float, rng: np.random.Gene
 
 def test_one_tag_has_no_gap() -> None:
     board = Board("tag", 2, 2, 40.0, 40.0, pattern=AprilGrid(0.3))
-    assert _spacing("tag", BoardShape("tag", "released", board.points(), declared=board)) == []
+    assert list(_spacing("tag", BoardShape("tag", "released", board.points(), declared=board))) == []
 
 
 def test_an_unsure_lens_tells_nothing_of_how_long_squares_are(rng: np.random.Generator) -> None:

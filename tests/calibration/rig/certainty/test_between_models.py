@@ -62,7 +62,7 @@ def test_held_out_frames_are_compared_with_the_cameras_alone(
     alone: tuple[float | None, ...], together: float, printed: bool
 ) -> None:
     """What a camera alone comes to is not known where its images were too few to hold some out."""
-    assert bool(_worse(with_heldout_errors(alone, together))) == printed
+    assert bool(list(_worse(with_heldout_errors(alone, together)))) == printed
 
 
 @pytest.mark.parametrize(
