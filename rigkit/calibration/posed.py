@@ -13,7 +13,7 @@ from rigkit.calibration.assemble import board_shapes, outliers_of, view_results
 from rigkit.calibration.calibrate import FOLDS
 from rigkit.calibration.choosing.choice import FittedModel
 from rigkit.calibration.choosing.heldout import heldout_squares
-from rigkit.calibration.choosing.models_tried import enough_agree
+from rigkit.calibration.choosing.models_tried import Request, enough_agree
 from rigkit.calibration.choosing.one_model import with_board_shape
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration, Candidate
@@ -27,7 +27,6 @@ from rigkit.core.arrays import BoolArray, Coordinates, FloatArray, Projected
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Finding
-from rigkit.core.progress import silent
 
 MAX_LENS_RESIDUAL_PX = 1.0
 """Above this 2-D RMS the lens is not that of the images, or their size or focus is another one."""
@@ -111,7 +110,8 @@ def _shaped(
     lens = fit.state.camera
     held = fit_kept(observations, replace(fit.state, camera=HeldLens(lens.size_px, np.zeros(0), lens)), fit.kept)
     flat = FittedModel("board flat", held, heldout_squares(observations, held, folds))
-    observations, chosen, _, candidates = with_board_shape(observations, flat, board, folds, silent)
+    request = Request(size_px=lens.size_px, model=lens.model, board=board, folds=folds)
+    observations, chosen, _, candidates = with_board_shape(observations, flat, request)
     if chosen is flat:
         return observations, fit, fit.rms_px, tuple(candidates)
     state = replace(chosen.fit.state, camera=lens)

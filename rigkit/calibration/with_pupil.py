@@ -45,7 +45,7 @@ def solved_with_pupil(found: ModelOutcome, everything: Observations, request: Re
             found = replace(found, observations=reweighted(found.observations, options))
     if not options:
         return None
-    sizes = compared(found.observations, options, request.folds, request.progress)
+    sizes = compared(found.observations, options, request)
     return chosen_of_sizes(found.observations, sizes, request, used=found.used, reasons=found.reasons)
 
 
@@ -99,7 +99,7 @@ def against_central(central: ModelOutcome, moving: ModelOutcome, request: Reques
     """Return whether the held-out error is lower with the moving pupil, on the same corners, and both as candidates."""
     options = on_same_images(central, moving, (CENTRAL, MOVING))
     if moving.observations is central.observations:
-        options = compared(central.observations, options, request.folds, request.progress)
+        options = compared(central.observations, options, request)
     chosen = choose(options, MIN_SIGMAS)
     return chosen.name == MOVING, described(options, chosen)
 

@@ -15,7 +15,7 @@ import numpy as np
 from rigkit.calibration.choosing.choice import FittedModel, models_of
 from rigkit.calibration.choosing.lens_choice import lenses_on_boards, lenses_on_flat_boards
 from rigkit.calibration.choosing.models_tried import ModelInQuestion, Request, fit_all, wanted_models
-from rigkit.calibration.choosing.one_model import ModelOutcome, only, solved
+from rigkit.calibration.choosing.one_model import ModelOutcome, solved
 from rigkit.calibration.result import Candidate
 from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.views.repeats import cluster_numbers
@@ -73,7 +73,8 @@ class BegunCalibration:
         """Return the outcome of a camera model."""
         if model not in self._solved:
             with about_camera(self.name, self.observations.views):
-                own, wanted = only(self.options, self.wanted, model)
+                own = [option for option in self.options if option.model == model]
+                wanted = [one for one in self.wanted if one.camera.model == model]
                 self._solved[model] = solved(self.observations, own, wanted, self.failed, self.request)
         return self._solved[model]
 
@@ -104,7 +105,7 @@ def begin(name: str, views: Sequence[BoardView], request: Request) -> BegunCalib
         wanted = wanted_models(request)
         used, dropped = usable_views(views, request.size_px)
         observations = Observations.from_views(used)
-        options, failed = fit_all(observations, request.size_px, wanted, request.progress)
+        options, failed = fit_all(observations, request, wanted)
         several = len(models_of(options)) > 1
         tried = lenses_on_flat_boards(observations, options, request) if several else options
     return BegunCalibration(

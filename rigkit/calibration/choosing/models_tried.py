@@ -18,7 +18,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import MODELS, camera_model, check_order
 from rigkit.core.arrays import BoolArray, IntArray
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.core.progress import Progress
+from rigkit.core.progress import Progress, silent
 
 COMPARABLE = 1.5
 """A corner is an outlier only if it is one for every model whose scatter is within this factor of the smallest."""
@@ -46,10 +46,10 @@ class Request:
 
     size_px: tuple[int, int]
     model: str
-    degree: int | None
+    degree: int | None = None
     board: str
     folds: int
-    progress: Progress
+    progress: Progress = silent
     pupil: str = "central"
     """Or "auto", "moving": see `calibrate`."""
 
@@ -80,11 +80,7 @@ def larger_sizes(chosen: FittedModel) -> list[ModelInQuestion]:
 
 
 def fit_all(
-    observations: Observations,
-    size_px: tuple[int, int],
-    wanted: Sequence[ModelInQuestion],
-    progress: Progress,
-    known: Sequence[FittedModel] = (),
+    observations: Observations, request: Request, wanted: Sequence[ModelInQuestion], known: Sequence[FittedModel] = ()
 ) -> tuple[list[FittedModel], list[Candidate]]:
     """Return the options `known` and those `wanted`, fitted, and the failed ones; raises the last error if there is no
     option at all."""
@@ -92,16 +88,16 @@ def fit_all(
     failed: list[Candidate] = []
     error: Exception | None = None
     for i, (name, cls, order) in enumerate(wanted):
-        progress("models", i, len(wanted))
+        request.progress("models", i, len(wanted))
         try:
-            fit = fit_model(observations, size_px, cls, order)
+            fit = fit_model(observations, request.size_px, cls, order)
             if not identifiable(fit):
                 raise not_identifiable(name)
             options.append(FittedModel(name, fit))
         except (DegenerateError, InputError) as caught:
             error = caught
             failed.append(Candidate(name, 0, float("nan"), None, False, str(caught)))
-    progress("models", len(wanted), len(wanted))
+    request.progress("models", len(wanted), len(wanted))
     if not options:
         assert error is not None
         raise error
@@ -146,9 +142,7 @@ def reweighted(observations: Observations, options: list[FittedModel]) -> Observ
     return observations.with_common_error(squared, best.fit.kept)
 
 
-def compared(
-    observations: Observations, options: list[FittedModel], folds: int, progress: Progress
-) -> list[FittedModel]:
+def compared(observations: Observations, options: list[FittedModel], request: Request) -> list[FittedModel]:
     """Return the options refitted to the same corners where they are not yet, with their held-out errors."""
     sigma = [robust_sigma(o.fit, observations) for o in options] if len(options) > 1 else [0.0]
     near = [o.fit.kept for o, s in zip(options, sigma, strict=True) if s <= COMPARABLE * min(sigma)]
@@ -156,12 +150,12 @@ def compared(
     out = []
     unequal = float(np.ptp(observations.weight[observations.present])) > 0.0
     for i, option in enumerate(options):
-        progress("cross-validation", i, len(options))
+        request.progress("cross-validation", i, len(options))
         if option.heldout is not None and (option.fit.kept == kept).all():
             out.append(option)
             continue
         same = (option.fit.kept == kept).all() and not unequal
         fit = option.fit if same else fit_kept(observations, option.fit.state, kept)
-        out.append(replace(option, fit=fit, heldout=heldout_squares(observations, fit, folds)))
-    progress("cross-validation", len(options), len(options))
+        out.append(replace(option, fit=fit, heldout=heldout_squares(observations, fit, request.folds)))
+    request.progress("cross-validation", len(options), len(options))
     return out

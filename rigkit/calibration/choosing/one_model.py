@@ -25,7 +25,6 @@ from rigkit.calibration.solving.linearise import normal_equations
 from rigkit.calibration.solving.shape import often_seen
 from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray
-from rigkit.core.progress import Progress
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -51,14 +50,6 @@ class ModelOutcome:
     shapes: list[FittedModel]
 
 
-def only(
-    options: list[FittedModel], wanted: Sequence[ModelInQuestion], model: str
-) -> tuple[list[FittedModel], list[ModelInQuestion]]:
-    """Return the options, and the models to fit, of one camera model."""
-    own = [option for option in options if option.model == model]
-    return own, [one for one in wanted if one.camera.model == model]
-
-
 def solved(
     observations: Observations,
     options: list[FittedModel],
@@ -67,17 +58,16 @@ def solved(
     request: Request,
 ) -> ModelOutcome:
     """Return the outcome of one camera model, independent of the other models."""
-    size_px, folds, progress = request.size_px, request.folds, request.progress
     keep, reasons = agreeing(observations, options)
     if reasons:
         observations = observations.subset(np.flatnonzero(keep))
-        options, failed = fit_all(observations, size_px, wanted, progress)
+        options, failed = fit_all(observations, request, wanted)
     observations = reweighted(observations, options)
-    options = compared(observations, options, folds, progress)
+    options = compared(observations, options, request)
     beyond = [] if request.degree is not None else larger_sizes(choose(options, MIN_SIGMAS))
     if beyond:
-        options, unfit = fit_all(observations, size_px, beyond, progress, options)
-        options = compared(observations, options, folds, progress)
+        options, unfit = fit_all(observations, request, beyond, options)
+        options = compared(observations, options, request)
         failed = [*failed, *unfit]
     return chosen_of_sizes(observations, options, request, used=keep, reasons=reasons, failed=failed, beyond=beyond)
 
@@ -95,9 +85,7 @@ def chosen_of_sizes(
     """Return the outcome with the best of the `sizes`, compared with flat boards, and then the best board shape."""
     chosen = choose(sizes, MIN_SIGMAS)
     candidates = [*described(sizes, chosen, rivals=request.model == "auto"), *failed]
-    observations, chosen, shapes, tried = with_board_shape(
-        observations, chosen, request.board, request.folds, request.progress
-    )
+    observations, chosen, shapes, tried = with_board_shape(observations, chosen, request)
     return ModelOutcome(
         observations=observations,
         used=used,
@@ -122,17 +110,17 @@ def on_same_images(found: ModelOutcome, again: ModelOutcome, names: tuple[str, s
 
 
 def with_board_shape(
-    observations: Observations, flat: FittedModel, board: str, folds: int, progress: Progress
+    observations: Observations, flat: FittedModel, request: Request
 ) -> tuple[Observations, FittedModel, list[FittedModel], list[Candidate]]:
-    """Return the views, the fit with the board shape `board` from that with `flat` boards, the shapes compared, and
+    """Return the views, the fit with the board shape requested from that with `flat` boards, the shapes compared, and
     those as candidates. With "auto" the shape has the smallest held-out error. In the views returned, boards with
     rotational symmetry are numbered from the same corner."""
-    if board == "flat" or not often_seen(observations).any():
+    if request.board == "flat" or not often_seen(observations).any():
         return observations, flat, [flat], []
-    observations, flat, fits = _fit_shapes(observations, flat, board)
-    shapes, spared = _shapes(observations, flat, fits, board, folds, progress)
+    observations, flat, fits = _fit_shapes(observations, flat, request.board)
+    shapes, untried = _shapes(observations, flat, fits, request)
     chosen = choose(shapes)
-    candidates = [*(c for c in described(shapes, chosen) if "board" in c.name), *spared]
+    candidates = [*(c for c in described(shapes, chosen) if "board" in c.name), *untried]
     # Corners that are inliers only of another shape were added for the comparison: the flat fit is without them.
     return observations, flat if chosen.name == flat.name else chosen, shapes, candidates
 
@@ -155,13 +143,13 @@ def _fit_shapes(
 
 
 def _shapes(
-    observations: Observations, flat: FittedModel, fits: dict[str, Fit], board: str, folds: int, progress: Progress
+    observations: Observations, flat: FittedModel, fits: dict[str, Fit], request: Request
 ) -> tuple[list[FittedModel], list[Candidate]]:
     """Return the shapes compared on the same corners, and as a candidate the one that was not tried."""
-    options = [FittedModel(f"board {kind}", fit) for kind, fit in fits.items()]
-    options = [flat, *options] if board == "auto" else options
-    spared = []
-    if board == "auto" and "released" not in fits:
-        reason = "not tried: residuals of the warp are consistent with noise"
-        spared.append(Candidate("board released", 0, float("nan"), None, False, reason))
-    return compared(observations, options, folds, progress), spared
+    options, untried = [FittedModel(f"board {kind}", fit) for kind, fit in fits.items()], list[Candidate]()
+    if request.board == "auto":
+        options = [flat, *options]
+        if "released" not in fits:
+            reason = "not tried: residuals of the warp are consistent with noise"
+            untried = [Candidate("board released", 0, float("nan"), None, False, reason)]
+    return compared(observations, options, request), untried

@@ -8,12 +8,12 @@ camera with such a target is a rig, too.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
-from rigkit.calibration.choosing.begun import BegunCalibration
+from rigkit.calibration.choosing.begun import BegunCalibration, about_camera
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
@@ -76,55 +76,71 @@ def calibrate_rig(
     """
     if not views or (len(views) < 2 and not rigid_boards):
         raise InputError(f"rig: {len(views)} camera; a rig has at least two, or boards that are mounted to each other")
-    options = _Options(
-        sizes_px=sizes_px,
-        model=model,
-        degree=degree,
-        board=board,
-        folds=folds,
-        known=known,
-        pupil=pupil,
-        begun=begun,
-    )
-    _require_sound(views, options)
+    require_known(pupil)
+    _require_entries(views, sizes_px=sizes_px, model=model, degree=degree)
+    _require_one_image(views)
+    _require_known(views, sizes_px, known)
+    requests = {
+        name: Request(
+            size_px=sizes_px[name],
+            model=model if isinstance(model, str) else model[name],
+            degree=degree[name] if isinstance(degree, Mapping) else degree,
+            board=board,
+            folds=folds,
+            pupil=pupil,
+        )
+        for name in views
+    }
+
+    def each_alone(seen: Views) -> RigViews:
+        return _each_alone(seen, requests, known, begun, progress)
+
     same = same_pictures(views)
-    every, notes = options.each_alone(views, progress), tuple[Finding, ...]()
+    every, notes = each_alone(views), tuple[Finding, ...]()
     if rigid_boards:
-        every, notes = _on_rigid_boards(every, views, rigid_boards, options, progress)
+        every, notes = _on_rigid_boards(every, views, rigid_boards, each_alone, shaped=board != "flat")
     with _mistakes_named(every):
-        joint, heldout = _predicting(every, options, progress)
+        joint, heldout = _best_timing(every, known, folds, progress)
     rig, far = assemble_rig(joint, heldout)
     notes = (*same, *_mispaired(rig, every, joint.cost_sigmas), *notes, *joint.notes)
-    return replace(rig, verdicts=diagnose_rig(rig, far, notes, in_force=options.in_force))
+    options = ("model", {one.model for one in requests.values()}), ("board_shape", {board})
+    in_force = [name for name, values in options if values == {"auto"}]
+    return replace(rig, verdicts=diagnose_rig(rig, far, notes, in_force=in_force))
 
 
-def _predicting(
-    every: RigViews, options: _Options, progress: Progress
+def _best_timing(
+    every: RigViews, known: KnownCameras | None, folds: int, progress: Progress
 ) -> tuple[JointRig, tuple[float | None, tuple[float | None, ...]]]:
     """Return the joint solution and its held-out errors, as `heldout_rms`. Rolling shutters, and then lags, are a part
     of it unless held-out frames are predicted better without them; without held-out errors, where significant."""
-    joint = solve_jointly(every, progress, options.known)
-    best = heldout_rms(joint, options.folds)
+    joint = solve_jointly(every, progress, known)
+    best = heldout_rms(joint, folds)
     for timing in TIMINGS[: TIMINGS.index(joint.timing)][::-1]:
         if best[0] is None:
             break
-        simpler = solve_jointly(every, progress, options.known, timing=timing)
-        heldout = heldout_rms(simpler, options.folds)
+        simpler = solve_jointly(every, progress, known, timing=timing)
+        heldout = heldout_rms(simpler, folds)
         if heldout[0] is not None and heldout[0] < best[0]:
             joint, best = simpler, heldout
     return joint, best
 
 
 def _on_rigid_boards(
-    alone: RigViews, views: Views, groups: Sequence[Sequence[str]], options: _Options, progress: Progress
+    alone: RigViews,
+    views: Views,
+    groups: Sequence[Sequence[str]],
+    each_alone: Callable[[Views], RigViews],
+    *,
+    shaped: bool,
 ) -> tuple[RigViews, tuple[Finding, ...]]:
-    """Return the views with boards identified and oriented by their arrangement, and findings."""
+    """Return the views with boards identified and oriented by their arrangement, and findings; `shaped`: whether the
+    boards' shapes were solved for."""
     boards = _boards(views, groups)
     every, notes = board_places(groups, alone, boards)
-    if options.board != "flat" and _renamed(alone.seen, every.seen):
+    if shaped and _renamed(alone.seen, every.seen):
         # The boards' shapes were found from mixed-up boards.
         views = {n: [(e.frame, e.view) for e in own.values()] for n, own in zip(views, every.seen, strict=True)}
-        every, notes = board_places(groups, options.each_alone(views, progress), boards)
+        every, notes = board_places(groups, each_alone(views), boards)
     return every, notes
 
 
@@ -144,13 +160,6 @@ def _mispaired(rig: RigCalibration, views: RigViews, cost_sigmas: float) -> list
         return [cause]
     mounts, left_out = [camera.cam_from_rig for camera in rig.cameras], [key[:2] for key in rig.left_out]
     return put_together_wrongly(views, mounts, left_out)
-
-
-def _require_sound(views: Views, options: _Options) -> None:
-    require_known(options.pupil)
-    _require_entries(views, sizes_px=options.sizes_px, model=options.model, degree=options.degree)
-    _require_one_image(views)
-    _require_known(views, options.sizes_px, options.known)
 
 
 def _require_entries(views: Views, **given: object) -> None:
@@ -198,58 +207,30 @@ def _require_known(views: Views, sizes_px: Mapping[str, tuple[int, int]], known:
         raise InputError(f"rig: camera '{known.mounted[0]}', in whose frame the mounts are known, has to be the first")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Options:
-    """The options of `calibrate_rig` for each camera alone."""
-
-    sizes_px: Mapping[str, tuple[int, int]]
-    model: str | Mapping[str, str]
-    degree: int | Mapping[str, int | None] | None
-    board: str
-    folds: int
-    known: KnownCameras | None
-    pupil: str
-    begun: Sequence[BegunCalibration]
-
-    @property
-    def in_force(self) -> list[str]:
-        """Those of "model" and "board_shape" that are "auto", so that this is no remedy."""
-        models = {self.model} if isinstance(self.model, str) else set(self.model.values())
-        return [name for name, values in (("model", models), ("board_shape", {self.board})) if values == {"auto"}]
-
-    def each_alone(self, views: Views, progress: Progress) -> RigViews:
-        """Return the views with the calibration of each camera alone; errors contain the camera's name."""
-        found: dict[str, Calibration] = {}
-        asked: list[tuple[str, Sequence[BoardView], Request]] = []
-        for name, own in views.items():
-            alone = [view for _, view in own]
-            if self.known is not None and name in self.known.cameras:
-                lens, _ = self.known.cameras[name]
-                try:
-                    found[name] = posed_calibration(
-                        alone, lens, self.known.of_lens(name), board=self.board, folds=self.folds
-                    )
-                except (InputError, DegenerateError) as error:
-                    raise type(error)(f"camera '{name}': {error}") from error
-                continue
-            model = self.model if isinstance(self.model, str) else self.model[name]
-            degree = self.degree[name] if isinstance(self.degree, Mapping) else self.degree
-            request = Request(
-                size_px=self.sizes_px[name],
-                model=model,
-                degree=degree,
-                board=self.board,
-                folds=self.folds,
-                progress=silent,
-                pupil=self.pupil,
-            )
+def _each_alone(
+    views: Views,
+    requests: Mapping[str, Request],
+    known: KnownCameras | None,
+    begun: Sequence[BegunCalibration],
+    progress: Progress,
+) -> RigViews:
+    """Return the views with the calibration of each camera alone; errors contain the camera's name."""
+    found: dict[str, Calibration] = {}
+    asked: list[tuple[str, Sequence[BoardView], Request]] = []
+    for name, own in views.items():
+        alone, request = [view for _, view in own], requests[name]
+        if known is None or name not in known.cameras:
             asked.append((name, alone, request))
-        names = [name for name, _, _ in asked]
-        found |= dict(zip(names, calibrate_together(asked, known=self.begun, progress=progress), strict=True))
-        if self.pupil == "auto" and any(found[name].pupil is not None for name in names):
-            found |= _with_pupils_too([one for one in asked if found[one[0]].pupil is None])
-        seen = [frame_observations(own, found[name]) for name, own in views.items()]
-        return RigViews(list(views), seen, tuple(found[name] for name in views), {})
+            continue
+        lens, _ = known.cameras[name]
+        with about_camera(name, ()):
+            found[name] = posed_calibration(alone, lens, known.of_lens(name), board=request.board, folds=request.folds)
+    names = [name for name, _, _ in asked]
+    found |= dict(zip(names, calibrate_together(asked, known=begun, progress=progress), strict=True))
+    if any(found[name].pupil is not None for name in names):
+        found |= _with_pupils_too([one for one in asked if one[2].pupil == "auto" and found[one[0]].pupil is None])
+    seen = [frame_observations(own, found[name]) for name, own in views.items()]
+    return RigViews(list(views), seen, tuple(found[name] for name in views), {})
 
 
 def _with_pupils_too(cameras: Sequence[tuple[str, Sequence[BoardView], Request]]) -> dict[str, Calibration]:
