@@ -38,10 +38,27 @@ def assemble(
     rivals: Sequence[RivalFit] = (),
 ) -> Calibration:
     """Return the result without verdicts; `rivals` are other models that the images support about as well."""
-    state, sigma = fit.state, fit.sigma_px
     covariance, clustered = _covariance(observations, fit)
     covariance += between_models(observations, fit, rivals, np.sqrt(np.diag(covariance)[:-6]))
-    camera, covariance, pupil = without_pupil(state.camera, covariance)
+    return replace(
+        with_covariance(observations, fit, heldout_px, dropped, candidates, covariance),
+        overdispersion=clustered.overdispersion,
+        freedom=clustered.freedom,
+        rivals=tuple(one.rival for one in rivals),
+    )
+
+
+def with_covariance(
+    observations: Observations,
+    fit: Fit,
+    heldout_px: float | None,
+    dropped: tuple[tuple[str, str], ...],
+    candidates: tuple[Candidate, ...],
+    covariance: FloatArray,
+) -> Calibration:
+    """Return the result without verdicts and rivals, with a given `covariance` (P + 6, P + 6) of the parameters and the
+    boards' mean motion."""
+    camera, covariance, pupil = without_pupil(fit.state.camera, covariance)
     p = camera.parameters.size
     return Calibration(
         camera=camera,
@@ -49,16 +66,13 @@ def assemble(
         heldout_rms_px=heldout_px,
         covariance=covariance[:p, :p],
         frame_covariance=covariance,
-        overdispersion=clustered.overdispersion,
-        freedom=clustered.freedom,
-        sigma_px=sigma,
-        views=view_results(observations, state, fit.residuals, fit.kept),
+        sigma_px=fit.sigma_px,
+        views=view_results(observations, fit.state, fit.residuals, fit.kept),
         dropped=dropped,
         outliers=outliers_of(observations, fit),
         candidates=candidates,
         convergence=fit.convergence,
-        boards=board_shapes(observations, state.shape, state.unknowns),
-        rivals=tuple(one.rival for one in rivals),
+        boards=board_shapes(observations, fit.state.shape, fit.state.unknowns),
         pupil=pupil,
     )
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigkit.calibration.assemble import board_shapes, outliers_of, view_results
+from rigkit.calibration.assemble import with_covariance
 from rigkit.calibration.calibrate import FOLDS
 from rigkit.calibration.choosing.choice import FittedModel
 from rigkit.calibration.choosing.heldout import heldout_squares
@@ -56,23 +56,10 @@ def posed_calibration(
     observations, fit, dropped = _on_flat_boards(views, camera)
     observations, fit, heldout_px, candidates = _shaped(observations, fit, board, folds)
     p = camera.parameters.size
-    own = np.zeros((p, p)) if covariance is None else covariance
     frame = np.zeros((p + 6, p + 6))
-    frame[:p, :p] = own
-    result = Calibration(
-        camera=camera,
-        rms_px=fit.rms_px,
-        heldout_rms_px=heldout_px,
-        covariance=own,
-        frame_covariance=frame,
-        sigma_px=fit.sigma_px,
-        views=view_results(observations, fit.state, fit.residuals, fit.kept),
-        dropped=dropped,
-        outliers=outliers_of(observations, fit),
-        candidates=candidates,
-        convergence=fit.convergence,
-        boards=board_shapes(observations, fit.state.shape, fit.state.unknowns),
-    )
+    if covariance is not None:
+        frame[:p, :p] = covariance
+    result = with_covariance(observations, fit, heldout_px, dropped, candidates, frame)
     return replace(result, verdicts=judge(result, _large_residual(result), in_force=("model", "board_shape")))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from rigkit.calibration.assemble import with_solution
 from rigkit.calibration.choosing.board_orientation import with_views_turned
-from rigkit.calibration.judging.two_kinds import MIN_LEAD, split_in_two
+from rigkit.calibration.judging.two_kinds import MIN_LEAD, split_entropy, split_in_two
 from rigkit.calibration.judging.view_evidence import ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
@@ -178,10 +178,8 @@ def _finding_of(back: _Back, before: float, evidence: ViewEvidence) -> Finding |
     left, part = max(back.squares / before, np.finfo(float).eps), float(at.mean())
     if not 0.0 < part < 1.0 or not changes:
         return None
-    # Which images were flipped is estimated from the same residuals: twice its entropy is added to the criterion.
-    entropy = -2.0 * len(at) * (part * np.log(part) + (1.0 - part) * np.log1p(-part))
     # Errors within an image are correlated: each counts as two measurements, of its principal point.
-    if 2.0 * len(at) * np.log(left) + entropy > -MIN_LEAD:
+    if 2.0 * len(at) * np.log(left) + split_entropy(at) > -MIN_LEAD:
         return None
     # Images that shift on the sensor for another reason still do after flipping.
     if left * max(changes[way].share for way in ("shift", "lens")) > MAX_STILL_SHIFTED * (1.0 - left):

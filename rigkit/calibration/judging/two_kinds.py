@@ -121,12 +121,16 @@ def split_in_two(evidence: ViewEvidence, rows: slice, known: FloatArray) -> Kind
     # Weights saturate: the amounts of images with much information scatter by errors of the model.
     weight = information / (information + np.median(information))
     amount, chosen = pull[best] / information, second[best]
-    part = float(chosen.mean())
-    # The kind of each image is estimated from the same residuals: twice its entropy is added to the criterion.
-    entropy = -2.0 * len(chosen) * (part * np.log(part) + (1.0 - part) * np.log1p(-part))
-    cost = entropy + len(step[best]) * np.log(len(chosen)) + OF_UNIFORM * len(chosen)
+    cost = split_entropy(chosen) + len(step[best]) * np.log(len(chosen)) + OF_UNIFORM * len(chosen)
     cost += _explained(amount, weight, chosen[None].astype(float))[0]
     return Kinds(chosen, amount, weight, step[best], float(cost))
+
+
+def split_entropy(second: BoolArray) -> float:
+    """Return twice the entropy of a split into two kinds that both occur (V,), which is added to an information
+    criterion: the kind of each image is estimated from the same residuals."""
+    part = float(second.mean())
+    return float(-2.0 * len(second) * (part * np.log(part) + (1.0 - part) * np.log1p(-part)))
 
 
 def _best_steps(

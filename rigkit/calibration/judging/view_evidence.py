@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.certainty.departures import turned_rays
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.core.arrays import FloatArray, IntArray, Points
 
@@ -213,10 +214,7 @@ def rows_of(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[Floa
     x, y = flat / np.maximum.reduceat(np.abs(flat).max(axis=0), start)[view]
     centre = calibration.camera.axis_px
     along_u, along_v = centred(pixels) / np.array(calibration.camera.size_px)[:, None]
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        np.multiply(lever[i], d_pixels_d_point[:, j], out=rows[:, k])
-        rows[:, k] -= lever[j] * d_pixels_d_point[:, i]
+    rows[:, :3] = turned_rays(lever, d_pixels_d_point)
     of_kind = {kind: rows[:, own] for kind, own in columns_of(rows.shape[1]).items()}
     out_of_plane = (d_pixels_d_point * rotation[:, 2]).sum(axis=1)
     for k, bow in enumerate((x * x, x * y, y * y)):

@@ -71,7 +71,7 @@ def _stray(observations: Observations, state: State, kept: BoolArray) -> bool:
     points = len(shape.released)
     # A corner needs two views; along the line of sight common to all of them its position is undetermined.
     seen = np.bincount(observations.corner[kept], minlength=len(shape.flat))[shape.released] > 1
-    size, axes = np.linalg.eigh(_own_blocks(normal, points))
+    size, axes = np.linalg.eigh(normal.point_blocks)
     along = np.swapaxes(axes, -1, -2) @ normal.g[-3 * points :].reshape(points, 3, 1)
     known = seen[:, None] & (size > OPEN * size[:, -1:])
     less = along[known, 0] ** 2 / size[known]
@@ -80,12 +80,6 @@ def _stray(observations: Observations, state: State, kept: BoolArray) -> bool:
     freedom = max(2 * int(kept.sum()) - state.camera.parameters.size - 6 * views, 1)
     variance = float((normal.residuals[0].weighted(observations)[kept] ** 2).sum()) / freedom
     return bool(less.sum() > variance * chance_limit(count))
-
-
-def _own_blocks(normal: NormalEquations, points: int) -> FloatArray:
-    """Return the 3x3 blocks (M, 3, 3) of the released corners."""
-    each, start = np.arange(points), len(normal.g) - 3 * points
-    return np.asarray(normal.gg[start:, start:].reshape(points, 3, points, 3)[each, :, each, :])
 
 
 def _evident(observations: Observations, state: State, kept: BoolArray) -> tuple[State, BoolArray]:
@@ -127,5 +121,5 @@ def _variance(state: State, normal: NormalEquations) -> FloatArray:
     count, first = state.shape.count, state.shape.basis.shape[-1]
     if state.shape.kind == "warp":
         return np.diag(normal.covariance[0])[-count:]
-    own = np.diagonal(np.linalg.inv(_own_blocks(normal, (count - first) // 3)), axis1=-2, axis2=-1)
+    own = np.diagonal(np.linalg.inv(normal.point_blocks), axis1=-2, axis2=-1)
     return np.concatenate([np.zeros(first), own.ravel()])

@@ -56,10 +56,6 @@ class Fit:
         """Return the weights of the kept corners, zero elsewhere."""
         return np.where(self.kept, observations.weight, 0.0)
 
-    def norm(self, observations: Observations) -> FloatArray:
-        """Return the weighted 2-D residuals (V, C) in px."""
-        return self.residuals.weighted(observations)
-
     @cached_property
     def normal(self) -> NormalEquations:
         """The normal equations in px^-2, priors included."""
@@ -78,7 +74,7 @@ class Fit:
 
 def robust_sigma(fit: Fit, observations: Observations) -> float:
     """Return the robust standard deviation of all corners, weighted, px."""
-    return sigma_of(fit.norm(observations), observations.present)
+    return sigma_of(fit.residuals.weighted(observations), observations.present)
 
 
 def fit_model(observations: Observations, size_px: tuple[int, int], model: type[Camera], order: int | None) -> Fit:

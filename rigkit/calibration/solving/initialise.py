@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 
@@ -64,54 +65,35 @@ def initialise(
     board = np.ascontiguousarray(np.swapaxes(np.take(table, observations.corner, axis=1), 0, 1))
     pixels = np.ascontiguousarray(np.swapaxes(observations.pixels, 1, 2))
     middle = image_center(size_px)
-    yield from _starts(observations, pixels, board, middle, size_px, model, order)
+
+    def fitted(centre: FloatArray, theta: FloatArray, radius: FloatArray) -> Camera | None:
+        for limit in (np.inf, NARROW):
+            inside = theta < limit
+            with suppress(InputError):
+                curve = RadialCurve(centre, theta[inside], radius[inside])
+                return model.from_radial_curve(size_px, curve, order=order)
+        return None
+
+    def around(centre: FloatArray) -> Iterator[State]:
+        offset = pixels - centre[:, None]
+        alignment = align(offset, board, observations.weight)
+        rho = np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2)
+        rho_max = float(rho[alignment.weight > MIN_ALIGNMENT_WEIGHT].max())
+        depths = _Depths(alignment, offset, rho / rho_max, board)
+        tried = (depths.curve(exponents) for exponents in EXPONENTS)
+        curve = next((c for c in tried if c is not None), None)
+        radius = np.linspace(0.0, rho_max, RADIUS_SAMPLES)
+        fallback = (np.linspace(0.0, 0.5 * fov, RADIUS_SAMPLES) for fov in FALLBACK_FOV_RAD)
+        for theta, sign, t3 in map(depths.known, fallback) if curve is None else [curve]:
+            camera = fitted(centre, theta, radius)
+            if camera is not None:
+                rotation, translation = _posed(alignment, sign, t3)
+                yield State.start(camera, rotation, translation, observations)
+
+    yield from around(middle)
     epipole = distortion_centre(pixels, board, observations.weight, middle)
     if (np.abs(epipole - middle) < 0.5 * np.array(size_px)).all():
-        yield from _starts(observations, pixels, board, epipole, size_px, model, order)
-
-
-def _starts(
-    observations: Observations,
-    pixels: FloatArray,
-    board: FloatArray,
-    centre: FloatArray,
-    size_px: tuple[int, int],
-    model: type[Camera],
-    order: int | None,
-) -> Iterator[State]:
-    """`pixels` and `board` are (V, 2, C)."""
-    offset = pixels - centre[:, None]
-    alignment = align(offset, board, observations.weight)
-    rho = np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2)
-    rho_max = float(rho[alignment.weight > MIN_ALIGNMENT_WEIGHT].max())
-    depths = _Depths(alignment, offset, rho / rho_max, board)
-    tried = (depths.curve(exponents) for exponents in EXPONENTS)
-    curve = next((c for c in tried if c is not None), None)
-    radius = np.linspace(0.0, rho_max, RADIUS_SAMPLES)
-    fallback = (np.linspace(0.0, 0.5 * fov, RADIUS_SAMPLES) for fov in FALLBACK_FOV_RAD)
-    for theta, sign, t3 in map(depths.known, fallback) if curve is None else [curve]:
-        camera = _fitted(model, size_px, centre, theta, radius, order)
-        if camera is not None:
-            rotation, translation = _posed(alignment, sign, t3)
-            yield State.start(camera, rotation, translation, observations)
-
-
-def _fitted(
-    model: type[Camera],
-    size_px: tuple[int, int],
-    centre: FloatArray,
-    theta: FloatArray,
-    radius: FloatArray,
-    order: int | None,
-) -> Camera | None:
-    for limit in (np.inf, NARROW):
-        inside = theta < limit
-        try:
-            curve = RadialCurve(centre, theta[inside], radius[inside])
-            return model.from_radial_curve(size_px, curve, order=order)
-        except InputError:
-            continue
-    return None
+        yield from around(epipole)
 
 
 def _posed(alignment: Alignment, sign: FloatArray, t3: FloatArray) -> tuple[Mat3, Points]:

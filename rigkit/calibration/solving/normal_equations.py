@@ -134,10 +134,8 @@ class NormalEquations:
     def _eliminate_points(self, damping_g: FloatArray, damping_p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the step with the released points eliminated by their 3x3 blocks: with many points and few views the
         system of the other globals and all poses is the smaller one."""
-        p, views = int(self.points_from or 0), len(self.pp)
-        count = (len(self.g) - p) // 3
-        each = np.arange(count)
-        own = self.gg[p:, p:].reshape(count, 3, count, 3)[each, :, each, :]
+        p, views, own = int(self.points_from or 0), len(self.pp), self.point_blocks
+        count = len(own)
         inverse = np.linalg.inv(_damped(own, damping_g[p:].reshape(count, 3)))
         system = np.zeros((p + 6 * views, p + 6 * views))
         system[:p, :p] = self.gg[:p, :p] + np.diag(damping_g[:p])
@@ -152,6 +150,14 @@ class NormalEquations:
         step = _solve_positive(system - coupling.T @ back, rhs)
         points = (inverse @ (self.g[p:] - coupling @ step).reshape(count, 3, 1)).reshape(-1)
         return np.concatenate([step[:p], points]), step[p:].reshape(views, 6)
+
+    @property
+    def point_blocks(self) -> FloatArray:
+        """The 3x3 blocks (M, 3, 3) of `gg` of the released points."""
+        start = int(self.points_from or 0)
+        count = (len(self.g) - start) // 3
+        each = np.arange(count)
+        return np.asarray(self.gg[start:, start:].reshape(count, 3, count, 3)[each, :, each, :])
 
     @property
     def identifiable(self) -> bool:

@@ -192,14 +192,9 @@ def _with_own_times(state: RigState, moments: Moments, observations: RigObservat
     free = _free(by_target)
     products = _with_times(by_target, moments.speeds_at_all())
     spread, own = np.where(free.any(axis=0), FIRST_SPREAD, 0.0), moments.own.T
-    poses, late = np.arange(6), np.arange(6, products.shape[1])
-    largest = np.maximum(np.einsum("fii->fi", products[..., :-1]).max(axis=1, keepdims=True), 1.0)
     for _ in range(SPREAD_ROUNDS):
-        known = (sigma_px / np.maximum(spread, MIN_SPREAD)) ** 2
-        information = np.where(free, known, HELD * largest)
-        system, right = products[..., :-1].copy(), products[..., -1].copy()
-        system[:, poses, poses] += RIDGE * largest
-        system[:, late, late] += information
+        system, information = _regularised(products, free, (sigma_px / np.maximum(spread, MIN_SPREAD)) ** 2)
+        right = products[..., -1].copy()
         right[:, 6:] -= information * own
         inverse = np.linalg.inv(system)
         found = own + np.einsum("fij,fj->fi", inverse, right)[:, 6:]
@@ -241,6 +236,19 @@ def _with_times(by_target: tuple[FloatArray, FloatArray, FloatArray], speeds: Fl
     return summed
 
 
+def _regularised(products: FloatArray, free: BoolArray, known: FloatArray | float) -> tuple[FloatArray, FloatArray]:
+    """Return the normal matrices (F, 6 + n, 6 + n) of the `products`, with a ridge on the poses and the prior
+    information (F, n) of the image times, also returned: `known` where `free` (F, n), else so much that they are
+    fixed."""
+    system = products[..., :-1].copy()
+    diagonal = np.einsum("fii->fi", system)
+    largest = np.maximum(diagonal.max(axis=1, keepdims=True), 1.0)
+    information = np.where(free, known, HELD * largest)
+    diagonal[:, :6] += RIDGE * largest
+    diagonal[:, 6:] += information
+    return system, information
+
+
 def _free(by_target: tuple[FloatArray, FloatArray, FloatArray]) -> BoolArray:
     """Return the mask (F, n) of the free image times: the pose of a frame is at the time of the first camera that sees
     it, which is fixed."""
@@ -258,12 +266,8 @@ def _chance_of_scatter(state: RigState, observations: RigObservations, start: Mo
 
     def gain(own: FloatArray) -> float:
         products = _with_times(by_target, np.broadcast_to(own, (free.shape[1], *own.shape)))
-        largest = np.maximum(np.einsum("fii->fi", products[..., :-1]).max(axis=1, keepdims=True), 1.0)
-        held = np.concatenate(
-            [np.broadcast_to(RIDGE * largest, (len(own), 6)), np.where(free, known, HELD * largest)], 1
-        )
-        system, right = products[..., :-1] + held[:, :, None] * np.eye(held.shape[1]), products[..., -1:]
-        return float((right * np.linalg.solve(system, right)).sum())
+        right = products[..., -1:]
+        return float((right * np.linalg.solve(_regularised(products, free, known)[0], right)).sum())
 
     found, better = gain(trajectories), 0
     for _ in range(ORDERS_DRAWN):
