@@ -192,7 +192,7 @@ def pairs(seeds: range, pupil: FloatArray, model: str) -> None:
 
 def real_pairs(folder: Path, size: str, model: str) -> None:
     """Print how pairs of REAL images of one board, calibrated by the other half of the images, fit epipolar geometry
-    and the board's lattice, with the pupil and as if from one point."""
+    and the board's lattice, with the pupil and as a central camera."""
     columns, rows, square = size.split("x")
     board = Board("board", int(columns), int(rows), float(square), float(square))
     views, size_px = [], (0, 0)
@@ -316,7 +316,7 @@ def single_cameras(args: argparse.Namespace, seeds: range) -> None:
             before.append(far_errors(calibrate(views, SIZE, model=args.model, pupil="central")))
             print(seed, np.round(found.pupil.terms, 3), np.round(terms[-1], 2), np.round(off[-1], 4), flush=True)
         else:
-            print(seed, "moves" if moves else "one point", found.pupil and found.pupil.terms, flush=True)
+            print(seed, "moves" if moves else "central", found.pupil and found.pupil.terms, flush=True)
     print(f"SIMULATED: found {found_of[True]} of {total[True]} that move, {found_of[False]} of {total[False]} central")
     if not terms:
         return

@@ -27,7 +27,7 @@ from rigkit.core.errors import DegenerateError, InputError
 
 PUPILS = ("auto", "central", "moving")
 """Values of the option: a pupil where the images support one, never, always."""
-CENTRAL, MOVING = "one point of view", "moving pupil"
+CENTRAL, MOVING = "fixed pupil", "moving pupil"
 """Names of the candidates."""
 
 

@@ -110,7 +110,7 @@ def test_a_central_approximation_is_reported(saved: Path, tmp_path: Path, caplog
 
 
 def test_a_certificate_is_of_the_lens_with_its_pupil(saved: Path) -> None:
-    """Lengths near the camera are within the bound, which as if from one point they are not."""
+    """Lengths near the camera are within the bound, which as a central camera they are not."""
     task = Task(quantity=Quantity.LENGTH, size_mm=30.0, distance_mm=150.0)
     found = certify_file(saved, task).certificate
     assert not any(LEFT_OUT in finding.message for finding in found.findings)
@@ -156,7 +156,7 @@ def test_fresh_boards_are_checked_with_the_pupil(saved: Path) -> None:
     assert check_views(monitored, seen).rms_px < 0.06
     near = monitored.cameras[0]
     assert isinstance(near, NearCamera)
-    # As if from one point; and the lens and the pupil as sure together as they were solved for.
+    # As a central camera; and the lens and the pupil as sure together as they were solved for.
     central = replace(monitored, cameras=(near.with_parameters([*near.lens.parameters, 0.0, 0.0]),))
     assert check_views(central, seen).rms_px > 0.2
     own, known = slice(near.lens.parameters.size, None), load_calibration(saved)

@@ -139,7 +139,7 @@ def test_a_central_approximation_is_reported(saved: Path, caplog: pytest.LogCapt
 
 
 def test_a_certificate_is_of_cameras_with_their_pupils(rig: RigCalibration, saved: Path) -> None:
-    """Lengths that both cameras see near by are within the bound, and as if from one point few are."""
+    """Lengths that both cameras see near by are within the bound, and as a central camera few are."""
     task = Task(quantity=Quantity.LENGTH, size_mm=30.0, distance_mm=150.0)
     found = certify_file(saved, task).certificate
     instrument = found.instrument

@@ -42,7 +42,6 @@ CONFIDENCE = 0.999
 """Probability of at least one sample without outliers, given the share of inliers found so far."""
 MAX_TRIALS = 4000
 
-NO_POSE = "no pose with enough inliers in front of both cameras in {} samples; check which camera took which image"
 BATCH = 96
 """Samples per batch: slightly more than 40 % of outliers require."""
 WIDE = 4.0
@@ -101,8 +100,8 @@ def robust_pose(
         raise InputError(f"robust estimation: max_noise is in sigmas of the matches and above 1, got {max_noise}")
     kind = str(pose_type)
     rows = SampsonRows.of(matches)
-    finalists, trials = _finalists(matches, rows, rng, kind, sample, max_noise)
-    noise = _shown_noise(rows, finalists, max_noise)
+    finalists, trials = _best_hypotheses(matches, rows, rng, kind, sample, max_noise)
+    noise = _estimated_noise(rows, finalists, max_noise)
     finalists = rows.improved(finalists, kind, noise)[0]
     loss = MarginalLoss(noise)
 
@@ -125,12 +124,15 @@ def robust_pose(
             except (InputError, DegenerateError):
                 continue
             if not compare_poses(_pose(found), _pose(other))[1]:
-                found, qualities = _preferred((found, qualities), (other, others))
+                found, qualities = _better_pose((found, qualities), (other, others))
         return found
-    raise DegenerateError(NO_POSE.format(trials))
+    raise DegenerateError(
+        f"no pose with enough inliers in front of both cameras{f' in {trials} samples' if trials else ''}; check which "
+        "camera took which image"
+    )
 
 
-def _finalists(
+def _best_hypotheses(
     matches: Matches, rows: SampsonRows, rng: np.random.Generator, kind: str, sample: Sample, max_noise: float
 ) -> tuple[Mat3, int]:
     """Return the best essential matrices (H, 3, 3) and the number of samples; raises DegenerateError without any."""
@@ -143,7 +145,7 @@ def _finalists(
     return finalists, trials
 
 
-def _shown_noise(rows: SampsonRows, finalists: Mat3, max_noise: float) -> float:
+def _estimated_noise(rows: SampsonRows, finalists: Mat3, max_noise: float) -> float:
     """Return the noise level, in sigmas, from the median residual of the inliers of the best of the finalists.
 
     At this level, lower than that of the search, the qualities of different local optima differ clearly.
@@ -161,7 +163,7 @@ def _pose(found: RobustPose) -> Rigid3:
     return found.refined.cam2_from_cam1
 
 
-def _preferred(
+def _better_pose(
     first: tuple[RobustPose, FloatArray], second: tuple[RobustPose, FloatArray]
 ) -> tuple[RobustPose, FloatArray]:
     """Return the better of the two poses of a plane, each given with the qualities (N,) of all matches.
@@ -188,7 +190,7 @@ def _poses(
     """
     found: list[tuple[float, Rigid3, BoolArray]] = []
     total, best = rows.quality(E21, noise), 0.0
-    for k in _different(total):
+    for k in _distinct_optima(total):
         # The quality of the plausible matches is at most that of all.
         if total[k] <= best:
             break
@@ -206,7 +208,7 @@ def _poses(
     return [(pose, plausible) for _, pose, plausible in sorted(found, key=lambda entry: -entry[0])]
 
 
-def _different(quality: FloatArray) -> IntArray:
+def _distinct_optima(quality: FloatArray) -> IntArray:
     """Return the indices of distinct optima, best first."""
     order = np.argsort(-quality, kind="stable")
     return np.asarray(order[np.append(True, -np.diff(quality[order]) > SAME_QUALITY)])
@@ -271,7 +273,7 @@ class _ConsensusSearch:
     def best(self, E21: Mat3) -> Mat3:
         """Return the best few of `E21` (H, 3, 3) at the highest noise level, best first, then those at the lowest."""
         qualities = self.rows.quality_ahead(E21, QUANTILE * self.max_noise, self.max_noise, MIN_NOISE)
-        return np.asarray(E21[np.concatenate([_different(quality)[:FINALISTS] for quality in qualities])])
+        return np.asarray(E21[np.concatenate([_distinct_optima(quality)[:FINALISTS] for quality in qualities])])
 
 
 def _sample_size(matches: Matches, kind: str, sample: Sample) -> int:

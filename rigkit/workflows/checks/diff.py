@@ -147,8 +147,8 @@ def _cameras(a: Path, b: Path) -> CameraPair:
     warn_if_bad(b, second.verdicts)
     if (first.pupil is None) != (second.pupil is None):
         _log.warning(
-            "'%s' has an entrance pupil that moves, '%s' was calibrated without: as if from one point, a lens is right "
-            "at the boards' distance alone, and this compares what is far away",
+            "'%s' has a moving entrance pupil, '%s' was calibrated without: as a central camera it is accurate at the "
+            "boards' distance only, and distant points are compared here",
             *((b, a) if first.pupil is None else (a, b)),
         )
     judged = compare_calibrations(first, second)

@@ -83,6 +83,14 @@ def test_a_noise_level_without_a_meaning_is_refused(rng, max_noise):
         robust_pose(wild, rng, max_noise=max_noise)
 
 
+def test_a_pose_without_samples_counts_none(rng: np.random.Generator) -> None:
+    """Disparities of both signs alike: neither direction of standard stereo puts most points in front."""
+    pixels = rng.uniform([200.0, 200.0], [1400.0, 1000.0], (20, 2))
+    others = pixels + np.where(np.arange(20) % 2, 6.0, -6.0)[:, None] * [1.0, 0.0]
+    with pytest.raises(DegenerateError, match="in front of both cameras; check"):
+        robust_pose(Matches.from_cameras(REGULAR, REGULAR, pixels, others), rng, pose_type="standard")
+
+
 def test_the_same_match_again_says_nothing_more(rng):
     m, _, _ = pair(rng, 5, noise_px=0.5)
     with pytest.raises(InputError, match="5 different matches"):
