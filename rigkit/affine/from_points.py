@@ -21,7 +21,7 @@ POINTS_AROUND = 12
 MOTION_ROUNDS = 4
 
 
-def are_rough(found: Correspondences) -> bool:
+def need_alignment(found: Correspondences) -> bool:
     """Return whether the correspondences have neither directions nor affinities better than ROUGH_SIGMA_A."""
     if found.A21 is None:
         return found.directions is None

@@ -103,7 +103,7 @@ class BoardPlanes(ABC):
         return slice(start, start + 3)
 
 
-def likeliest(
+def maximum_likelihood(
     state: State,
     linearise: Callable[[State], DenseProblem],
     moved: Callable[[State, FloatArray], State],
@@ -119,7 +119,7 @@ def likeliest(
     return minimise(state, linearise, stepped, DAMPING_OF_PLANES, STOP_OF_PLANES).state
 
 
-def near_the_rest(lengths: FloatArray) -> BoolArray:
+def inliers_by_median(lengths: FloatArray) -> BoolArray:
     """Return a mask (N,) of the inliers, from the lengths (N,) of the corners' residuals and their median."""
     return np.asarray(lengths <= GROSS * max(float(np.median(lengths)) / MEDIAN_OF_RAYLEIGH, 1e-9))
 

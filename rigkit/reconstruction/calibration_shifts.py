@@ -23,7 +23,7 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
-from rigkit.reconstruction.moved_cameras import Known, moved_pairs, moved_pixels, seen_by_all
+from rigkit.reconstruction.moved_cameras import Known, moved_pairs, moved_pixels, visible_in_all
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.reconstruction.scale import metric_scale
 from rigkit.relative_pose.refinement.refine import refine_pose
@@ -84,20 +84,20 @@ def calibration_shifts(
     moves = [there, *moved_pairs(there, calibrations)]
     known = (known1, known2 or known1) if isinstance(known1, UncertainCamera) else (None, None)
     # A corner outside the field of view of any moved camera is left out for all.
-    seen = seen_by_all([(move.camera1, move.camera2) for move in moves], r.pixels1, r.pixels2)
-    again = [_again(_seen_through(r, known, move), move, seen, pose_is_known) for move in moves]
+    seen = visible_in_all([(move.camera1, move.camera2) for move in moves], r.pixels1, r.pixels2)
+    again = [_reestimated(_with_moved_pixels(r, known, move), move, seen, pose_is_known) for move in moves]
     base, *moved = (estimated for estimated, _ in again)
     return CalibrationShifts(base, tuple(moved), np.logical_and.reduce([found for _, found in again]))
 
 
-def _seen_through(r: Reconstruction, known: Known, there: PosedPair) -> Reconstruction:
+def _with_moved_pixels(r: Reconstruction, known: Known, there: PosedPair) -> Reconstruction:
     """Return the reconstruction with its pixels corrected for moved cameras, see `moved_pixels`."""
     points = r.cloud.points_mm, r.cam2_from_cam1.apply(r.cloud.points_mm)
     pixels1, pixels2 = moved_pixels((r.pixels1, r.pixels2), points, known, (there.camera1, there.camera2))
     return replace(r, pixels1=pixels1, pixels2=pixels2)
 
 
-def _again(
+def _reestimated(
     r: Reconstruction, there: PosedPair, seen: BoolArray, pose_is_known: bool
 ) -> tuple[Reconstruction, BoolArray]:
     """Estimate pose, scale and points again from the corners `seen`; return also a mask (N,) of the new points.

@@ -23,11 +23,11 @@ from rigkit.reconstruction.board_planes import (
     MIN_CORNERS_OF_BOARD,
     OUTLIER_ROUNDS,
     BoardPlanes,
-    near_the_rest,
+    inliers_by_median,
     variance_and_covariance,
 )
 from rigkit.reconstruction.coplanar_problem import CoplanarProblem, CoplanarState
-from rigkit.reconstruction.moved_cameras import Known, moved_cameras, moved_pixels, seen_by_all
+from rigkit.reconstruction.moved_cameras import Known, moved_cameras, moved_pixels, visible_in_all
 from rigkit.reconstruction.scale import board_scales_and_gradients, square_sigmas
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def coplanar_planes(
     pair = geometry.pair
     moved = moved_cameras(pair.camera1, pair.camera2, known1, known2, one=one_camera)
     cameras = [(pair.camera1, pair.camera2), *moved]
-    seen = seen_by_all(cameras, pair.captured.pixels1, pair.captured.pixels2)
+    seen = visible_in_all(cameras, pair.captured.pixels1, pair.captured.pixels2)
     matches, boards, total = _on_boards(pair.captured.select(seen), pair.boards)
     if not boards:
         raise DegenerateError(
@@ -123,7 +123,7 @@ def _without_outliers(problem: CoplanarProblem, state: CoplanarState) -> tuple[C
     """Return the problem without outliers, and its minimum."""
     for _ in range(OUTLIER_ROUNDS):
         state = problem.minimum(state)
-        near = near_the_rest(np.linalg.norm(problem.corners(state)[0], axis=1))
+        near = inliers_by_median(np.linalg.norm(problem.corners(state)[0], axis=1))
         enough = np.bincount(problem.matches.board_index[near], minlength=len(state.planes)) >= MIN_CORNERS_OF_BOARD
         if near.all() or not enough.all():
             break
@@ -151,17 +151,17 @@ class _Scale(NamedTuple):
         boards: list[Board],
         points: Points,
         noise: FloatArray,
-        motions: FloatArray,
+        point_jacobians: FloatArray,
         covariance: FloatArray,
     ) -> _Scale:
         """Return the scale from points (N, 3), their covariances for this state (N, 3, 3), their derivatives (F, N, 3)
         by the free parameters, and the covariance (F, F) of these."""
-        weighing = noise + np.einsum("fni,fg,gnj->nij", motions, covariance, motions)
+        weighing = noise + np.einsum("fni,fg,gnj->nij", point_jacobians, covariance, point_jacobians)
         found = board_scales_and_gradients(points, matches.board_index, matches.grid, boards, weighing)
         known = np.isfinite(found[0])
         scales, by_points = found[0][known], found[2][known]
         own = np.einsum("kni,nij,knj->k", by_points, noise, by_points) + (scales * square_sigmas(boards)[known]) ** 2
-        by_state = np.einsum("kni,fni->kf", by_points, motions)
+        by_state = np.einsum("kni,fni->kf", by_points, point_jacobians)
         weights = np.linalg.solve(np.diag(own) + by_state @ covariance @ by_state.T, np.ones(len(scales)))
         weights /= weights.sum()
         gradient = np.einsum("k,kni->ni", weights, by_points)
@@ -181,12 +181,14 @@ def _result(
     here, count = problem.linearise(state), len(problem.matches)
     factor, of_free = variance_and_covariance(here, count, here.jacobian.shape[1], pair_id)
     points, noise = problem.points(state)
-    noise, motions = factor * noise, problem.motions(state)
-    scale = _Scale.of(problem.matches, boards, points, noise, motions, of_free)
+    noise, point_jacobians = factor * noise, problem.point_jacobians(state)
+    scale = _Scale.of(problem.matches, boards, points, noise, point_jacobians, of_free)
     lengths, by_scale = problem.lengths(state, scale.value)
-    by_state = problem.parameter_changes(state) * lengths[:, None] + np.outer(by_scale, scale.by_state)
-    points_mm = scale.value * problem.turned_back(points)
-    by_point = scale.value * problem.turned_back(motions) + np.multiply.outer(scale.by_state, points_mm / scale.value)
+    by_state = problem.parameter_jacobian(state) * lengths[:, None] + np.outer(by_scale, scale.by_state)
+    points_mm = scale.value * problem.from_level1(points)
+    by_point = scale.value * problem.from_level1(point_jacobians) + np.multiply.outer(
+        scale.by_state, points_mm / scale.value
+    )
     moves, point_moves = [np.zeros((0, len(by_scale)))], [np.zeros((0, *points.shape))]
     residuals = here.residual[: 2 * count]
     pose, normals, _ = problem.in_camera(state)
@@ -203,10 +205,10 @@ def _result(
         shift = there.points(state)[0] - points
         lengthening = float(np.sum(scale.by_points * shift))
         moves.append((by_state @ step + lengthening * by_scale)[None])
-        shift = scale.value * problem.turned_back(shift) + lengthening * points_mm / scale.value
+        shift = scale.value * problem.from_level1(shift) + lengthening * points_mm / scale.value
         point_moves.append((shift + np.einsum("f,fni->ni", step, by_point))[None])
     of_points = np.concatenate(point_moves)
-    own = scale.value**2 * problem.turned_back(np.swapaxes(problem.turned_back(noise), 1, 2))
+    own = scale.value**2 * problem.from_level1(np.swapaxes(problem.from_level1(noise), 1, 2))
     own += (scale.sigma / scale.value) ** 2 * points_mm[:, :, None] * points_mm[:, None, :]
     shared = np.einsum("fni,fg,gnj->nij", by_point, of_free, by_point)
     return CoplanarPlanes(

@@ -16,7 +16,7 @@ from rigkit.geometry.board_pose import point_residuals
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew, unit
 from rigkit.optim.levenberg_marquardt import DenseProblem
-from rigkit.reconstruction.board_planes import likeliest
+from rigkit.reconstruction.board_planes import maximum_likelihood
 from rigkit.reconstruction.geometry import PoseTypeDecision
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.relative_pose.refinement.refine import project_to_type
@@ -139,7 +139,7 @@ class CoplanarProblem:
 
     def minimum(self, state: CoplanarState) -> CoplanarState:
         """Return the state of maximum likelihood near `state`."""
-        return likeliest(state, self.linearise, CoplanarState.moved, self.free(state))
+        return maximum_likelihood(state, self.linearise, CoplanarState.moved, self.free(state))
 
     def points(self, state: CoplanarState) -> tuple[Points, FloatArray]:
         """Return the maximum-likelihood points (N, 3) on the planes, and their covariances (N, 3, 3) for this state.
@@ -158,7 +158,7 @@ class CoplanarProblem:
         by_pixel = by_ray @ m.jacobians1
         return depth * rays, by_pixel @ spread @ np.swapaxes(by_pixel, 1, 2)
 
-    def motions(self, state: CoplanarState) -> FloatArray:
+    def point_jacobians(self, state: CoplanarState) -> FloatArray:
         """Return the derivatives (F, N, 3) of the points by the free parameters, by central differences."""
         out = []
         for one in np.eye(5 + state.planes.size)[self.free(state)]:
@@ -171,10 +171,10 @@ class CoplanarProblem:
         pose = Rigid3(state.rotation, state.t)
         size = np.linalg.norm(state.planes, axis=1)
         # m . x = 1 > 0 in front: m points away from the camera.
-        normals = self.turned_back(-state.planes / size[:, None])
+        normals = self.from_level1(-state.planes / size[:, None])
         return pose if self.frames is None else self.frames.camera_pose(pose), normals, -1.0 / size
 
-    def parameter_changes(self, state: CoplanarState) -> FloatArray:
+    def parameter_jacobian(self, state: CoplanarState) -> FloatArray:
         """Return the derivatives (6 + 6 K, F) of the `BoardPlanes` parameters at unit baseline by the free ones."""
         count = len(state.planes)
         out = np.zeros((6 + 6 * count, 5 + 3 * count))
@@ -201,6 +201,6 @@ class CoplanarProblem:
         by_scale[6:].reshape(-1, 6)[:, 3:] = offsets[:, None] * normals
         return np.where(is_length, scale, 1.0), by_scale
 
-    def turned_back(self, vectors: FloatArray) -> FloatArray:
+    def from_level1(self, vectors: FloatArray) -> FloatArray:
         """Return vectors (..., 3) of the level frame of camera 1 in the camera's frame."""
         return vectors if self.frames is None else np.asarray(vectors @ self.frames.level1_from_cam1)

@@ -121,7 +121,7 @@ def pair_geometry(
         captured = pair.captured if level_frames is None else level_frames.matches(pair.captured)
         decision = replace(decide_pose_type(captured, declared, level_sigma_rad), level_frames=level_frames)
         contradiction = () if declared is PoseType.AUTO else decision.notes
-        return _in_mm(pair, decision, _likeliest_pose(pair, decision))
+        return _in_mm(pair, decision, _maximum_likelihood_pose(pair, decision))
     except DegenerateError as error:
         # A wrong declaration is the likeliest reason of a degenerate pose.
         raise DegenerateError("; ".join((f"pair '{pair.pair_id}': {error}", *contradiction))) from error
@@ -144,7 +144,7 @@ def decide_pose_type(captured: Matches, declared: PoseType, level_sigma_rad: flo
     return PoseTypeDecision(declared, declared, level or None, evidence, notes)
 
 
-def _likeliest_pose(pair: MatchedPair, decision: PoseTypeDecision) -> RefinedPose:
+def _maximum_likelihood_pose(pair: MatchedPair, decision: PoseTypeDecision) -> RefinedPose:
     """Return the pose of maximum likelihood among the minima that the refinement reaches from several initial poses.
 
     The linear solution holds the pose type exactly. If a level is off by half a degree and the corners are good, it
@@ -180,7 +180,7 @@ def _in_mm(pair: MatchedPair, decision: PoseTypeDecision, refined: RefinedPose) 
     notes = [*pair.notes, *decision.notes]
     freedom = len(pair.captured) - POSE_FREEDOM
     scatter = float(np.sqrt(variance_factor(refined.variance_factor * freedom, freedom)))
-    pair = pair.noisier(scatter)
+    pair = pair.with_scaled_sigmas(scatter)
     level, frames = decision.level_sigma_rad, decision.level_frames
     refined = refine_pose(pair.captured, refined.cam2_from_cam1, decision.pose_type, level, level_frames=frames)
     if scatter > NOTABLE_SCATTER:

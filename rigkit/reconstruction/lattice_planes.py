@@ -27,8 +27,8 @@ from rigkit.reconstruction.board_planes import (
     MIN_CORNERS_OF_BOARD,
     OUTLIER_ROUNDS,
     BoardPlanes,
-    likeliest,
-    near_the_rest,
+    inliers_by_median,
+    maximum_likelihood,
     variance_and_covariance,
 )
 from rigkit.reconstruction.moved_cameras import Known, moved_cameras, moved_pixels
@@ -154,7 +154,7 @@ def _problem(geometry: PairGeometry, moved: list[tuple[Camera, Camera]]) -> tupl
         )
     size_sigma = np.array([(b.square_sigma_mm or 0.0) / np.sqrt(b.square_x_mm * b.square_y_mm) for b in boards])
     views = [[np.concatenate(column) for column in zip(*part, strict=True)] for part in parts]
-    one, two = (seen_corners(camera, *view) for camera, view in zip(cameras[0], views, strict=True))
+    one, two = (observed_corners(camera, *view) for camera, view in zip(cameras[0], views, strict=True))
     return LatticeProblem((views[0][0], views[1][0]), (one, two), size_sigma), boards
 
 
@@ -195,7 +195,7 @@ class LatticeProblem:
     def through(self, cameras: tuple[Camera, Camera], pixels: tuple[Pixels, Pixels]) -> LatticeProblem:
         """Return the same corners, at new pixels, for other cameras."""
         first, second = (
-            seen_corners(camera, at, c.sigma_px, c.points, c.board)
+            observed_corners(camera, at, c.sigma_px, c.points, c.board)
             for camera, at, c in zip(cameras, pixels, self.images, strict=True)
         )
         return replace(self, images=(first, second))
@@ -216,14 +216,14 @@ class LatticeProblem:
 
     def minimum(self, state: PlacedLattices) -> PlacedLattices:
         """Return the state of maximum likelihood near `state`."""
-        return likeliest(state, self.linearise, _moved, self.free)
+        return maximum_likelihood(state, self.linearise, _moved, self.free)
 
     def without_outliers(self, state: PlacedLattices) -> tuple[LatticeProblem, PlacedLattices]:
         """Return the problem without outliers, and its minimum."""
         problem = self
         for _ in range(OUTLIER_ROUNDS):
             state = problem.minimum(state)
-            near = near_the_rest(np.linalg.norm(problem.residuals(state).reshape(-1, 2), axis=1))
+            near = inliers_by_median(np.linalg.norm(problem.residuals(state).reshape(-1, 2), axis=1))
             each = np.split(near, [len(problem.pixels[0])])
             seen = zip(problem.images, each, strict=True)
             left = [np.bincount(c.board[kept], minlength=len(state[1])) for c, kept in seen]
@@ -240,7 +240,9 @@ class LatticeProblem:
         return replace(self, pixels=(pixels[0], pixels[1]), images=(images[0], images[1]))
 
 
-def seen_corners(camera: Camera, pixels: Pixels, sigma_px: FloatArray, points: Points, board: IntArray) -> BoardCorners:
+def observed_corners(
+    camera: Camera, pixels: Pixels, sigma_px: FloatArray, points: Points, board: IntArray
+) -> BoardCorners:
     """Return the corners with their rays in a camera, and the bases that whiten their residuals."""
     bases = np.linalg.pinv(camera.ray_jacobian(pixels)) / sigma_px[:, None, None]
     return BoardCorners(camera.unproject(pixels)[0], np.asarray(bases), points, board, sigma_px)

@@ -81,11 +81,11 @@ def _edges_of_depth(points: Points, normals: Normals) -> tuple[IntArray, IntArra
     rise = np.log(distance[far] / distance[near])
     edge = (rise > STEEP * angle) & (angle < MAX_STEPS * np.median(angle))
     for one, other in ((near, far), (far, near)):
-        edge &= _missed(points[one], normals[one], rays[other], distance[other]) > OPEN_RISE * rise
+        edge &= _distance_to_plane(points[one], normals[one], rays[other], distance[other]) > OPEN_RISE * rise
     return near[edge], far[edge]
 
 
-def _missed(points: Points, normals: Normals, rays: FloatArray, distance: FloatArray) -> FloatArray:
+def _distance_to_plane(points: Points, normals: Normals, rays: FloatArray, distance: FloatArray) -> FloatArray:
     """Return the distance (N,) along `rays` between planes and points, in log(distance); inf if they do not meet."""
     with np.errstate(divide="ignore", invalid="ignore"):
         there = np.sum(normals * points, axis=1) / np.sum(normals * rays, axis=1)

@@ -56,6 +56,6 @@ def moved_pixels(
     return one, two
 
 
-def seen_by_all(cameras: Sequence[tuple[Camera, Camera]], pixels1: Pixels, pixels2: Pixels) -> BoolArray:
+def visible_in_all(cameras: Sequence[tuple[Camera, Camera]], pixels1: Pixels, pixels2: Pixels) -> BoolArray:
     """Return a mask (N,) of the pixels (N, 2) of both images that have a ray in all of the cameras."""
     return np.asarray(np.all([a.unproject(pixels1)[1] & b.unproject(pixels2)[1] for a, b in cameras], axis=0))

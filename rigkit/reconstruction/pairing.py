@@ -65,7 +65,7 @@ class MatchedPair:
 
     __repr__ = brief
 
-    def noisier(self, factor: float) -> MatchedPair:
+    def with_scaled_sigmas(self, factor: float) -> MatchedPair:
         """Return the same pair with all standard deviations of corners and directions multiplied by `factor`."""
 
         def scaled(matches: Matches) -> Matches:
@@ -139,8 +139,8 @@ def _with_fixed_pupil(
     largest = max(
         (float(np.abs(new.pixels - old.pixels).max()) for new, old in zip(out, detections, strict=True)), default=0.0
     )
-    words = f"{image}: the entrance pupil of the lens moves; corners are where it would show them if it did not, "
-    return out, [f"{words}up to {largest:.1f} px away"]
+    moves = "the entrance pupil of the lens moves"
+    return out, [f"{image}: {moves}; corners were corrected to a central camera, by up to {largest:.1f} px"]
 
 
 def _matched(

@@ -135,10 +135,10 @@ def reconstruct_scene(
         notes=_notes(fit, seen, baseline_mm),
         level_sigma_rad=fit.level_sigma_rad,
     )
-    return _with_scatter(reconstruction, fit, np.flatnonzero(seen), chosen, len(seen), metric=baseline_mm is not None)
+    return _scene(reconstruction, fit, seen, chosen, metric=baseline_mm is not None)
 
 
-def with_pupils(
+def correct_moving_pupils(
     scene_of: Callable[[Correspondences], SceneReconstruction],
     correspondences: Correspondences,
     cameras: tuple[Camera, Camera],
@@ -166,8 +166,7 @@ def with_pupils(
         scene = scene_of(found)
         off = np.maximum(np.abs(pixels[0] - correspondences.pixels1), np.abs(pixels[1] - correspondences.pixels2))
         largest = float(off[scene.kept].max())
-    words = "entrance pupils move; points are where lenses that look from one point would show them, up to "
-    note = f"{words}{largest:.1f} px away"
+    note = f"entrance pupils move; points were corrected to central cameras, by up to {largest:.1f} px"
     r = scene.reconstruction
     return replace(scene, reconstruction=replace(r, notes=(note, *r.notes)))
 
@@ -184,31 +183,24 @@ def _fit(
         return known_scene_pose(matches, known_pose)
     declared = PoseType(pose_type or "general")
     fit = fit_scene_pose(matches, declared, level_sigma_rad, np.random.default_rng(seed))
-    if pose_type is not None or not (rectified and seen_as_rectified(fit.matches.select(fit.inliers))):
+    if pose_type is not None or not (rectified and support_rectified_pose(fit.matches.select(fit.inliers))):
         return fit
     exact = fit_scene_pose(fit.matches, PoseType.STANDARD, 0.0, np.random.default_rng(seed))
     return replace(exact, notes=(*exact.notes, RECTIFIED_NOTE))
 
 
-def _with_scatter(
-    reconstruction: Reconstruction,
-    fit: ScenePose,
-    seen: NDArray[np.int64],
-    chosen: NDArray[np.int64],
-    count: int,
-    *,
-    metric: bool,
+def _scene(
+    reconstruction: Reconstruction, fit: ScenePose, seen: BoolArray, chosen: NDArray[np.int64], *, metric: bool
 ) -> SceneReconstruction:
-    """Return the scene of `count` correspondences: `seen` are the indices of those with matches, `chosen` the indices
-    of the matches in the cloud."""
-    inliers = np.zeros(count, dtype=bool)
-    inliers[seen[fit.inliers]] = True
-    sigma_A = fit.matches.sigma_A
+    """Return the scene: `seen` is the mask of the correspondences with matches, `chosen` the indices of the matches in
+    the cloud."""
+    inliers, sigma_A = np.zeros(len(seen), dtype=bool), fit.matches.sigma_A
+    inliers[seen] = fit.inliers
     return SceneReconstruction(
         reconstruction,
         metric,
         inliers,
-        seen[chosen],
+        np.flatnonzero(seen)[chosen],
         float(np.median(fit.matches.sigma1_px[fit.inliers])),
         float("nan") if sigma_A is None else float(np.median(sigma_A[fit.inliers])),
     )
@@ -218,7 +210,13 @@ def _matches(
     correspondences: Correspondences, camera1: Camera, camera2: Camera, baseline_mm: float | None, pair_id: str
 ) -> tuple[Matches, BoolArray]:
     """Return the matches, and a mask of the correspondences with one. Raises InputError for unusable ones."""
-    _check(correspondences, baseline_mm, pair_id)
+    if baseline_mm is not None and not (np.isfinite(baseline_mm) and baseline_mm > 0.0):
+        raise InputError(f"'{pair_id}': the baseline must be positive, got {baseline_mm} mm")
+    if correspondences.A21 is None and correspondences.directions is None:
+        raise InputError(
+            f"'{pair_id}': the correspondences have neither affinities nor directions, without which there are no "
+            "normals; give the images too, or add columns a11, a12, a21, a22 or du1_1, dv1_1, ..."
+        )
     matches, seen = correspondences.matches(camera1, camera2)
     if len(seen) < MIN_MATCHES:
         raise InputError(
@@ -246,16 +244,6 @@ def _notes(fit: ScenePose, seen: BoolArray, baseline_mm: float | None) -> tuple[
     if baseline_mm is None:
         notes.append("no baseline is given: lengths are in baselines, not in mm")
     return tuple(notes)
-
-
-def _check(correspondences: Correspondences, baseline_mm: float | None, pair_id: str) -> None:
-    if baseline_mm is not None and not (np.isfinite(baseline_mm) and baseline_mm > 0.0):
-        raise InputError(f"'{pair_id}': the baseline must be positive, got {baseline_mm} mm")
-    if correspondences.A21 is None and correspondences.directions is None:
-        raise InputError(
-            f"'{pair_id}': the correspondences have neither affinities nor directions, without which there are no "
-            "normals; give the images too, or add columns a11, a12, a21, a22 or du1_1, dv1_1, ..."
-        )
 
 
 def _affinities(found: Correspondences, fit: ScenePose) -> Affinities:
@@ -307,10 +295,7 @@ def are_rectified(camera1: Camera, camera2: Camera) -> bool:
         return False
     tangents = []
     for camera in (camera1, camera2):
-        width, height = camera.size_px
-        at = np.stack(
-            np.meshgrid(np.linspace(0, width - 1, PIXELS_A_SIDE), np.linspace(0, height - 1, PIXELS_A_SIDE)), axis=-1
-        )
+        at = np.stack(np.meshgrid(*(np.linspace(0, n - 1, PIXELS_A_SIDE) for n in camera.size_px)), axis=-1)
         rays, seen = camera.unproject(at)
         if not (seen.all() and (rays[..., 2] > 0.0).all()):
             return False
@@ -322,7 +307,7 @@ def are_rectified(camera1: Camera, camera2: Camera) -> bool:
     return bool(np.abs(tangents[0] - tangents[1]).max() < SAME_ROW)
 
 
-def seen_as_rectified(matches: Matches) -> bool:
+def support_rectified_pose(matches: Matches) -> bool:
     """Return whether the matches support a baseline along the rows and no rotation."""
     try:
         return pose_type_evidence(matches).choice is PoseType.STANDARD

@@ -16,7 +16,7 @@ from rigkit.geometry.rotation import rotation_angle
 from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL, MEDIAN_OF_RAYLEIGH
 from rigkit.reconstruction.geometry import decide_pose_type
-from rigkit.reconstruction.moved_cameras import seen_by_all
+from rigkit.reconstruction.moved_cameras import visible_in_all
 from rigkit.relative_pose.refinement.marginal import QUANTILE, marginal_quality
 from rigkit.relative_pose.refinement.pose_problem import cauchy_weights
 from rigkit.relative_pose.refinement.refine import RefinedPose, refine_pose
@@ -75,13 +75,13 @@ class KnownPose:
         """Length of the translation."""
         return float(np.linalg.norm(self.cam2_from_cam1.translation_mm))
 
-    def open_px(self, matches: Matches) -> FloatArray:
+    def epipolar_sigma_px(self, matches: Matches) -> FloatArray:
         """Return the standard deviation (N,) px of exact matches' epipolar distances by the uncertainty of the pose and
         the cameras."""
         here = sampson_of_matches(essential_from_pose(self.cam2_from_cam1), matches)
         squares = np.zeros(len(matches))
         for camera1, camera2, pose in self.moved:
-            seen = seen_by_all([(camera1, camera2)], matches.pixels1, matches.pixels2)
+            seen = visible_in_all([(camera1, camera2)], matches.pixels1, matches.pixels2)
             there = matches.select(seen).through(camera1, camera2)
             squares[seen] += (sampson_of_matches(essential_from_pose(pose), there) - here[seen]) ** 2
         return np.sqrt(squares)
@@ -94,15 +94,15 @@ def known_scene_pose(matches: Matches, known: KnownPose) -> ScenePose:
     """
     length = known.baseline_mm
     pose = Rigid3(known.cam2_from_cam1.rotation, known.cam2_from_cam1.translation_mm / length)
-    slack = GATE * known.open_px(matches) / matches.sigma1_px
+    slack = GATE * known.epipolar_sigma_px(matches) / matches.sigma1_px
     near = np.abs(_in_sigmas(matches, pose)) < np.hypot(QUANTILE * MAX_NOISE, slack)
-    _require(near)
-    _refuse_contradiction(matches, pose, near)
+    _check_inlier_count(near)
+    _check_measured_pose(matches, pose, near)
     inliers = near
     for _ in range(SCENE_ROUNDS):
-        matches = _with_shown_noise(matches, pose, inliers)
-        inliers = near & _agreeing(matches, pose)
-        _require(inliers)
+        matches = _with_residual_noise(matches, pose, inliers)
+        inliers = near & _inliers(matches, pose)
+        _check_inlier_count(inliers)
     px = _in_sigmas(matches, pose)[inliers] * matches.sigma1_px[inliers]
     to_unit = np.repeat([1.0, 1.0 / length], 3)
     refined = RefinedPose(
@@ -118,7 +118,7 @@ def known_scene_pose(matches: Matches, known: KnownPose) -> ScenePose:
     return ScenePose(matches, refined, inliers, PoseType.GENERAL, None, ())
 
 
-def _refuse_contradiction(matches: Matches, pose: Rigid3, near: BoolArray) -> None:
+def _check_measured_pose(matches: Matches, pose: Rigid3, near: BoolArray) -> None:
     """Raise DegenerateError if another pose explains many more of the matches than the measured one."""
     try:
         other = _search(matches, PoseType.GENERAL, np.random.default_rng(0)).refined.cam2_from_cam1
@@ -175,10 +175,10 @@ def _fitted(
         pose, inliers = found.refined.cam2_from_cam1, found.inliers
     else:
         inliers = np.abs(_in_sigmas(matches, pose)) < QUANTILE * MAX_NOISE
-    _require(inliers)
+    _check_inlier_count(inliers)
     notes: list[str] = []
     for k in range(SCENE_ROUNDS):
-        matches = _with_shown_noise(matches, pose, inliers)
+        matches = _with_residual_noise(matches, pose, inliers)
         fitting = matches.select(inliers)
         if k == 0:
             check_baseline(fitting)
@@ -187,8 +187,8 @@ def _fitted(
             notes += decision.notes
         refined = refine_pose(fitting, pose, pose_type, level_sigma_rad, robust=cauchy_weights)
         pose = refined.cam2_from_cam1
-        inliers = _agreeing(matches, pose)
-        _require(inliers)
+        inliers = _inliers(matches, pose)
+        _check_inlier_count(inliers)
     if start is None:
         _a_contrario_test(matches, pose, inliers, fundamental_for(pose_type).degrees_of_freedom)
     return ScenePose(matches, refined, inliers, pose_type, level_sigma_rad, tuple(notes))
@@ -220,7 +220,7 @@ def _search(matches: Matches, kind: PoseType, rng: np.random.Generator) -> Robus
     return best[1]
 
 
-def _require(inliers: BoolArray) -> None:
+def _check_inlier_count(inliers: BoolArray) -> None:
     if inliers.sum() < MIN_MATCHES:
         raise DegenerateError(
             f"only {int(inliers.sum())} of {len(inliers)} correspondences agree with one pose; check that the images "
@@ -244,7 +244,7 @@ def _in_sigmas(matches: Matches, pose: Rigid3) -> FloatArray:
     return sampson_of_matches(essential_from_pose(pose), matches, in_sigmas=True)
 
 
-def _agreeing(matches: Matches, pose: Rigid3) -> BoolArray:
+def _inliers(matches: Matches, pose: Rigid3) -> BoolArray:
     """Return a mask of the matches that fit by their point, and by their affinity if they have one.
 
     The affinity reveals a wrong match that is close to its epipolar line by chance.
@@ -254,7 +254,7 @@ def _agreeing(matches: Matches, pose: Rigid3) -> BoolArray:
     return np.asarray(good & ~(np.nan_to_num(affinity) >= AFFINITY_GATE))
 
 
-def _with_shown_noise(matches: Matches, pose: Rigid3, inliers: BoolArray) -> Matches:
+def _with_residual_noise(matches: Matches, pose: Rigid3, inliers: BoolArray) -> Matches:
     """Return the matches with sigmas scaled to the residuals of the inliers of `pose`."""
     m = matches
     # The pose has five degrees of freedom.
@@ -264,11 +264,11 @@ def _with_shown_noise(matches: Matches, pose: Rigid3, inliers: BoolArray) -> Mat
         m,
         sigma1_px=factor * m.sigma1_px,
         sigma2_px=factor * m.sigma2_px,
-        sigma_A=None if m.A21 is None else _shown_sigma_A(m, pose, inliers),
+        sigma_A=None if m.A21 is None else _residual_sigma_A(m, pose, inliers),
     )
 
 
-def _shown_sigma_A(matches: Matches, pose: Rigid3, inliers: BoolArray) -> FloatArray:
+def _residual_sigma_A(matches: Matches, pose: Rigid3, inliers: BoolArray) -> FloatArray:
     """Return sigma_A (N,) from the residuals: equal for all, or proportional to the stated sigma_A or its square root.
 
     The likeliest is returned. A stated sigma_A contains the image noise but not the curvature of the surface.

@@ -22,7 +22,7 @@ from rigkit.reconstruction.calibration_shifts import calibration_shifts
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import fit_planes, reconstruct_from
-from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene, with_pupils
+from rigkit.reconstruction.scene import SceneReconstruction, correct_moving_pupils, reconstruct_scene
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 
 BOARDS = tuple(Board(name, 8, 6, 10.0, 10.0) for name in ("plane1", "plane2", "plane3"))
@@ -111,7 +111,7 @@ def test_points_of_a_scene_in_mm_say_what_the_pupils_do_to_them(rng: np.random.G
         def scene_of(one: Correspondences) -> SceneReconstruction:
             return reconstruct_scene(one, FISHEYE, FISHEYE, baseline_mm=baseline_mm)
 
-        scene = with_pupils(scene_of, found, (camera, camera))
+        scene = correct_moving_pupils(scene_of, found, (camera, camera))
         away = scene.reconstruction.cloud.points_mm - points[scene.kept]
         return float(np.median(np.linalg.norm(away, axis=1))), scene
 

@@ -14,7 +14,7 @@ from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrownPatches
 from rigkit.reconstruction.growing.surface import PairRays
 
 
-def without_curvature(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3) -> GrownPatches:
+def correct_curvature(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3) -> GrownPatches:
     """Return the pairs, at their nodes or `centred`, with corrected pixels in image 2."""
     planes = PairRays.of(grown, camera1, camera2).planes(cam2_from_cam1)
     at = grown.valid & np.isfinite(planes[..., 0])

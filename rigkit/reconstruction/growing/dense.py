@@ -22,21 +22,27 @@ from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, log_so3, rotation_angle, unit
+from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
 from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
-from rigkit.reconstruction.growing.curvature import without_curvature
-from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_in_both_directions
-from rigkit.reconstruction.growing.propagate import kept, propagated
+from rigkit.reconstruction.growing.curvature import correct_curvature
+from rigkit.reconstruction.growing.grow import (
+    EpipolarConstraint,
+    GrowingView,
+    GrownPatches,
+    grow,
+    grow_in_both_directions,
+)
+from rigkit.reconstruction.growing.propagate import kept, propagate_planes
 from rigkit.reconstruction.growing.surface import WINDOW_AREA_PX, GrownSurface, PairRays, fit_surface
-from rigkit.reconstruction.growing.sweep import filled
+from rigkit.reconstruction.growing.sweep import fill_by_sweep
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_lens_errors
-from rigkit.reconstruction.moved_cameras import Calibrations, moved_pairs, seen_by_all
+from rigkit.reconstruction.moved_cameras import Calibrations, moved_pairs, visible_in_all
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
 from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, NO_DISTANCE, SceneReconstruction, in_unit
 from rigkit.reconstruction.scene_pose import GATE, KnownPose, fit_scene_pose, known_scene_pose
 from rigkit.relative_pose.refinement.residuals import point_terms
-from rigkit.relative_pose.solvers.pose import essential_from_pose, translation_basis
+from rigkit.relative_pose.solvers.pose import essential_from_pose, pose_directions, translation_basis
 from rigkit.relative_pose.solvers.weights import affinity_residuals
 
 POSE_STEP = 8
@@ -130,27 +136,27 @@ def grow_scene(
     fixed = KnownPose(r.cam2_from_cam1, moved=tuple(moved)) if pose_is_known else None
     even = _pose_from_grown(view1, view2, agreeing, sparse, fixed)
     pose, covariance = in_unit(even.pose.cam2_from_cam1, even.pose.covariance, r.baseline_mm)
-    known = _knowledge(even.matches, pose)
+    known = _epipolar_constraint(even.matches, pose)
     step = max(CLOUD_STEP, round(float(np.sqrt(np.prod(view1.size_px) / CLOUD_NODES))))
     grown = grow_in_both_directions(view1, view2, agreeing, step=step, known=known).centred()
-    grown = without_curvature(grown, r.camera1, r.camera2, pose)
+    grown = correct_curvature(grown, r.camera1, r.camera2, pose)
     if not len(grown):
         raise DegenerateError(
             f"no surface grows from {len(agreeing)} correspondences; check that the images are sharp and "
             "show surfaces with texture"
         )
-    grown, sweep = filled(grown, PairRays.of(grown, r.camera1, r.camera2).measured(pose), view1, view2, pose)
+    grown, sweep = fill_by_sweep(grown, PairRays.of(grown, r.camera1, r.camera2).measured(pose), view1, view2, pose)
     rays = PairRays.of(grown, r.camera1, r.camera2)
     measured = rays.measured(pose)
     surface = fit_surface(measured, step, even.pose.epipolar_rms_px)
     if sweep is not None:
         surface = surface.where(kept(surface, grown, measured.slope, sweep, view1))
-        surface, grown = propagated(surface, grown, measured.slope, sweep, view1, view2, pose)
+        surface, grown = propagate_planes(surface, grown, measured.slope, sweep, view1, view2, pose)
         rays = PairRays.of(grown, r.camera1, r.camera2)
-    by_pose = _moved_planes(rays, pose, covariance)
-    moves = _moves(even, r, moved, pose_is_known=pose_is_known)
+    by_pose = _planes_by_pose(rays, pose, covariance)
+    moves = _moved_by_calibration(even, r, moved, pose_is_known=pose_is_known)
     covariance = covariance + sum((np.outer(m.change, m.change) for m in moves), np.zeros((6, 6)))
-    cloud, nodes, of_calibrations = _cloud(grown, surface, by_pose, _planes_of_moves(rays, pose, moves), image1)
+    cloud, nodes, of_calibrations = _cloud(grown, surface, by_pose, _planes_by_calibration(rays, pose, moves), image1)
     cloud = replace(cloud, calibration_in_sigmas=calibrations is not None)
     scene = _scene(sparse, grown, cloud, nodes, known, pose, covariance)
     return DenseScene(scene=scene, grown=grown, surface=surface, nodes=nodes, of_calibrations=of_calibrations)
@@ -161,7 +167,7 @@ def _scene(
     grown: GrownPatches,
     cloud: OrientedCloud,
     nodes: NDArray[np.int64],
-    known: LineKnowledge,
+    known: EpipolarConstraint,
     pose: Rigid3,
     covariance: FloatArray,
 ) -> SceneReconstruction:
@@ -188,7 +194,7 @@ def _scene(
     return SceneReconstruction(dense, sparse.metric, inliers, chosen, known.sigma_px, known.sigma_A)
 
 
-class _EvenPose(NamedTuple):
+class _PoseOfPairs(NamedTuple):
     """A pose, and the evenly spread pairs that gave it."""
 
     pose: SystematicPose
@@ -201,16 +207,16 @@ def _pose_from_grown(
     seeds: Correspondences,
     sparse: SceneReconstruction,
     fixed: KnownPose | None,
-) -> _EvenPose:
+) -> _PoseOfPairs:
     """Return the pose of evenly spread pairs, which are grown again until it converges, or the `fixed` pose."""
     r = sparse.reconstruction
     pose = Rigid3(r.cam2_from_cam1.rotation, unit(r.cam2_from_cam1.translation_mm))
     cameras = view1.camera, view2.camera
     gate = max(MAX_DISTANCE_PX, GATE * sparse.sigma_px)
     for k in range(MAX_GROWTHS):
-        known = LineKnowledge(essential_from_pose(pose), gate)
+        known = EpipolarConstraint(essential_from_pose(pose), gate)
         grown = grow(view1, view2, seeds, step=POSE_STEP, known=known).centred()
-        pairs = without_curvature(grown, view1.camera, view2.camera, pose).correspondences()
+        pairs = correct_curvature(grown, view1.camera, view2.camera, pose).correspondences()
         matches, _ = pairs.matches(view1.camera, view2.camera)
         if len(matches) < MIN_GROWN:
             raise DegenerateError(
@@ -222,10 +228,10 @@ def _pose_from_grown(
             # The pose is kept; this measures the lens errors across epipolar lines, which also act along them.
             there = kept.refined.cam2_from_cam1
             found = pose_with_lens_errors(even, cameras, there, PoseType.STANDARD, None, WINDOW_OVERLAP)
-            return _EvenPose(replace(found, cam2_from_cam1=there, covariance=kept.refined.covariance), even)
+            return _PoseOfPairs(replace(found, cam2_from_cam1=there, covariance=kept.refined.covariance), even)
         # Without a level the type is exact.
         level = r.level_sigma_rad or 0.0
-        fit = fit_scene_pose(_floored(matches), r.pose_type, level, np.random.default_rng(0), start=pose)
+        fit = fit_scene_pose(_with_sigma_floor(matches), r.pose_type, level, np.random.default_rng(0), start=pose)
         even = fit.matches.select(fit.inliers)
         found = pose_with_lens_errors(
             even, cameras, fit.refined.cam2_from_cam1, fit.pose_type, fit.level_sigma_rad, WINDOW_OVERLAP
@@ -236,10 +242,10 @@ def _pose_from_grown(
         gate = MAX_DISTANCE_PX
         if max(turn, swing) < MOVED_RAD or k == MAX_GROWTHS - 1:
             break
-    return _EvenPose(found, even)
+    return _PoseOfPairs(found, even)
 
 
-def _floored(matches: Matches) -> Matches:
+def _with_sigma_floor(matches: Matches) -> Matches:
     """Return the matches with SHARED_ERROR added to their sigmas, which the images do not show."""
     sigma = np.hypot(matches.sigma1_px, SHARED_ERROR * np.median(matches.sigma1_px))
     return replace(matches, sigma1_px=sigma, sigma2_px=sigma)
@@ -249,21 +255,20 @@ def _distances(matches: Matches, pose: Rigid3) -> FloatArray:
     return sampson_of_matches(essential_from_pose(pose), matches)
 
 
-def _knowledge(matches: Matches, pose: Rigid3) -> LineKnowledge:
+def _epipolar_constraint(matches: Matches, pose: Rigid3) -> EpipolarConstraint:
     """Return the epipolar constraint of the pose, with sigmas from the residuals of its pairs."""
     # Sampson's distance moves both pixels; growing moves only that in image 2.
     sigma = np.sqrt(2.0) * SIGMA_OF_MEDIAN * float(np.median(np.abs(_distances(matches, pose))))
     sigma_A = SIGMA_OF_MEDIAN * float(np.nanmedian(np.abs(affinity_residuals(matches, essential_from_pose(pose)))))
-    return LineKnowledge(essential_from_pose(pose), max(MAX_DISTANCE_PX, GATE * sigma), sigma, sigma_A)
+    return EpipolarConstraint(essential_from_pose(pose), max(MAX_DISTANCE_PX, GATE * sigma), sigma, sigma_A)
 
 
-def _moved_planes(rays: PairRays, pose: Rigid3, covariance: FloatArray) -> FloatArray:
+def _planes_by_pose(rays: PairRays, pose: Rigid3, covariance: FloatArray) -> FloatArray:
     """Return the change (R, C, 3, K) of the nodes' own planes by one standard deviation of the pose along each of the K
     principal axes of its covariance that are not exact."""
     length = float(np.linalg.norm(pose.translation_mm))
     t = pose.translation_mm / length
-    directions = np.zeros((5, 6))
-    directions[:3, :3], directions[3:, 3:] = np.eye(3), translation_basis(t)
+    directions = pose_directions(t)
     to_five = directions / np.array([1.0, 1.0, 1.0, length, length, length])
     variances, axes = np.linalg.eigh(to_five @ covariance @ to_five.T)
     moves = np.flatnonzero(variances > EXACT * variances[-1])
@@ -281,7 +286,7 @@ def _moved_planes(rays: PairRays, pose: Rigid3, covariance: FloatArray) -> Float
     return changes
 
 
-class _Moved(NamedTuple):
+class _MovedCameras(NamedTuple):
     """Cameras moved by one standard deviation along an axis of their covariance, and the resulting change (6,) of the
     pose: left rotation perturbation, rad, and translation."""
 
@@ -289,37 +294,35 @@ class _Moved(NamedTuple):
     change: FloatArray
 
 
-def _moves(even: _EvenPose, r: Reconstruction, moved: list[PosedPair], *, pose_is_known: bool) -> list[_Moved]:
+def _moved_by_calibration(
+    even: _PoseOfPairs, r: Reconstruction, moved: list[PosedPair], *, pose_is_known: bool
+) -> list[_MovedCameras]:
     """Return the moved cameras with the change of the pose: that of `moved` if it is known, else by the same pairs."""
     here, out = r.cam2_from_cam1, []
     for camera1, camera2, there in moved:
-        if pose_is_known:
-            turn = log_so3(there.rotation @ here.rotation.T)
-            change = np.concatenate([turn, there.translation_mm - here.translation_mm])
-        else:
-            change = _change_of_pose(even, r, (camera1, camera2))
-        out.append(_Moved((camera1, camera2), change))
+        cameras = camera1, camera2
+        change = there.step_from(here) if pose_is_known else _change_of_pose(even, r, cameras)
+        out.append(_MovedCameras(cameras, change))
     return out
 
 
-def _change_of_pose(even: _EvenPose, r: Reconstruction, cameras: tuple[Camera, Camera]) -> FloatArray:
+def _change_of_pose(even: _PoseOfPairs, r: Reconstruction, cameras: tuple[Camera, Camera]) -> FloatArray:
     """Return the change (6,) of the pose of the same pairs with other cameras."""
     pose, m = even.pose.cam2_from_cam1, even.matches
     t = pose.translation_mm
-    seen = np.flatnonzero(seen_by_all([cameras], m.pixels1, m.pixels2))
+    seen = np.flatnonzero(visible_in_all([cameras], m.pixels1, m.pixels2))
     here = m.select(seen)
     there = here.through(*cameras)
     before, after = (point_terms(each, pose.rotation, t, translation_basis(t))[0] for each in (here, there))
     return np.asarray(np.repeat([1.0, r.baseline_mm], 3) * (even.pose.by_distance[:, seen] @ (after - before)))
 
 
-def _planes_of_moves(rays: PairRays, pose: Rigid3, moves: list[_Moved]) -> FloatArray:
+def _planes_by_calibration(rays: PairRays, pose: Rigid3, moves: list[_MovedCameras]) -> FloatArray:
     """Return the change (R, C, 3, M) of the nodes' own planes by each move."""
     planes = np.zeros((*rays.grown.valid.shape, 3, len(moves)))
     here = rays.planes(pose) if moves else planes
     for k, (cameras, change) in enumerate(moves):
-        there = Rigid3(exp_so3(change[:3]) @ pose.rotation, pose.translation_mm + change[3:])
-        planes[..., k] = PairRays.of(rays.grown, *cameras).planes(there) - here
+        planes[..., k] = PairRays.of(rays.grown, *cameras).planes(pose.moved(change)) - here
     return planes
 
 

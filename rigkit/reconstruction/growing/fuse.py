@@ -200,35 +200,34 @@ def _merge(earlier: _MergedSurface, later: _MergedSurface) -> None:
     np.add.at(earlier.weights, into, 1.0 / variance)
     largest = later.common_sums[left] * later.variance[left]
     np.add.at(earlier.common_sums, into, largest / variance)
-    np.add.at(earlier.normal_weights, into, later.normal_weights[left])
-    np.add.at(earlier.normal_sums, into, later.normal_sums[left])
-    np.add.at(earlier.colour_sums, into, later.colour_sums[left])
-    np.add.at(earlier.counts, into, later.counts[left])
+    for name in ("normal_weights", "normal_sums", "colour_sums", "counts"):
+        np.add.at(getattr(earlier, name), into, getattr(later, name)[left])
     later.keep[left] = False
 
 
 def _fused(surfaces: Sequence[_MergedSurface], order: Sequence[int]) -> FusedCloud:
-    def joined(of: Sequence[FloatArray]) -> FloatArray:
-        return np.concatenate([values[s.keep] for values, s in zip(of, surfaces, strict=True)])
+    def joined(name: str) -> FloatArray:
+        return np.concatenate([getattr(s, name)[s.keep] for s in surfaces])
 
-    weights, counts = joined([s.weights for s in surfaces]), np.concatenate([s.counts[s.keep] for s in surfaces])
+    weights, counts, normals = (
+        joined("weights"),
+        np.concatenate([s.counts[s.keep] for s in surfaces]),
+        joined("normals"),
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        move = np.where(weights > 0.0, joined([s.offsets for s in surfaces]) / weights, 0.0)
-        shrink = np.sqrt(1.0 / weights / joined([s.variance for s in surfaces]))
-        common = np.nan_to_num(joined([s.common_sums for s in surfaces]) / weights)
-    normals = joined([s.normals for s in surfaces])
-    sigma = joined([s.sigma for s in surfaces]) * np.nan_to_num(shrink, nan=1.0)
+        move = np.where(weights > 0.0, joined("offsets") / weights, 0.0)
+        shrink = np.sqrt(1.0 / weights / joined("variance"))
+        common = np.nan_to_num(joined("common_sums") / weights)
+    sigma = joined("sigma") * np.nan_to_num(shrink, nan=1.0)
     count = len(counts)
     cloud = OrientedCloud(
-        points_mm=joined([s.points for s in surfaces]) + move[:, None] * normals,
-        normals=unit(joined([s.normal_sums for s in surfaces])),
-        colours=np.rint(joined([s.colour_sums for s in surfaces]) / counts[:, None]).astype(np.uint8),
+        points_mm=joined("points") + move[:, None] * normals,
+        normals=unit(joined("normal_sums")),
+        colours=np.rint(joined("colour_sums") / counts[:, None]).astype(np.uint8),
         board_index=np.full(count, -1),
         grid=np.zeros((count, 2), dtype=np.int64),
         sigma_mm=np.hypot(sigma, common),
-        normal_sigma_rad=np.sqrt(
-            1.0 / joined([s.normal_weights for s in surfaces]) + joined([s.common_rad for s in surfaces]) ** 2
-        ),
+        normal_sigma_rad=np.sqrt(1.0 / joined("normal_weights") + joined("common_rad") ** 2),
         board_ids=(),
         calibration_in_sigmas=all(s.posed.cloud.calibration_in_sigmas for s in surfaces),
     )

@@ -71,7 +71,7 @@ class GrowingView:
 
 
 @dataclass(frozen=True, slots=True)
-class LineKnowledge:
+class EpipolarConstraint:
     """The epipolar constraint on pairs.
 
     Attributes
@@ -87,7 +87,7 @@ class LineKnowledge:
     sigma_px: float = np.inf
     sigma_A: float = np.inf
 
-    def swapped(self) -> LineKnowledge:
+    def swapped(self) -> EpipolarConstraint:
         """Return the constraint for the images in reverse order."""
         return replace(self, E21=self.E21.T)
 
@@ -174,7 +174,7 @@ def grow(
     seeds: Correspondences,
     *,
     step: int,
-    known: LineKnowledge | None = None,
+    known: EpipolarConstraint | None = None,
     settled_px: float = GROWN_SETTLED_PX,
     wanted: BoolArray | None = None,
 ) -> GrownPatches:
@@ -187,7 +187,7 @@ def grow(
     rays, seen = view1.camera.unproject(at)
     rays = np.where((seen if wanted is None else seen & wanted)[..., None], rays, np.nan)
     jacobians = view1.camera.ray_jacobian(at)
-    line = known if known is not None else LineKnowledge(np.zeros((3, 3)), np.inf)
+    line = known if known is not None else EpipolarConstraint(np.zeros((3, 3)), np.inf)
     knowledge = EpipolarKnowledge.make(
         view2.rays,
         RAY_SPACING_PX,
@@ -221,7 +221,7 @@ def grow(
 
 
 def grow_in_both_directions(
-    view1: GrowingView, view2: GrowingView, seeds: Correspondences, *, step: int, known: LineKnowledge
+    view1: GrowingView, view2: GrowingView, seeds: Correspondences, *, step: int, known: EpipolarConstraint
 ) -> GrownPatches:
     """Return the pairs that grow from `seeds` and lead back to their nodes when grown from image 2.
 

@@ -16,7 +16,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches
 from rigkit.reconstruction.growing.surface import GrownSurface
-from rigkit.reconstruction.growing.sweep import Sweep, with_pairs
+from rigkit.reconstruction.growing.sweep import Sweep, replace_pairs
 
 REACHES = (1, 2, 4)
 """Distances, in nodes, of the neighbours in eight directions: up to the reach of a plane's fit."""
@@ -41,7 +41,7 @@ def kept(surface: GrownSurface, grown: GrownPatches, slope: FloatArray, sweep: S
     return out
 
 
-def propagated(
+def propagate_planes(
     surface: GrownSurface,
     grown: GrownPatches,
     slope: FloatArray,
@@ -63,7 +63,7 @@ def propagated(
     fresh = surface.valid.ravel()
     for _ in range(PROPAGATION_ROUNDS):
         holes = np.flatnonzero(seen & ~np.isfinite(plane[..., 0]))
-        around = _around(holes, seen.shape)
+        around = _neighbours(holes, seen.shape)
         # Only holes close to planes of the last round can change.
         near = (fresh[around] & (around >= 0)).any(axis=1)
         holes, around = holes[near], around[near]
@@ -85,7 +85,7 @@ def propagated(
     frame = np.concatenate([rays[new][:, None], np.swapaxes(view1.camera.ray_jacobian(nodes[new]), 1, 2)], axis=1)
     z = np.einsum("nij,nj->ni", frame, plane[new])
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", rays[new], covariance[new], rays[new]))
-    grown = with_pairs(grown, new, z, sigma, view1, view2, cam2_from_cam1)
+    grown = replace_pairs(grown, new, z, sigma, view1, view2, cam2_from_cam1)
     new &= grown.valid
     known = surface.valid | new
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -95,7 +95,7 @@ def propagated(
     return whole.where(known), grown
 
 
-def _around(nodes: IntArray, shape: tuple[int, ...]) -> IntArray:
+def _neighbours(nodes: IntArray, shape: tuple[int, ...]) -> IntArray:
     """Return the row-major indices (M, K) of the nodes around each of M; -1 outside of the grid."""
     row, column = (index[:, None] + OFFSETS[:, k] for k, index in enumerate(np.unravel_index(nodes, shape)))
     inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
@@ -118,11 +118,13 @@ def _best(
     planes, slopes = plane.reshape(-1, 3)[around], slope.reshape(-1)[around]
     inverse = np.einsum("mki,mi->mk", planes, rays)
     known = (around >= 0) & (inverse > 0.0)
-    of_rivals = np.full(known.shape, np.inf)
+    cost_over_rivals = np.full(known.shape, np.inf)
     which, _ = np.nonzero(known)
-    of_rivals[known] = sweep.of_rivals(pixels1[which], planes[known], slopes[known])
-    best = of_rivals.argmin(axis=1)[:, None]
-    least, here, slope_here = (np.take_along_axis(values, best, axis=1) for values in (of_rivals, inverse, slopes))
+    cost_over_rivals[known] = sweep.cost_over_rivals(pixels1[which], planes[known], slopes[known])
+    best = cost_over_rivals.argmin(axis=1)[:, None]
+    least, here, slope_here = (
+        np.take_along_axis(values, best, axis=1) for values in (cost_over_rivals, inverse, slopes)
+    )
     off = np.where(known, inverse - here, np.inf)
     same = np.abs(off) * slope_here < SAME_PLANE_PX
     agree = same.mean(axis=1)

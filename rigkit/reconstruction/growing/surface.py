@@ -135,7 +135,7 @@ class PairRays:
         to_z = np.zeros((len(z), 3, 6))
         with np.errstate(divide="ignore", invalid="ignore"):
             to_z[:, 0, 0:2] = to_z[:, 1, 2::2] = to_z[:, 2, 3::2] = along / slope[:, None]
-        covariance = to_z @ (self.grown.covariance[self.grown.valid] + self._unexplained()) @ np.swapaxes(to_z, 1, 2)
+        covariance = to_z @ (self.grown.covariance[self.grown.valid] + self._model_error()) @ np.swapaxes(to_z, 1, 2)
         good &= np.isfinite(covariance).all(axis=(1, 2))
         return NodeMeasurements(
             z=self._spread(z, good),
@@ -145,7 +145,7 @@ class PairRays:
             swept=self.grown.swept,
         )
 
-    def _unexplained(self) -> FloatArray:
+    def _model_error(self) -> FloatArray:
         """Return the covariance (K, 6, 6) of patches' errors that do not decrease with texture, as noise does.
 
         Without it patches with strong texture contradict each other, and hardly any plane has support.

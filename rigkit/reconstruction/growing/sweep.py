@@ -116,9 +116,9 @@ class Sweep:
         `slope` (N,) is the derivative, in px along the epipolar line, by the inverse range, `support` as in
         `GrownSurface`.
         """
-        return np.asarray(self.of_rivals(pixels1, plane, slope) < MAX_OF_RIVAL * support)
+        return np.asarray(self.cost_over_rivals(pixels1, plane, slope) < MAX_OF_RIVAL * support)
 
-    def of_rivals(self, pixels1: Pixels, plane: FloatArray, slope: FloatArray) -> FloatArray:
+    def cost_over_rivals(self, pixels1: Pixels, plane: FloatArray, slope: FloatArray) -> FloatArray:
         """Return the cost (N,) of each plane over the least of any parallel plane; see `distinct` for the arguments.
 
         Infinite for planes far from the sweep's own surface; 1 if the sweep cannot distinguish them.
@@ -154,7 +154,7 @@ class Sweep:
         return out
 
 
-def filled(
+def fill_by_sweep(
     grown: GrownPatches, measured: NodeMeasurements, view1: GrowingView, view2: GrowingView, cam2_from_cam1: Rigid3
 ) -> tuple[GrownPatches, Sweep | None]:
     """Return the pairs, completed by those of a sweep at nodes where none grew, and the sweep.
@@ -164,13 +164,17 @@ def filled(
     """
     if not np.isfinite(measured.z).any():
         return grown, None
-    sweep = _swept(grown, measured, view1, view2, cam2_from_cam1)
+    sweep = _sweep(grown, measured, view1, view2, cam2_from_cam1)
     best, around = swept_surfaces(
         sweep.costs, len(sweep.inverse), sweep.samples1, bend=CURVATURE_COST, jump=JUMP_COST, even=EVEN_LEVELS
     )
     level, good = _winners(best, around, sweep, view2, cam2_from_cam1)
     sweep = replace(sweep, winners=level, seen=good)
-    good = good & (_at(_contrast(view1), sweep.pixels1) > MIN_SWEPT_CONTRAST) & (_at(_lit(view1), sweep.pixels1) == 1.0)
+    good = (
+        good
+        & (_at(_contrast(view1), sweep.pixels1) > MIN_SWEPT_CONTRAST)
+        & (_at(_image_circle(view1), sweep.pixels1) == 1.0)
+    )
     spacing = sweep.inverse[1] - sweep.inverse[0]
     at_nodes = (measured.z[..., 0] - sweep.inverse[0]) / spacing
     of_grown = np.full(level.shape, np.nan)
@@ -183,10 +187,10 @@ def filled(
     at = sweep.nearest(grown.pixels1)
     grown = grown.where(grown.valid & (sweep.near_winner(at_nodes, at, measured.slope) | ~good[at]))
     inverse = np.where(good, sweep.inverse[0] + spacing * level, np.nan)[::SAMPLES_A_NODE, ::SAMPLES_A_NODE]
-    return _with(grown, inverse, residual * spacing, view1, view2, cam2_from_cam1), sweep
+    return _with_swept_pairs(grown, inverse, residual * spacing, view1, view2, cam2_from_cam1), sweep
 
 
-def _swept(
+def _sweep(
     grown: GrownPatches, measured: NodeMeasurements, view1: GrowingView, view2: GrowingView, cam2_from_cam1: Rigid3
 ) -> Sweep:
     inverse = measured.z[..., 0]
@@ -244,7 +248,7 @@ def _contrast(view: GrowingView) -> NDArray[np.float32]:
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)), np.float32)
 
 
-def _lit(view: GrowingView) -> NDArray[np.float32]:
+def _image_circle(view: GrowingView) -> NDArray[np.float32]:
     """Return 1 inside the image circle of the lens and 0 in the dark border around it."""
     dark = np.asarray(view.grey) <= UNLIT_LEVELS
     _, label = cv2.connectedComponents(dark.astype(np.uint8))
@@ -272,7 +276,7 @@ def _winners(
         inside &= ((place >= 0.0) & (place <= np.array([width - 1, height - 1]))).all(axis=-1)
     place = np.where(inside[..., None], place, 0.0)
     cost = np.where(inside, around[..., 0], np.iinfo(np.int32).max)
-    return level, inside & _foremost(place, best, cost, sweep.step_px, view2)
+    return level, inside & _unoccluded(place, best, cost, sweep.step_px, view2)
 
 
 def _reliable(sweep: Sweep, good: BoolArray, grown: FloatArray) -> BoolArray:
@@ -299,11 +303,11 @@ def _reliable(sweep: Sweep, good: BoolArray, grown: FloatArray) -> BoolArray:
     size, agreed = np.bincount(label), np.bincount(label, weights=agrees.ravel()) > 0.0
     reliable = size >= SMALLEST
     alone = np.flatnonzero((reliable & ~agreed & (size < LARGE))[label])
-    reliable &= agreed | (size >= LARGE) | (_of_shifted(sweep, alone, label[alone], len(size)) < MAX_OF_SHIFTED)
+    reliable &= agreed | (size >= LARGE) | (_cost_over_shifted(sweep, alone, label[alone], len(size)) < MAX_OF_SHIFTED)
     return np.asarray(good & reliable[label].reshape(level.shape))
 
 
-def _of_shifted(sweep: Sweep, samples: IntArray, label: IntArray, count: int) -> FloatArray:
+def _cost_over_shifted(sweep: Sweep, samples: IntArray, label: IntArray, count: int) -> FloatArray:
     """Return the cost (count,) of each surface over its least cost at other ranges; NaN for those without samples.
 
     `samples` (M,) are indices of samples, `label` (M,) their surfaces. Ranges with half of a surface beyond the sweep
@@ -326,7 +330,7 @@ def _of_shifted(sweep: Sweep, samples: IntArray, label: IntArray, count: int) ->
         return np.asarray(mean(0) / np.min([mean(shift) for shift in others], axis=0), np.float64)
 
 
-def _foremost(
+def _unoccluded(
     place: Pixels, best: NDArray[np.int32], cost: NDArray[np.int32], step_px: float, view2: GrowingView
 ) -> BoolArray:
     """Return a mask (R, C) of the samples that agree with the one of least cost at the same pixel of image 2."""
@@ -339,7 +343,7 @@ def _foremost(
     return np.asarray(np.abs(claimed[cell].reshape(best.shape) - best) <= 1)
 
 
-def _with(
+def _with_swept_pairs(
     grown: GrownPatches,
     inverse: FloatArray,
     sigma: float,
@@ -351,10 +355,10 @@ def _with(
     at = np.isfinite(inverse) & (inverse > 0.0) & ~grown.valid
     # The gradient is unknown: assume a surface that faces the camera.
     z = np.pad(inverse[at][:, None], ((0, 0), (0, 2)))
-    return with_pairs(grown, at, z, np.full(len(z), sigma), view1, view2, cam2_from_cam1)
+    return replace_pairs(grown, at, z, np.full(len(z), sigma), view1, view2, cam2_from_cam1)
 
 
-def with_pairs(
+def replace_pairs(
     grown: GrownPatches,
     at: BoolArray,
     z: FloatArray,

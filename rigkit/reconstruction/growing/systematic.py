@@ -24,7 +24,7 @@ from rigkit.geometry.sampson import epipolar_normals
 from rigkit.reconstruction.growing.lens_errors import ErrorModes, error_modes
 from rigkit.relative_pose.refinement.pose_problem import cauchy_weights
 from rigkit.relative_pose.refinement.residuals import level_terms, point_terms
-from rigkit.relative_pose.solvers.pose import free_directions, translation_basis
+from rigkit.relative_pose.solvers.pose import free_directions, pose_directions
 
 AMPLITUDES_PX = np.geomspace(0.003, 1.0, 9)
 """Grid of the RMS amplitude of a family of lens errors over the image."""
@@ -81,10 +81,10 @@ def pose_with_lens_errors(
     )
     rows_of_lenses, families = _lens_rows(matches, lenses, R, t)
     count = len(free)
-    basis = translation_basis(t)
     # If the pose is fixed, the weights do not change: one step.
     for _ in range(LENS_STEPS if count else 1):
-        basis = translation_basis(t)
+        to_five = pose_directions(t)
+        basis = to_five[3:, 3:]
         r, J = point_terms(matches, R, t, basis)
         weight = cauchy_weights(r) / overlap
         rows = np.concatenate([J[:, free], rows_of_lenses], axis=1)
@@ -98,9 +98,7 @@ def pose_with_lens_errors(
         change[free] = found.mean
         R, t = exp_so3(change[:3]) @ R, unit(t + change[3:] @ basis)
     covariance = found.covariance + _of_frames(lenses, found.variances, R, t, basis)[np.ix_(free, free)]
-    to_six = np.zeros((6, 5))
-    to_six[:3, :3], to_six[3:, 3:] = np.eye(3), basis.T
-    spread = to_six[:, free]
+    spread = to_five[free].T
     by_row = -found.inverse @ (rows * weight[:, None]).T
     # Sampson's distance moves both pixels.
     in_px = np.sqrt(2.0) * matches.sigma1_px[:, None] * rows_of_lenses

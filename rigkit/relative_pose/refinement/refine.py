@@ -24,7 +24,7 @@ from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.relative_pose.refinement.pose_problem import PoseMinimum, PoseProblem, RobustWeights
 from rigkit.relative_pose.refinement.residuals import whitened_affinities
 from rigkit.relative_pose.solvers.planar_ambiguity import ambiguous_poses, compare_poses
-from rigkit.relative_pose.solvers.pose import cheirality_margin, choose_pose, essential_from_pose, translation_basis
+from rigkit.relative_pose.solvers.pose import cheirality_margin, choose_pose, essential_from_pose, pose_directions
 from rigkit.relative_pose.solvers.registry import fundamental_for
 from rigkit.relative_pose.solvers.weights import MIN_SIGMA_A, WeightRule, estimate_sigma_A, usable_affinities
 
@@ -138,13 +138,13 @@ def estimate_pose(
             failure = failure or error
     if not ends:
         raise failure or DegenerateError("no pose found")
-    best = min(ends, key=lambda end: _visible_cost(matches, end))
+    best = min(ends, key=lambda end: _cost_with_cheirality(matches, end))
     if flat:
         _refuse_ambiguity(matches, best, ends)
     return best
 
 
-def _visible_cost(matches: Matches, end: RefinedPose) -> float:
+def _cost_with_cheirality(matches: Matches, end: RefinedPose) -> float:
     """Return the cost plus that of moving the points behind a camera to infinity."""
     return end.cost + float(np.sum(end.weights * cheirality_margin(matches, end.cam2_from_cam1) ** 2))
 
@@ -162,12 +162,12 @@ def _refuse_ambiguity(matches: Matches, best: RefinedPose, ends: list[RefinedPos
 
 def rules_out(matches: Matches, better: RefinedPose, worse: RefinedPose) -> bool:
     """Return whether the cost of the worse pose is significantly higher than that of the better one."""
-    chance = _chance_difference(matches, better.cam2_from_cam1, worse.cam2_from_cam1)
-    difference = _visible_cost(matches, worse) - _visible_cost(matches, better)
+    chance = _cost_difference_sigma(matches, better.cam2_from_cam1, worse.cam2_from_cam1)
+    difference = _cost_with_cheirality(matches, worse) - _cost_with_cheirality(matches, better)
     return difference >= SIGNIFICANT * max(better.variance_factor, 1.0) * chance
 
 
-def _chance_difference(matches: Matches, first: Rigid3, second: Rigid3) -> float:
+def _cost_difference_sigma(matches: Matches, first: Rigid3, second: Rigid3) -> float:
     """Return the standard deviation of the difference of two poses' costs that noise alone would cause.
 
     A residual is the noise across an epipolar line, whose direction depends on the pose. For two standard normal
@@ -223,10 +223,7 @@ def _result(problem: PoseProblem, end: PoseMinimum) -> RefinedPose:
             "the matches do not determine the pose (all on one plane in a critical position, or no baseline); "
             "add points off that plane or declare the pose type"
         )
-    to_six = np.zeros((6, 5))
-    to_six[:3, :3] = np.eye(3)
-    to_six[3:, 3:] = translation_basis(end.t).T
-    spread = to_six[:, problem.free()]
+    spread = pose_directions(end.t)[problem.free()].T
     covariance = spread @ np.linalg.inv(gram) @ spread.T if freedom else np.zeros((6, 6))
     data, n = r[: len(r) - end.priors], len(matches)
     pose = Rigid3(end.R, end.t)

@@ -63,13 +63,13 @@ def affinity_terms(
     dg = np.swapaxes(A, -1, -2) @ dn2 + dn1
     variance = m.sigma_A**2 * np.sum(n2**2, axis=1) + pixel_share(m, skew(t) @ R)
     variance = np.where(variance > 0.0, variance, np.inf)
-    along = m.sigma_A[:, None] ** 2 * np.sum(n2[:, :, None] * dn2, axis=1) + _half_slope(m, R, t, basis)
+    along = m.sigma_A[:, None] ** 2 * np.sum(n2[:, :, None] * dn2, axis=1) + _half_pixel_share_jacobian(m, R, t, basis)
     along /= variance[:, None]
     scale = 1.0 / np.sqrt(variance)
     return g * scale[:, None], (dg - g[:, :, None] * along[:, None, :]) * scale[:, None, None], which
 
 
-def _half_slope(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray) -> FloatArray:
+def _half_pixel_share_jacobian(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray) -> FloatArray:
     """Return half the derivative (K, 5) of `pixel_share`, which is a sum of squares of M = B2^T E B1 and A^T M."""
     m = matches
     assert m.A21 is not None

@@ -22,7 +22,7 @@ from rigkit.geometry.rotation import rotation_angle, unit
 from rigkit.relative_pose.refinement.noise_level import POSE_FREEDOM, variance_factor
 from rigkit.relative_pose.refinement.refine import RefinedPose, estimate_pose, refine_pose
 from rigkit.relative_pose.refinement.residuals import level_terms
-from rigkit.relative_pose.solvers.pose import translation_basis
+from rigkit.relative_pose.solvers.pose import pose_directions
 
 DEFAULT_LEVEL_RAD = float(np.radians(0.2))
 """Default sigma of the level: that of a carefully set spirit level on a tripod."""
@@ -143,10 +143,8 @@ def _fits(matches: Matches, level: float) -> dict[PoseType, RefinedPose]:
 def _level_parts(fit: RefinedPose, kind: PoseType) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return deviations (K,), their Jacobian (K, 5), and the covariance (5, 5) of the pose."""
     pose = fit.cam2_from_cam1
-    basis = translation_basis(pose.translation_mm)
-    values, jacobian = level_terms(kind, pose.rotation, pose.translation_mm, basis)
-    to_five = np.zeros((5, 6))
-    to_five[:3, :3], to_five[3:, 3:] = np.eye(3), basis
+    to_five = pose_directions(pose.translation_mm)
+    values, jacobian = level_terms(kind, pose.rotation, pose.translation_mm, to_five[3:, 3:])
     return values, jacobian, to_five @ fit.covariance @ to_five.T
 
 

@@ -17,7 +17,7 @@ from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import cross, nearest_rotation, rotation_angle, skew, unit
 from rigkit.relative_pose.solvers.estimate import check_baseline, transfer_error
-from rigkit.relative_pose.solvers.pose import parallax_noise
+from rigkit.relative_pose.solvers.pose import parallax_sigma
 from rigkit.relative_pose.solvers.rows import right_singular
 from rigkit.relative_pose.solvers.weights import RowWeights
 
@@ -145,7 +145,7 @@ def other_ambiguous_poses(matches: Matches, among: BoolArray, noise: float, pose
     if np.count_nonzero(among) < MIN_PLANE_POINTS:
         return ()
     rays1, f2, t = matches.rays1[among], matches.rays2[among], pose.translation_mm
-    across, sigma = cross(t, f2), noise * parallax_noise(matches)[among]
+    across, sigma = cross(t, f2), noise * parallax_sigma(matches)[among]
     reach = np.sqrt(np.sum(across**2, axis=1))
     parallax = np.sum(cross(f2, rays1 @ pose.rotation.T) * unit(across), axis=1) / sigma
     still = np.abs(parallax) < AT_REST_SIGMAS

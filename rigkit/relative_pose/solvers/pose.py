@@ -95,10 +95,10 @@ def cheirality_margin(matches: Matches, cam2_from_cam1: Rigid3) -> FloatArray:
     range1, range2, defined = ray_ranges(matches.rays1, matches.rays2, cam2_from_cam1)
     behind = defined & ((range1 < 0.0) | (range2 < 0.0))
     parallax = np.linalg.norm(cross(matches.rays2, matches.rays1 @ cam2_from_cam1.rotation.T), axis=1)
-    return np.asarray(np.divide(parallax, parallax_noise(matches), out=np.zeros(len(matches)), where=behind))
+    return np.asarray(np.divide(parallax, parallax_sigma(matches), out=np.zeros(len(matches)), where=behind))
 
 
-def parallax_noise(matches: Matches) -> FloatArray:
+def parallax_sigma(matches: Matches) -> FloatArray:
     """Return the standard deviation (N,), rad, of the angle between the rays of each match in a fixed direction."""
     size1, size2 = px_angles(matches)
     return np.asarray(np.hypot(matches.sigma1_px * size1, matches.sigma2_px * size2))
@@ -119,6 +119,13 @@ def translation_basis(direction: FloatArray) -> FloatArray:
     across = np.stack([t[..., 2], np.zeros(t.shape[:-1]), -t[..., 0]], axis=-1)
     first = np.where(size > 1e-9, across / np.maximum(size, 1e-9), [1.0, 0.0, 0.0])
     return np.stack([first, cross(t, first)], axis=-2)
+
+
+def pose_directions(translation: FloatArray) -> FloatArray:
+    """Return the five perturbations (w, b) of a pose of unit baseline, rows (5, 6) of (rotation, translation)."""
+    out = np.zeros((5, 6))
+    out[:3, :3], out[3:, 3:] = np.eye(3), translation_basis(translation)
+    return out
 
 
 def free_directions(pose_type: PoseType | str) -> IntArray:

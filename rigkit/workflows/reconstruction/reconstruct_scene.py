@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import TILTS, match_affine_features
-from rigkit.affine.from_points import are_rough, with_affinities
+from rigkit.affine.from_points import need_alignment, with_affinities
 from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import NearCamera, far_camera
@@ -31,7 +31,7 @@ from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
 from rigkit.reconstruction.growing.dense import grow_scene
 from rigkit.reconstruction.moved_cameras import Calibrations, moved_pairs
-from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene, with_pupils
+from rigkit.reconstruction.scene import SceneReconstruction, correct_moving_pupils, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.pages.cloud_page import build_cloud_page
 from rigkit.report.pictures.figures import as_png, cloud_figure, epipolar_figure
@@ -292,16 +292,16 @@ def _sparse(
 
     if options.correspondences:
         found = read_correspondences(options.correspondences, [path.name for path in options.images or ()])
-        if images and are_rough(found):
+        if images and need_alignment(found):
             found = with_affinities(found, *images)
-        return with_pupils(scene_of, found, cameras), found
+        return correct_moving_pupils(scene_of, found, cameras), found
     assert images is not None
     for k, tilts in enumerate((None, TILTS)):
         progress("matching affine features", 0, 1)
         found = match_affine_features(*images, tilts=tilts)
         progress("matching affine features", 1, 1)
         try:
-            return with_pupils(scene_of, found, cameras), found
+            return correct_moving_pupils(scene_of, found, cameras), found
         except DegenerateError as error:
             if not k:
                 continue

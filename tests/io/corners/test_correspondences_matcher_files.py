@@ -11,7 +11,7 @@ from helpers.textured_scene import Corner
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import match_affine_features
-from rigkit.affine.from_points import are_rough, with_affinities
+from rigkit.affine.from_points import need_alignment, with_affinities
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
@@ -44,7 +44,7 @@ def test_arrays_of_matchers(tmp_path: Path, points: tuple[np.ndarray, np.ndarray
         found = read_correspondences(tmp_path / f"{name}.npz")
         np.testing.assert_allclose(found.pixels1, first[expected[:, 0]])
         np.testing.assert_allclose(found.pixels2, second[expected[:, 1]])
-        assert are_rough(found)
+        assert need_alignment(found)
 
 
 def test_frames_give_affinities(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -56,7 +56,7 @@ def test_frames_give_affinities(tmp_path: Path, rng: np.random.Generator) -> Non
     assert found.A21 is not None
     np.testing.assert_allclose(found.A21, A21, atol=1e-9)
     np.testing.assert_allclose(found.pixels2, second[..., 2])
-    assert are_rough(found)
+    assert need_alignment(found)
 
 
 def database(path: Path, first: np.ndarray, second: np.ndarray, pairs: np.ndarray) -> None:
@@ -128,7 +128,7 @@ def test_bare_points_get_their_affinities_from_the_images() -> None:
     expected, seen = camera.project(poses[1].apply(corner.surface(camera, found.pixels1)[0]))
     assert seen.all()
     assert np.median(np.linalg.norm(found.pixels2 - expected, axis=1)) < 0.1
-    assert not are_rough(found)
+    assert not need_alignment(found)
     flat = [np.full_like(image, 90) for image in images]
     with pytest.raises(DegenerateError, match="could be aligned"):
         with_affinities(Correspondences(known.pixels1, rough), *flat)

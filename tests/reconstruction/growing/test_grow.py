@@ -18,7 +18,7 @@ from rigkit.core.progress import silent
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, log_so3
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
-from rigkit.reconstruction.growing.grow import GrowingView, LineKnowledge, grow, grow_in_both_directions
+from rigkit.reconstruction.growing.grow import EpipolarConstraint, GrowingView, grow, grow_in_both_directions
 from rigkit.reconstruction.growing.surface import PairRays
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
@@ -136,7 +136,7 @@ def test_no_place_of_image_2_is_grown_from_two_places_of_image_1() -> None:
     seeds = Correspondences(
         np.array([[65.0, 75.0], [225.0, 75.0]]), np.full((2, 2), [215.0, 75.0]), np.broadcast_to(np.eye(2), (2, 2, 2))
     )
-    anywhere = LineKnowledge(np.zeros((3, 3)), np.inf)
+    anywhere = EpipolarConstraint(np.zeros((3, 3)), np.inf)
     twice = grow(*views, seeds, step=3, known=anywhere)
     once = grow_in_both_directions(*views, seeds, step=3, known=anywhere)
     assert len(twice) > 1000

@@ -68,18 +68,18 @@ def test_filled_points_have_pairs_normals_and_sigmas_as_others_have(
 
 def test_nothing_is_filled_where_no_pixels_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     plane, slope = np.full((9, 9, 3), [0.0, 0.0, 0.001]), np.ones((9, 9))
-    around = propagate._around(np.array([40]), (9, 9))
+    around = propagate._neighbours(np.array([40]), (9, 9))
     assert around.shape == (1, 24) and (around >= 0).all()
-    assert (propagate._around(np.array([0]), (9, 9)) < 0).sum() == 15
+    assert (propagate._neighbours(np.array([0]), (9, 9)) < 0).sum() == 15
 
     class AllAlike:
-        def of_rivals(self, *_: Any) -> np.ndarray:
+        def cost_over_rivals(self, *_: Any) -> np.ndarray:
             return np.full(24, 2.0)
 
     rays, pixels = np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 2))
     alike: Any = AllAlike()
     assert propagate._best(alike, pixels, rays, plane, slope, around).source.tolist() == [-1]
-    monkeypatch.setattr(AllAlike, "of_rivals", lambda *_: np.where(np.arange(24) == 7, 0.5, 2.0))
+    monkeypatch.setattr(AllAlike, "cost_over_rivals", lambda *_: np.where(np.arange(24) == 7, 0.5, 2.0))
     best = propagate._best(alike, pixels, rays, plane, slope, around)
     assert best.source.tolist() == [around[0, 7]]
     assert best.agree.tolist() == [1.0] and best.scatter.tolist() == [0.0]

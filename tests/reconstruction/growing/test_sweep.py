@@ -18,9 +18,9 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.sweep import swept_costs, swept_surfaces
 from rigkit.reconstruction.growing import sweep as sweep_module
 from rigkit.reconstruction.growing.dense import grow_scene
-from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow_in_both_directions
+from rigkit.reconstruction.growing.grow import EpipolarConstraint, GrowingView, GrownPatches, grow_in_both_directions
 from rigkit.reconstruction.growing.surface import NodeMeasurements, PairRays
-from rigkit.reconstruction.growing.sweep import filled
+from rigkit.reconstruction.growing.sweep import fill_by_sweep
 from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.relative_pose.solvers.pose import essential_from_pose
@@ -48,7 +48,7 @@ def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, tuple[Gr
     near = [camera.project(CAM2_FROM_CAM1.apply(corner.surface(camera, pixels + d)[0]))[0] for d in np.eye(2)]
     A21 = np.stack([each - pixels2 for each in near], axis=-1)
     seeds = Correspondences(pixels, pixels2, A21, None, None, None).select(seen)
-    known = LineKnowledge(essential_from_pose(CAM2_FROM_CAM1), 0.7, 0.1, 0.01)
+    known = EpipolarConstraint(essential_from_pose(CAM2_FROM_CAM1), 0.7, 0.1, 0.01)
     grown = grow_in_both_directions(view1, view2, seeds, step=STEP, known=known).centred()
     keep = np.ones(grown.valid.shape, dtype=bool)
     keep[HOLE] = False
@@ -60,7 +60,7 @@ def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, tuple[Gr
 @pytest.mark.parametrize("lens", SMALL_LENSES)
 def test_gaps_between_patches_are_filled_to_the_stated_accuracy(lens: str) -> None:
     grown, measured, views, corner = grown_with_hole(lens)
-    done, _ = filled(grown, measured, *views, CAM2_FROM_CAM1)
+    done, _ = fill_by_sweep(grown, measured, *views, CAM2_FROM_CAM1)
     # Only beside the seams of the walls the sweep contradicts patches.
     assert (done.swept & grown.valid).sum() < 0.005 * grown.valid.sum()
     kept = grown.valid & ~done.swept
@@ -90,7 +90,7 @@ def test_pairs_that_the_sweep_contradicts_give_way_to_its_own() -> None:
     # By three pixels along the epipolar line.
     z = measured.z.copy()
     z[wrong, 0] += 3.0 / measured.slope[wrong]
-    done, sweep = filled(grown, replace(measured, z=z), *views, CAM2_FROM_CAM1)
+    done, sweep = fill_by_sweep(grown, replace(measured, z=z), *views, CAM2_FROM_CAM1)
     assert wrong.sum() > 200 and sweep is not None
     assert done.swept[wrong].mean() > 0.95
     expected, _ = SMALL_LENSES["pinhole"].project(
@@ -108,7 +108,7 @@ def test_pairs_that_the_sweep_contradicts_give_way_to_its_own() -> None:
 
 def test_nothing_is_filled_where_there_is_no_texture() -> None:
     grown, measured, views, _ = grown_with_hole("pinhole")
-    done, _ = filled(grown, measured, *views, CAM2_FROM_CAM1)
+    done, _ = fill_by_sweep(grown, measured, *views, CAM2_FROM_CAM1)
     rows, columns = (np.arange(n) * STEP for n in done.valid.shape)
     inside = np.zeros(done.valid.shape, dtype=bool)
     v, u = FLAT
@@ -123,7 +123,7 @@ def test_a_sweep_that_contradicts_the_patches_is_not_believed() -> None:
     grown, measured, (view1, view2), _ = grown_with_hole("pinhole")
     unrelated = np.random.default_rng(1).uniform(0.0, 255.0, view2.grey.shape)
     other = replace(view2, grey=unrelated.astype(np.uint8))
-    done, sweep = filled(grown, measured, view1, other, CAM2_FROM_CAM1)
+    done, sweep = fill_by_sweep(grown, measured, view1, other, CAM2_FROM_CAM1)
     assert done is grown
     assert sweep is None
 
@@ -134,7 +134,7 @@ def test_a_wall_at_one_range_is_swept_without_a_fault() -> None:
     same = measured.z.copy()
     same[..., 0] = np.where(np.isfinite(same[..., 0]), np.nanmedian(same[..., 0]), np.nan)
     with np.errstate(all="raise", under="ignore"):
-        done, _ = filled(grown, replace(measured, z=same), *views, CAM2_FROM_CAM1)
+        done, _ = fill_by_sweep(grown, replace(measured, z=same), *views, CAM2_FROM_CAM1)
     assert done.valid.sum() >= grown.valid.sum()
 
 
@@ -230,5 +230,5 @@ def test_no_light_falls_around_the_circle_of_a_fisheye_but_does_on_its_dark_spot
     spot = np.hypot(u - 180.0, v - 100.0) < 12.0
     rng = np.random.default_rng(3)
     image = np.where(around | spot, 0.0, 120.0) + rng.uniform(0.0, 5.0, around.shape)
-    lit = sweep_module._lit(GrowingView.of(image.astype(np.uint8), SMALL_LENSES["fisheye"]))
+    lit = sweep_module._image_circle(GrowingView.of(image.astype(np.uint8), SMALL_LENSES["fisheye"]))
     np.testing.assert_array_equal(lit == 0.0, around)
