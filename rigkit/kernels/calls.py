@@ -198,6 +198,13 @@ def structure(name: str) -> Any:
     return fill
 
 
+def make_struct(name: str, **members: Any) -> Struct:
+    """Return the structure `name` of api.h, which needs no class of its own, with its members; see `Struct.of`."""
+    if name not in STRUCTURES:
+        structure(name)(type(name, (Struct,), {}))
+    return STRUCTURES[name].of(**members)
+
+
 def _ctype(one: Declaration) -> Any:
     """Return the type of ctypes for a member, parameter or result."""
     if one.array is not None or (one.pointer and one.type in SCALARS) or one.type in ("int32_t", "uint8_t"):

@@ -8,17 +8,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, Coordinates, FloatArray, Projected
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
-
-
-@structure("brown_points_t")
-class _BrownPoints(Struct):
-    """Points in the camera frame and a camera with Brown's distortion."""
-
-
-@structure("radial_points_t")
-class _RadialPoints(Struct):
-    """Points in the camera frame and a radially symmetric camera."""
+from rigkit.kernels.calls import make_struct
 
 
 def brown_pixels(
@@ -34,7 +24,7 @@ def brown_pixels(
     """
     camera = {"parameters": _of_twelve(parameters), "rational": int(parameters.size > 9), "max_r": max_r}
     kernel = kernels().differentiate_brown
-    return _written(kernel, _BrownPoints, points, d_pixels_d_point, d_pixels_d_parameters, camera)
+    return _written(kernel, "brown_points_t", points, d_pixels_d_point, d_pixels_d_parameters, camera)
 
 
 def brown_places(
@@ -72,12 +62,12 @@ def radial_pixels(
     camera: dict[str, Any] = {"polynomial": np.array(polynomial)}
     camera |= zip(("l00", "l01", "l11", "cx", "cy", "max_angle", "max_radius"), (*linear, *limits), strict=True)
     kernel = getattr(kernels(), f"differentiate_{model}")
-    return _written(kernel, _RadialPoints, points, d_pixels_d_point, d_pixels_d_parameters, camera)
+    return _written(kernel, "radial_points_t", points, d_pixels_d_point, d_pixels_d_parameters, camera)
 
 
 def _written(
     kernel: Any,
-    struct: type[Struct],
+    structure: str,
     points: Coordinates,
     d_pixels_d_point: FloatArray | None,
     d_pixels_d_parameters: FloatArray | None,
@@ -88,7 +78,7 @@ def _written(
     x, y, z = points
     wanted = d_pixels_d_point, d_pixels_d_parameters
     written = [_memory(out, count) for out in wanted]
-    at = struct.of(x=x, y=y, z=z, axes=written[0].shape[1], rows=written[1].shape[1], **camera)
+    at = make_struct(structure, x=x, y=y, z=z, axes=written[0].shape[1], rows=written[1].shape[1], **camera)
     projected: Projected = kernel(at, *written)
     for out, memory in zip(wanted, written, strict=True):
         if out is not None and out is not memory:

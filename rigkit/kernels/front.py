@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.calls import Struct, make_struct, structure
 from rigkit.kernels.declarations import header
 
 _CONSTANTS = header().constants
@@ -47,11 +47,6 @@ class LinkRules(Struct):
 @structure("image_t")
 class ImageOf(Struct):
     """An image of brightness, float32."""
-
-
-@structure("corners_t")
-class _CornerArrays(Struct):
-    """The corners to be linked."""
 
 
 def has_mosaic(image: GreyImage, step: int, min_level: float, share: float) -> bool:
@@ -179,8 +174,14 @@ def links(
     neighbours, `reach` (N,) the largest distance from the edge at which brightness is read.
     """
     min_contrast, max_contrast = bounds
-    given = _CornerArrays.of(
-        pixels=pixels, lines=lines, contrast=contrast, min_contrast=min_contrast, max_contrast=max_contrast, reach=reach
+    given = make_struct(
+        "corners_t",
+        pixels=pixels,
+        lines=lines,
+        contrast=contrast,
+        min_contrast=min_contrast,
+        max_contrast=max_contrast,
+        reach=reach,
     )
     done, both = kernels().find_links(given, ImageOf.of(brightness=image), scale, offset, rules)
     if not done:

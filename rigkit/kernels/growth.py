@@ -8,7 +8,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.calls import Struct, make_struct, structure
 from rigkit.kernels.front import ImageOf, RingRules
 
 
@@ -25,16 +25,6 @@ class GrowthRules(Struct):
     def make(cls, predictions: Sequence[FitRules], ring: RingRules, along: np.ndarray, **numbers: float) -> GrowthRules:
         """Return the rules; `along` are the positions along an edge that are tested."""
         return cls.of(predictions=(FitRules * 2)(*predictions), ring=ring, along=along, **numbers)
-
-
-@structure("pyramid_level_t")
-class _PyramidLevel(Struct):
-    """The image level from which brightness is read."""
-
-
-@structure("sheet_t")
-class _Sheet(Struct):
-    """A lattice within empty cells."""
 
 
 @structure("squares_t")
@@ -71,8 +61,10 @@ def grown(
 
     Returns the number of remaining rings when the lattice reaches the border of its arrays, -1 if no more can be added.
     """
-    sheet = _Sheet.of(pixels=pixels, contrast=contrast, due=np.ones((2, *contrast.shape), np.uint8), sign=sign)
-    level = _PyramidLevel.of(image=ImageOf.of(brightness=image), scale=scale, offset=offset)
+    sheet = make_struct(
+        "sheet_t", pixels=pixels, contrast=contrast, due=np.ones((2, *contrast.shape), np.uint8), sign=sign
+    )
+    level = make_struct("pyramid_level_t", image=ImageOf.of(brightness=image), scale=scale, offset=offset)
     return int(kernels().grow_lattice(sheet, level, saddles, rules, rings))
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.calls import Struct, make_struct, structure
 
 
 @structure("board_views_t")
@@ -22,11 +22,6 @@ class BoardViews(Struct):
         (exclusive)."""
         placed: tuple[FloatArray, FloatArray] = kernels().place_corners(self, first, (stop - first) * self.corners)
         return placed
-
-
-@structure("view_sums_t")
-class _ViewSumsStruct(Struct):
-    """The memory to which the kernel writes."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -44,7 +39,7 @@ class ViewSums:
     products: FloatArray
     own: FloatArray
     poses: FloatArray
-    _struct: _ViewSumsStruct = field(repr=False)
+    _struct: Struct = field(repr=False)
 
     @classmethod
     def of(cls, seen: BoardViews, across: int) -> ViewSums:
@@ -58,7 +53,7 @@ class ViewSums:
             "own": np.zeros((r, 3, across + 3)),
             "poses": np.zeros((v, r, 3, 6)),
         }
-        return cls(seen=seen, **arrays, _struct=_ViewSumsStruct.of(**arrays))
+        return cls(seen=seen, **arrays, _struct=make_struct("view_sums_t", **arrays))
 
     def add(
         self,
@@ -71,11 +66,6 @@ class ViewSums:
         """Add the views from `first` on, with N corners in total: `d_pixels_d_point` (2, 3, N), `d_pixels_d_parameters`
         (2, P, N), the values of `Camera.derivatives`, and the `lever` arms (3, N)."""
         kernels().add_views(self.seen, first, d_pixels_d_point, d_pixels_d_parameters, *projected, lever, self._struct)
-
-
-@structure("normal_equations_t")
-class _BlockSystem(Struct):
-    """Blocks of the normal equations."""
 
 
 def schur_step(
@@ -91,7 +81,7 @@ def schur_step(
     gg, gp, pp : (G, G), (V, G, 6) and (V, 6, 6) of J^T W J: globals, globals with poses, poses.
     g, p : (G,) and (V, 6) of J^T W r.
     """
-    normal = _BlockSystem.of(gg=gg, gp=gp, pp=pp, g=g, p=p)
+    normal = make_struct("normal_equations_t", gg=gg, gp=gp, pp=pp, g=g, p=p)
     positive_definite, step_g, step_p, predicted = kernels().solve_schur(normal, damping)
     return (step_g, step_p, float(predicted[0])) if positive_definite else None
 

@@ -6,12 +6,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
-
-
-@structure("increasing_t")
-class _Increasing(Struct):
-    """The functions, a table of initial values, and the range of the inverses."""
+from rigkit.kernels.calls import make_struct
 
 
 def inverses(
@@ -32,7 +27,8 @@ def inverses(
     target : (N,) arguments of the `table` (cells + 1,) of initial x, which is uniform between the two `values`.
     """
     linear, factor, offset = parts
-    functions = _Increasing.of(
+    functions = make_struct(
+        "increasing_t",
         polynomial=polynomial,
         linear=linear,
         factor=factor,

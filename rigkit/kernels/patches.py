@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import Affines, FloatArray, Mat3, Pixels
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.calls import Struct, make_struct, structure
 from rigkit.kernels.declarations import header
 from rigkit.kernels.front import ImageOf
 
@@ -55,11 +55,6 @@ class EpipolarKnowledge(Struct):
             sigma_A=sigma_A,
             max_distance=max_distance,
         )
-
-
-@structure("patch_grid_t")
-class _Grid(Struct):
-    """The nodes over which patches grow."""
 
 
 class PatchTable(NamedTuple):
@@ -109,6 +104,6 @@ def grown(
 ) -> PatchTable:
     """Return the patches (R * C,) grown from `seeds` (S, 8) over the nodes of rays (R, C, 3), `step` pixels apart."""
     out = np.empty((*rays1.shape[:2], PATCH_COLUMNS))
-    grid = _Grid.of(rays1=rays1, jacobians1=jacobians1, out=out, step=step, max_tries=max_tries)
+    grid = make_struct("patch_grid_t", rays1=rays1, jacobians1=jacobians1, out=out, step=step, max_tries=max_tries)
     kernels().grow_patches(first, second, epipolar, rules, grid, seeds)
     return _table(out.reshape(-1, PATCH_COLUMNS))

@@ -6,12 +6,7 @@ from typing import NamedTuple
 
 from rigkit.core.arrays import FloatArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
-
-
-@structure("plane_grid_t")
-class _PlaneGrid(Struct):
-    """The measurements at the nodes, and parameters of the fits."""
+from rigkit.kernels.calls import make_struct
 
 
 class PlaneFits(NamedTuple):
@@ -33,5 +28,7 @@ def fitted_planes(
     its predicted values. A neighbour at the Mahalanobis distance s from a plane has the weight 1 / (1 + s^2 / (3
     turn^2))^2 (Geman and McClure), in the first round with the uncertainty of the node's own plane added.
     """
-    grid = _PlaneGrid.of(values=values, information=information, frames=frames, reach=reach, rounds=rounds, turn=turn)
+    grid = make_struct(
+        "plane_grid_t", values=values, information=information, frames=frames, reach=reach, rounds=rounds, turn=turn
+    )
     return PlaneFits(*kernels().fit_planes(grid))

@@ -13,15 +13,10 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray, Mat3
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.calls import make_struct
 from rigkit.kernels.declarations import header
 
 NO_MEMORY = header().constants["NO_MEMORY"]
-
-
-@structure("pose_problem_t")
-class _Problem(Struct):
-    """Data and parameters of the maximum likelihood pose."""
 
 
 def residuals(packed: FloatArray, E21: Mat3) -> FloatArray:
@@ -65,7 +60,8 @@ def minimise(
     `affine` (25, K) are the affinities of the matches `which` (K,), see pose_minimum.c; `loss` is its number (0 none, 1
     Cauchy, 2 marginal) and its scale; `free` are the indices of the free parameters.
     """
-    problem = _Problem.of(
+    problem = make_struct(
+        "pose_problem_t",
         packed=packed,
         affine=affine,
         point_weights=point_weights,

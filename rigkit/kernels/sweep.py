@@ -7,27 +7,12 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import FloatArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.calls import make_struct
 from rigkit.kernels.declarations import header
 from rigkit.kernels.front import ImageOf
 
 CENSUS_BITS: int = header().constants["CENSUS_BITS"]
 """Bits of a sample's census: whether each of its neighbours in 5 x 5 samples is darker."""
-
-
-@structure("sweep_t")
-class _SweptRanges(Struct):
-    """Samples of image 1, and their positions in image 2 at each range."""
-
-
-@structure("surface_rules_t")
-class _SurfaceRules(Struct):
-    """Costs of changes of level along a surface."""
-
-
-@structure("claims_t")
-class _Claims(Struct):
-    """Surfaces at some samples, and parameters of their neighbourhoods."""
 
 
 def swept_costs(
@@ -39,7 +24,7 @@ def swept_costs(
     half of the bits count as different. K' is K padded to whole vectors, with levels of high cost.
     """
     rows, columns = samples1.shape
-    sweep = _SweptRanges.of(table=table, spacing=spacing, rows=rows, columns=columns)
+    sweep = make_struct("sweep_t", table=table, spacing=spacing, rows=rows, columns=columns)
     return np.asarray(kernels().sweep_costs(sweep, ImageOf.of(brightness=image2), samples1))
 
 
@@ -52,7 +37,7 @@ def swept_surfaces(
     must be below 120.
     """
     rows, columns = samples1.shape
-    rules = _SurfaceRules.of(rows=rows, columns=columns, levels=levels, bend=bend, jump=jump, even=even)
+    rules = make_struct("surface_rules_t", rows=rows, columns=columns, levels=levels, bend=bend, jump=jump, even=even)
     total = kernels().sweep_surfaces(rules, costs, samples1)
     winners: tuple[NDArray[np.int32], NDArray[np.int32]] = kernels().sweep_winners(rules, total)
     return winners
@@ -77,7 +62,8 @@ def swept_rivals(
     smallest difference in levels of another surface.
     """
     rows, columns = samples1.shape
-    claims = _Claims.of(
+    claims = make_struct(
+        "claims_t",
         samples=np.ascontiguousarray(samples, np.int32),
         surfaces=np.ascontiguousarray(surfaces, np.float32),
         rows=rows,

@@ -7,7 +7,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.calls import Struct, make_struct, structure
 from rigkit.kernels.declarations import header
 from rigkit.kernels.edges import FactorRules
 from rigkit.kernels.surface import SURFACE_COLUMNS
@@ -28,11 +28,6 @@ class TagsOfBoard(Struct):
     """The properties of a board of tags."""
 
 
-@structure("tag_fit_t")
-class _TagFit(Struct):
-    """The fit of a board of tags in an image."""
-
-
 class TagBoardFit:
     """The fit of the N corners of a board of tags in an image.
 
@@ -48,7 +43,8 @@ class TagBoardFit:
         self.corners = np.full((count, CORNER_COLUMNS), np.nan)
         self.corners[:, :2] = pixels.reshape(-1, 2)
         self._numbers, self._base = np.zeros(TAG_NUMBERS), np.empty((count, SURFACE_COLUMNS))
-        self._fit = _TagFit.of(
+        self._fit = make_struct(
+            "tag_fit_t",
             board=tags,
             rules=rules,
             grey=image,

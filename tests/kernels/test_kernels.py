@@ -16,12 +16,11 @@ import rigkit.kernels as package
 from rigkit.core.errors import InstallationError
 from rigkit.kernels import kernels
 from rigkit.kernels.building import library_name, mismatch
-from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.calls import Struct, make_struct, structure
 from rigkit.kernels.declarations import header, parsed
 from rigkit.kernels.front import ImageOf
 from rigkit.kernels.growth import FitRules
-from rigkit.kernels.patches import PATCH_COLUMNS, _Grid
-from rigkit.kernels.planes import _PlaneGrid
+from rigkit.kernels.patches import PATCH_COLUMNS
 from rigkit.kernels.pose import qualities
 
 
@@ -125,7 +124,7 @@ def test_a_structure_keeps_the_copies_that_it_points_to() -> None:
     whole = np.arange(8.0)[None, :, None].repeat(3, axis=2)
     matrices = np.zeros((1, 4, 3, 3))
     fit = {"reach": 1, "rounds": 1, "turn": 1.0}
-    grid = _PlaneGrid.of(values=whole[:, ::2], information=matrices, frames=matrices, **fit)
+    grid = make_struct("plane_grid_t", values=whole[:, ::2], information=matrices, frames=matrices, **fit)
     others = [np.full((1, 4, 3), 7.0) for _ in range(50)]
     read = np.ctypeslib.as_array((ctypes.c_double * 12).from_address(grid.values)).reshape(1, 4, 3)
     np.testing.assert_array_equal(read, whole[:, ::2])
@@ -135,13 +134,13 @@ def test_a_structure_keeps_the_copies_that_it_points_to() -> None:
 def test_a_structure_with_a_member_of_any_name_does_not_keep_itself() -> None:
     rays = np.ones((2, 6, 3))[:, ::2]
     out, slopes = np.empty((2, 3, PATCH_COLUMNS)), np.ones((2, 3, 3, 2))
-    grid = _Grid.of(rays1=rays, jacobians1=slopes, out=out, step=1, max_tries=1)
+    grid = make_struct("patch_grid_t", rays1=rays, jacobians1=slopes, out=out, step=1, max_tries=1)
     assert grid._kept["out"] is out and all(kept is not grid for kept in grid._kept.values())
 
 
 def test_sizes_are_read_from_arrays_and_scratch_is_made() -> None:
     rays, slopes, out = np.ones((2, 5, 3)), np.ones((2, 5, 3, 2)), np.ones((2, 5, PATCH_COLUMNS))
-    grid = _Grid.of(rays1=rays, jacobians1=slopes, out=out, step=1, max_tries=1)
+    grid = make_struct("patch_grid_t", rays1=rays, jacobians1=slopes, out=out, step=1, max_tries=1)
     assert (grid.rows, grid.columns) == (2, 5)
     assert (grid._kept["heap"].shape, grid._kept["heap"].dtype) == ((2, 5), np.int32)
     with pytest.raises(TypeError, match=r"qualities: 'packed' is float64 \(18,\), wants \(18, count\)"):
