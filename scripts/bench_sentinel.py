@@ -63,7 +63,7 @@ from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
 from rigkit.validation.sentinel.change_aim import informative_views
-from rigkit.validation.sentinel.epipolar import check_scene
+from rigkit.validation.sentinel.epipolar import check_matches, matches_of_scenes
 from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_of
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import monitored_camera, monitored_rig
@@ -187,7 +187,7 @@ def one_camera(name: str, seeds: int, noise_px: float) -> None:
                 BEST.setdefault(how, []).extend(most[what])
 
 
-def departing(name: str, seeds: int, noise_px: float) -> None:
+def with_model_inadequacy(name: str, seeds: int, noise_px: float) -> None:
     """A lens that departs from its model, unchanged and with a longer focal length, where the calibration had no
     boards; and the same where what lenses may do beyond their models is not counted."""
     sys.path.append(str(Path(__file__).parents[1] / "tests"))
@@ -338,7 +338,9 @@ def scene(seeds: int, noise_px: float, name: str) -> None:
         left = walls.image(camera, Rigid3.identity(), rng)
         for what, checks in found.items():
             pose = turned(MOUNT, SCENE_TURNED_DEG if what == "rotation" else 0.0, rng)
-            checks.append(check_scene(monitored, [[left, walls.image(camera, pose, rng)]]))
+            checks.append(
+                check_matches(monitored, matches_of_scenes(monitored, [[left, walls.image(camera, pose, rng)]]))
+            )
     for what, checks in found.items():
         tell(f"scene {name}: {what}", checks, what)
 
@@ -366,7 +368,7 @@ def main() -> None:
     work: dict[str, list[Callable[[], None]]] = {
         "lens": [partial(one_camera, n, args.seeds, args.noise) for n in args.lens],
         "rig": [partial(stereo, args.seeds, args.noise, n) for n in args.lens],
-        "departs": [partial(departing, n, args.seeds, args.noise) for n in DEPARTING],
+        "departs": [partial(with_model_inadequacy, n, args.seeds, args.noise) for n in DEPARTING],
         "pupil": [partial(pupils, args.seeds)],
         "rendered": [partial(rendered, n, args.seeds, args.cache) for n in args.lens],
         "scene": [partial(scene, args.seeds, args.noise, n) for n in args.lens],

@@ -91,7 +91,7 @@ class Session:
         return FOLDS if self.model == "auto" else 0
 
 
-def departing(lens: Camera, sigma_px: float, rng: np.random.Generator) -> Camera:
+def with_model_inadequacy(lens: Camera, sigma_px: float, rng: np.random.Generator) -> Camera:
     """Return a lens that departs from its model."""
     amounts = np.append(lens.parameters, sigma_px * rng.normal(size=DISPLACEMENTS))
     return DisplacedCamera(SIZE_PX, amounts, lens, np.eye(DISPLACEMENTS))
@@ -201,7 +201,7 @@ def lenses_of(name: str, trial: int, departs_px: float, rng: np.random.Generator
     if name == STRANGE:
         kind = list(CURVES)[trial % len(CURVES)]
         return [strange_lens(kind, SIZE_PX, DECENTRED_PX, rng) for _ in range(2)]
-    return [departing(LENSES[name], departs_px, rng) if departs_px else LENSES[name] for _ in range(2)]
+    return [with_model_inadequacy(LENSES[name], departs_px, rng) if departs_px else LENSES[name] for _ in range(2)]
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import Affines, BoolArray, FloatArray, IntArray, Pixels, as_array
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, IntArray, Pixels, keep_arrays
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs, Matches
 
@@ -37,13 +37,10 @@ class Correspondences:
 
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.pixels1))
-        object.__setattr__(self, "pixels1", as_array(self.pixels1, (n, 2), "correspondences, pixels1"))
-        object.__setattr__(self, "pixels2", as_array(self.pixels2, (n, 2), "correspondences, pixels2"))
-        shapes: dict[str, tuple[int | None, ...]] = {"A21": (n, 2, 2), "sigma_px": (n,), "sigma_A": (n,)}
-        for name, shape in shapes.items():
-            if getattr(self, name) is not None:
-                array = as_array(getattr(self, name), shape, f"correspondences, {name}", finite=name == "sigma_px")
-                object.__setattr__(self, name, array)
+        what = "correspondences, "
+        keep_arrays(self, what=what, pixels1=(n, 2), pixels2=(n, 2))
+        keep_arrays(self, what=what, optional=True, sigma_px=(n,))
+        keep_arrays(self, what=what, optional=True, finite=False, A21=(n, 2, 2), sigma_A=(n,))
         if self.sigma_px is not None and (self.sigma_px <= 0.0).any():
             raise InputError("correspondences, sigma_px: standard deviations must be positive")
         if self.directions is not None and len(self.directions.valid) != n:

@@ -94,13 +94,13 @@ def _aligned(
 ) -> tuple[Correspondences, int]:
     """Return the matches of two images' features whose patches align, and the number of matches tried."""
     i, j, rank = matched
-    once = _unrepeated(first.pixels[i], second.pixels[j], rank)
+    once = _one_per_cell(first.pixels[i], second.pixels[j], rank)
     i, j = i[once], j[once]
     A21 = second.frames[j] @ np.linalg.inv(first.frames[i]) if i.size else np.zeros((0, 2, 2))
     refined = refine_patches(pyramid1, pyramid2, first.pixels[i], second.pixels[j], A21)
     with np.errstate(invalid="ignore"):
         good = refined.valid & (refined.correlation >= MIN_CORRELATION)
-    good[good] = _unrepeated(first.pixels[i][good], refined.pixels2[good], refined.sigma_A[good])
+    good[good] = _one_per_cell(first.pixels[i][good], refined.pixels2[good], refined.sigma_A[good])
     pairs = Correspondences(
         first.pixels[i][good],
         refined.pixels2[good],
@@ -153,7 +153,7 @@ def _features(grey: NDArray[np.uint8], views: Sequence[tuple[float, float]], cou
         image, scale = (grey, 1.0) if tilt == 1.0 else _shrunk(grey)
         area = image.shape[0] * image.shape[1]
         most = int(np.clip(area / AREA_OF_FEATURE, *FEATURES_OF_VIEWS)) if tilt == 1.0 else FEATURES_OF_VIEWS[0]
-        view, mask, view_from_image = _simulated(image, tilt, roll)
+        view, mask, view_from_image = _tilted_view(image, tilt, roll)
         keypoints, descriptors = cv2.SIFT.create(nfeatures=count or most).detectAndCompute(view, mask)
         if not keypoints:
             continue
@@ -184,7 +184,7 @@ def _shrunk(grey: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8), grey.shape[1] / size[0]
 
 
-def _simulated(
+def _tilted_view(
     grey: NDArray[np.uint8], tilt: float, roll: float
 ) -> tuple[NDArray[Any], NDArray[Any] | None, FloatArray]:
     """Return the image turned by `roll` and squeezed by `tilt` along x, its mask, and view_from_image (2, 3)."""
@@ -252,7 +252,7 @@ def _nearest(first: _Features, second: _Features, block: int = 1024) -> tuple[In
     return best, nearest, rival
 
 
-def _unrepeated(pixels1: Pixels, pixels2: Pixels, rank: FloatArray) -> BoolArray:
+def _one_per_cell(pixels1: Pixels, pixels2: Pixels, rank: FloatArray) -> BoolArray:
     """Return which matches (N,) to keep so that every cell of either image has only the match of lowest rank."""
     keep = np.zeros(len(pixels1), dtype=bool)
     order = np.argsort(rank, kind="stable")

@@ -22,7 +22,7 @@ from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.core.processes import Here
+from rigkit.core.processes import SerialExecutor
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Goal, RemainingError, Requirement, projection_goal, px_words, turned_design
@@ -131,7 +131,7 @@ class CaptureGuide:
         self.size_px: tuple[int, int] | None = None
         self._quick: Calibration | None = None
         self._stale = False
-        self._whole = WholeCalibrations(executor or Here(), whole_calibration)
+        self._whole = WholeCalibrations(executor or SerialExecutor(), whole_calibration)
         self._plan: Plan | None = None
         self._left_now: tuple[RemainingError, ...] = ()
         self._map: list[list[float | None]] | None = None

@@ -31,7 +31,7 @@ from rigkit.coach.rig_whole import RigKnown, whole_rig
 from rigkit.coach.whole import WholeCalibrations
 from rigkit.core.arrays import Pixels
 from rigkit.core.errors import DegenerateError
-from rigkit.core.processes import Here
+from rigkit.core.processes import SerialExecutor
 from rigkit.planning.candidates import held_boards, outline_mm
 from rigkit.planning.goal import RemainingError
 from rigkit.planning.information import HeldBoards
@@ -90,7 +90,7 @@ class RigGuide:
         # A requirement on what is measured is one on the rig, not on single cameras.
         alone = options if len(names) == 1 else replace(options, goal_mm=None)
         self.lenses = tuple(CaptureGuide(alone, executor) for _ in names)
-        self._whole = WholeCalibrations(executor or Here(), whole_rig)
+        self._whole = WholeCalibrations(executor or SerialExecutor(), whole_rig)
         self._known: RigKnown | None = None
         self.frames: list[tuple[FrameObservation, ...]] = []
         self._shared: dict[int, SharedViews | None] = {}

@@ -21,7 +21,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.core.processes import Here
+from rigkit.core.processes import SerialExecutor
 from rigkit.core.progress import silent
 from rigkit.planning.information import Knowledge
 
@@ -101,7 +101,7 @@ class WholeCalibrations(Generic[Found]):
         try:
             future = self._executor.submit(self._calibrated, frames, *given)
         except BrokenProcessPool:
-            self._executor = Here()
+            self._executor = SerialExecutor()
             future = self._executor.submit(self._calibrated, frames, *given)
         self._asked = len(frames), future
 
@@ -114,7 +114,7 @@ class WholeCalibrations(Generic[Found]):
             found = future.result()
         except (BrokenProcessPool, CancelledError):
             # Without the process, calibrations block the page for a moment, but the capture goes on.
-            self._executor = Here()
+            self._executor = SerialExecutor()
             return False
         self._heldout_rms_px[count] = None if found is None else found.heldout_rms_px
         if found is None or count < self.count:

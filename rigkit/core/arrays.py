@@ -67,16 +67,16 @@ def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, *, fini
 
 
 def keep_arrays(
-    result: object, *, finite: bool = True, optional: bool = False, **shapes: tuple[int | None, ...]
+    result: object, *, finite: bool = True, optional: bool = False, what: str = "", **shapes: tuple[int | None, ...]
 ) -> None:
     """Replace the fields named in `shapes` of a frozen `result` by read-only copies, checked as by `as_array`.
 
-    `optional`: these fields may also be None.
+    `optional`: these fields may also be None. `what` precedes their names in messages.
     """
     for name, shape in shapes.items():
         value = getattr(result, name)
         if not (optional and value is None):
-            object.__setattr__(result, name, as_array(value, shape, name, finite=finite))
+            object.__setattr__(result, name, as_array(value, shape, what + name, finite=finite))
 
 
 def keep_indices(result: object, **shapes: tuple[int | None, ...]) -> None:

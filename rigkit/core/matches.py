@@ -63,8 +63,7 @@ class DirectionPairs:
         if first.ndim != 3:
             raise InputError(f"directions: expected shape NxKx2, got {first.shape}")
         n, k = first.shape[:2]
-        object.__setattr__(self, "image1", as_array(self.image1, (n, k, 2), "directions in image 1", finite=False))
-        object.__setattr__(self, "image2", as_array(self.image2, (n, k, 2), "directions in image 2", finite=False))
+        keep_arrays(self, what="directions in ", finite=False, image1=(n, k, 2), image2=(n, k, 2))
         valid = np.array(self.valid, dtype=bool)
         if valid.shape != (n, k):
             raise InputError(f"directions: valid must be {n}x{k}, got {valid.shape}")
@@ -74,9 +73,7 @@ class DirectionPairs:
         object.__setattr__(self, "valid", valid)
         if len(self.kinds) != k:
             raise InputError(f"directions: {k} directions a point but {len(self.kinds)} kinds")
-        for name in ("pixels1", "pixels2"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, as_array(getattr(self, name), (n, 2), f"directions' {name}"))
+        keep_arrays(self, what="directions' ", optional=True, pixels1=(n, 2), pixels2=(n, 2))
 
     def select(self, which: BoolArray | IntArray) -> DirectionPairs:
         """Return the directions at points selected by a mask or indices, without their pixels."""

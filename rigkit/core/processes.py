@@ -58,7 +58,7 @@ def process_count(jobs: int | None) -> int:
     return 1 if multiprocessing.current_process().daemon else jobs or available_cores()
 
 
-class Here(Executor):
+class SerialExecutor(Executor):
     """An executor that runs work in `submit`, in this process."""
 
     def submit(
@@ -73,7 +73,7 @@ class Here(Executor):
 
 
 @contextmanager
-def _terminal_silent() -> Iterator[None]:
+def _terminal_signals_blocked() -> Iterator[None]:
     """Block SIGINT and SIGHUP in processes that start here: the terminal sends them to the whole process group, and the
     parent handles them. Children inherit the mask; their own handlers would be set after a second of imports."""
     if not hasattr(signal, "pthread_sigmask"):
@@ -88,7 +88,7 @@ def _terminal_silent() -> Iterator[None]:
 
 
 @contextmanager
-def _script_left_alone() -> Iterator[None]:
+def _without_main_module() -> Iterator[None]:
     """Prevent processes that start here from importing the caller's script: without `if __name__ == "__main__"` it
     would run again in each of them."""
     script = sys.modules["__main__"]
@@ -127,7 +127,7 @@ class _Pool(ProcessPoolExecutor):
     ) -> Future[Result]:
         if self._of_script is None:
             self._of_script = _is_of_script(fn, args, kwargs)
-        with _terminal_silent():
+        with _terminal_signals_blocked():
             future = super().submit(fn, *args, **kwargs)
         # Pending futures are cancelled before the workers end; setting an exception on them would print a traceback.
         future.set_exception = functools.partial(_set_exception, future)  # type: ignore[method-assign]
@@ -135,7 +135,7 @@ class _Pool(ProcessPoolExecutor):
 
     def _launch_processes(self) -> None:
         # Before the pool starts a thread, which would miss the script, too.
-        with nullcontext() if self._of_script else _script_left_alone():
+        with nullcontext() if self._of_script else _without_main_module():
             super()._launch_processes()  # type: ignore[misc]
 
 
@@ -152,7 +152,7 @@ def worker_pool(count: int) -> Iterator[ProcessPoolExecutor]:
     Raises InputError if a worker is killed.
     """
     others = set(multiprocessing.active_children())
-    with _terminal_silent():
+    with _terminal_signals_blocked():
         pool = _Pool(count, _end_with_parent)
     try:
         yield pool

@@ -118,7 +118,7 @@ class Rigid3:
 
 def _checked(matrix: Mat3) -> Mat3:
     """Return the rotations nearest to `matrix` (..., 3, 3); raises InputError if one differs by more than rounding."""
-    off = _off(matrix)
+    off = _orthonormality_error(matrix)
     if np.abs(off).max(initial=0.0) <= ROUNDING and (np.linalg.det(matrix) > 0.0).all():
         return _orthonormal(matrix, off)
     nearest = nearest_rotation(matrix)
@@ -127,7 +127,7 @@ def _checked(matrix: Mat3) -> Mat3:
     return nearest
 
 
-def _off(matrix: Mat3) -> Mat3:
+def _orthonormality_error(matrix: Mat3) -> Mat3:
     """Return M^T M - I of matrices (..., 3, 3)."""
     return np.asarray(np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3))
 
@@ -135,7 +135,7 @@ def _off(matrix: Mat3) -> Mat3:
 def _orthonormal(matrix: Mat3, off: Mat3 | None = None) -> Mat3:
     """Return matrices (..., 3, 3) that are rotations up to rounding, made orthonormal: one step of Newton's iteration
     for the polar factor, which squares the deviation `off`."""
-    return np.asarray(matrix - 0.5 * (matrix @ (_off(matrix) if off is None else off)))
+    return np.asarray(matrix - 0.5 * (matrix @ (_orthonormality_error(matrix) if off is None else off)))
 
 
 def cam_from_world_look_at(eye_mm: ArrayLike, target_mm: ArrayLike, down: ArrayLike = (0.0, 1.0, 0.0)) -> Rigid3:

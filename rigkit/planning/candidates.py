@@ -69,7 +69,7 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
 
     Raises DegenerateError where the board never fits into the image.
     """
-    u, v, size, tilt, azimuth, upright = _even(CANDIDATES_DRAWN, 6).T
+    u, v, size, tilt, azimuth, upright = _low_discrepancy(CANDIDATES_DRAWN, 6).T
     width, height = camera.size_px
     facing = _tilted(np.radians(TILT_DEG[0] + tilt * (TILT_DEG[1] - TILT_DEG[0])), 2.0 * np.pi * azimuth)
     facing = facing @ exp_so3(np.where(upright < UPRIGHT_SHARE, 0.5 * np.pi, 0.0)[:, None] * np.array([0.0, 0.0, 1.0]))
@@ -84,7 +84,7 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
         held, seen = _placed(camera, board, spot[moving], facing[moving], square_px[moving], middle)
         points = held.in_cam(paper)
         pixels, valid = camera.project(points)
-        push = _back_inside(camera, pixels, valid & seen[:, None] & _in_field(points, reach.field_deg))
+        push = _shift_inside(camera, pixels, valid & seen[:, None] & _in_field(points, reach.field_deg))
         spot[moving] += push
         moving = moving[push.any(axis=1)]
     held, good = _placed(camera, board, spot, facing, square_px, middle)
@@ -101,10 +101,10 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
 
 def sees_held(camera: Camera, board: Board, held: HeldBoards, reach: Reach) -> BoolArray:
     """Say for each of C poses whether the camera sees the whole board, large enough and not too slanted."""
-    return _inside(camera, held.in_cam(outline_mm(board)), reach.field_deg) & _plain(camera, board, held)
+    return _inside(camera, held.in_cam(outline_mm(board)), reach.field_deg) & _squares_visible(camera, board, held)
 
 
-def _even(count: int, dimensions: int) -> FloatArray:
+def _low_discrepancy(count: int, dimensions: int) -> FloatArray:
     """Return `count` points that fill the unit cube evenly: multiples of the powers of the generalised golden ratio.
 
     Reference: M. Roberts, "The unreasonable effectiveness of quasirandom sequences" (2018).
@@ -144,7 +144,7 @@ def _placed(
     return held, np.asarray(seen & np.isfinite(distance))
 
 
-def _back_inside(camera: Camera, pixels: Pixels, valid: BoolArray) -> FloatArray:
+def _shift_inside(camera: Camera, pixels: Pixels, valid: BoolArray) -> FloatArray:
     """Return the shifts (C, 2) px that move boards with outlines at `pixels` (C, 8, 2) into the image; boards partly
     outside the field of view move towards the image centre."""
     width, height = camera.size_px
@@ -171,7 +171,7 @@ def _in_field(points: Points, field_deg: float | None) -> BoolArray:
     return np.asarray(points[..., 2] >= limit * np.linalg.norm(points, axis=-1))
 
 
-def _plain(camera: Camera, board: Board, held: HeldBoards) -> BoolArray:
+def _squares_visible(camera: Camera, board: Board, held: HeldBoards) -> BoolArray:
     """Say for each board whether all squares are large enough, and no line of sight too slanted."""
     columns, rows = board.size
     lattice = board.points().reshape(rows, columns, 3)[[0, 0, -1, -1], [0, -1, 0, -1]]

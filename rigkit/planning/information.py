@@ -144,7 +144,7 @@ class Knowledge:
     @classmethod
     def beyond_model(cls, calibration: Calibration) -> Knowledge:
         """Return the same with the inadequacy of the model, estimated from alternative models."""
-        return cls.of(calibration).departing(lens_modes(calibration))
+        return cls.of(calibration).with_model_inadequacy(lens_modes(calibration))
 
     def of_views(self, held: HeldBoards, board_id: str = "") -> FloatArray:
         """Return the information of each view of the board `board_id` in C poses, (C, T, T)."""
@@ -160,7 +160,7 @@ class Knowledge:
         out[:, own[:, None], own] = reduced
         return out
 
-    def departing(self, modes: LensModes) -> Knowledge:
+    def with_model_inadequacy(self, modes: LensModes) -> Knowledge:
         """Return the same with the amounts of the model's inadequacy as further parameters, which new views also
         estimate."""
         p, count = self.camera.parameters.size, modes.modes.shape[1]

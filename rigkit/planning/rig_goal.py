@@ -26,7 +26,7 @@ def rig_goal(
     rotation perturbation, rad, and translation, mm.
     """
     placed, layout = list(zip(cameras, cam_from_rig, strict=True)), Layout.of_cameras(cameras)
-    points = np.concatenate([_before(c, pose, distance_mm, field_deg) for c, pose in placed])
+    points = np.concatenate([_points_in_view(c, pose, distance_mm, field_deg) for c, pose in placed])
     rows = np.concatenate([_design(c, pose, points, layout, k, field_deg) for k, (c, pose) in enumerate(placed)])
     # Rotations in radians and translations in millimetres, scaled to equal effects at the distance.
     motion = rows[:, layout.count :] / np.array([1.0, 1.0, 1.0, *[1.0 / distance_mm] * 3])
@@ -36,7 +36,7 @@ def rig_goal(
     return Goal(left.T @ left / (len(rows) / 2), "px", what)
 
 
-def _before(camera: Camera, cam_from_rig: Rigid3, distance_mm: float, field_deg: float | None) -> Points:
+def _points_in_view(camera: Camera, cam_from_rig: Rigid3, distance_mm: float, field_deg: float | None) -> Points:
     """Return points at a distance all over a camera's image, in the rig's frame."""
     rays = rays_within(camera, grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2), field_deg)
     return cam_from_rig.inverse().apply(distance_mm * rays)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigkit.core.tables import Cell, Column, Table
-from rigkit.report.tables import below, column_label, in_words, measured_words
+from rigkit.report.tables import below, column_label, measured_words, text_columns
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -40,18 +40,20 @@ def drawing(svg: str) -> Any:
     return Markup(svg)
 
 
-def shown_table(table: Table, pictures: Sequence[str | None] = ()) -> dict[str, Any]:
+def table_context(table: Table, pictures: Sequence[str | None] = ()) -> dict[str, Any]:
     """Return a table for the template `table.html`; `pictures` are image sources of the rows."""
     return {
         "title": table.title,
-        "head": [(column_label(column), text) for column, text in zip(table.columns, in_words(table), strict=True)],
-        "rows": [[_shown_cell(c, column) for c, column in zip(row, table.columns, strict=True)] for row in table.rows],
+        "head": [(column_label(column), text) for column, text in zip(table.columns, text_columns(table), strict=True)],
+        "rows": [
+            [_cell_context(c, column) for c, column in zip(row, table.columns, strict=True)] for row in table.rows
+        ],
         "pictures": list(pictures) if any(pictures) else [],
         "below": below(table),
     }
 
 
-def _shown_cell(cell: Cell, column: Column) -> dict[str, Any]:
+def _cell_context(cell: Cell, column: Column) -> dict[str, Any]:
     if isinstance(cell.value, str):
         text = "text words" if len(cell.value) > LONG_WORDS else "text"
         kind = f"{text} fail" if cell.failed else "pass" if cell.value == "pass" else text

@@ -20,15 +20,8 @@ from rigkit.io.disk.reading import is_number
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """First characters of formulas in spreadsheets."""
 
-LATEX = {
+LATEX = {letter: rf"\{letter}" for letter in "&%$#_{}"} | {
     "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "{": r"\{",
-    "}": r"\}",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
     "<": r"\textless{}",
@@ -47,7 +40,7 @@ def tables_to_markdown(tables: Sequence[Table]) -> str:
             f"## {_escape_markdown(table.title)}",
             "",
             _markdown_row(head),
-            _markdown_row([":--" if left else "--:" for left in in_words(table)]),
+            _markdown_row([":--" if left else "--:" for left in text_columns(table)]),
         ]
         for row in table.rows:
             cells = []
@@ -100,7 +93,7 @@ def tables_to_latex(tables: Sequence[Table]) -> str:
             rf"\caption{{{_escape_latex((table.title + '. ' + below(table)).strip())}}}",
             rf"\label{{tab:{table.key}}}",
             r"\resizebox{\textwidth}{!}{%",
-            rf"\begin{{tabular}}{{{''.join('l' if left else 'r' for left in in_words(table))}}}",
+            rf"\begin{{tabular}}{{{''.join('l' if left else 'r' for left in text_columns(table))}}}",
             r"\toprule",
             head + r" \\",
             r"\midrule",
@@ -148,7 +141,7 @@ def tables_to_text(tables: Sequence[Table]) -> str:
             [_one_line(_text(c, column)) for c, column in zip(row, table.columns, strict=True)] for row in table.rows
         ]
         widths = [max(len(line[j]) for line in grid) for j in range(len(table.columns))]
-        pad = [str.ljust if left else str.rjust for left in in_words(table)]
+        pad = [str.ljust if left else str.rjust for left in text_columns(table)]
         lines = ["  ".join(p(t, w) for p, t, w in zip(pad, line, widths, strict=True)).rstrip() for line in grid]
         parts.append("\n".join([table.title, *lines, *filter(None, [below(table)])]))
     return "\n\n".join(parts)
@@ -223,7 +216,7 @@ def rounded_parameters(camera: Camera, sigmas: FloatArray) -> dict[str, str]:
     return {name: rounded_words(value, spreads[name]) for name, value in values.items()}
 
 
-def in_words(table: Table) -> list[bool]:
+def text_columns(table: Table) -> list[bool]:
     """Return for each column whether it holds text, which is aligned to the left."""
     return [any(isinstance(row[j].value, str) for row in table.rows) for j in range(len(table.columns))]
 

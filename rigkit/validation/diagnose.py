@@ -44,7 +44,7 @@ def camera_fit(camera: Camera, detections: Sequence[BoardDetection], boards: Seq
     """
     square, count = 0.0, 0
     for detection in detections:
-        board = _of_that_shape(detection, boards)
+        board = _board_of_size(detection, boards)
         if board is None or len(detection.grid) < MIN_CORNERS_TO_DIAGNOSE:
             continue
         # A quarter turn if the board's columns are the image's rows; its sense does not matter to the shape.
@@ -172,7 +172,7 @@ def _diagnose_free(reports: Sequence[ValidationReport]) -> list[str]:
     return out
 
 
-def _of_that_shape(detection: BoardDetection, boards: Sequence[Board]) -> Board | None:
+def _board_of_size(detection: BoardDetection, boards: Sequence[Board]) -> Board | None:
     sizes = (detection.columns, detection.rows), (detection.rows, detection.columns)
     return next((board for size in sizes for board in boards if board.size == size), None)
 
@@ -196,15 +196,15 @@ class _SquareSizes:
     aspect: float
 
     @property
-    def no_board(self) -> bool:
+    def implausible(self) -> bool:
         return bool(abs(np.log(self.aspect)) > NO_BOARD)
 
     @property
     def stretched(self) -> bool:
-        return not self.no_board and abs(self.aspect - 1.0) > ODD_BOARD
+        return not self.implausible and abs(self.aspect - 1.0) > ODD_BOARD
 
     @property
-    def would_fit(self) -> str:
+    def fitting_words(self) -> str:
         x_mm, y_mm = np.array(self.board.squares_mm) * self.size * self.aspect ** np.array([0.5, -0.5])
         declared_x_mm, declared_y_mm = self.board.squares_mm
         if not self.stretched and declared_x_mm == declared_y_mm:
@@ -223,7 +223,7 @@ def _diagnose_boards(reports: Sequence[ValidationReport]) -> list[str]:
         f"board '{name}' is reconstructed with an impossible shape: corners of different boards were matched (is a "
         "board of this kind not listed?), or the pose is wrong"
         for name, squares in found.items()
-        if squares.no_board
+        if squares.implausible
     ]
     aspects = [squares.aspect for squares in found.values() if squares.stretched]
     all_alike = len(aspects) == len(found) and np.ptp(aspects) < ODD_BOARD
@@ -235,13 +235,13 @@ def _diagnose_boards(reports: Sequence[ValidationReport]) -> list[str]:
     for name, squares in found.items():
         if squares.stretched:
             out.append(
-                f"board '{name}': its squares are reconstructed {_stretch(squares.aspect)} ({squares.would_fit}); "
+                f"board '{name}': its squares are reconstructed {_stretch(squares.aspect)} ({squares.fitting_words}); "
                 f"{measure_sides}"
             )
-        elif abs(squares.size - 1.0) > ODD_BOARD and not squares.no_board:
+        elif abs(squares.size - 1.0) > ODD_BOARD and not squares.implausible:
             out.append(
                 f"board '{name}': its squares are {100.0 * (squares.size - 1.0):+.1f} % off relative to the other "
-                f"boards; measure them again ({squares.would_fit})"
+                f"boards; measure them again ({squares.fitting_words})"
             )
     return out
 
@@ -249,7 +249,7 @@ def _diagnose_boards(reports: Sequence[ValidationReport]) -> list[str]:
 def _longest_by_boards(reports: Sequence[ValidationReport]) -> float:
     """Return the largest relative length error that wrong boards can explain; infinite for boards not as listed."""
     found = _squares(reports).values()
-    if any(squares.no_board for squares in found) or not all(b.right_handed for r in reports for b in r.boards):
+    if any(squares.implausible for squares in found) or not all(b.right_handed for r in reports for b in r.boards):
         return float("inf")
     off = [float(np.exp(abs(np.log(part)))) - 1.0 for squares in found for part in (squares.size, squares.aspect)]
     return max((part for part in off if part > ODD_BOARD), default=0.0)
@@ -302,7 +302,7 @@ def _diagnose_lengths(failed: Sequence[tuple[str, Check]], reports: Sequence[Val
         f"pairs '{one}' and '{two}': each {a.name} matches the measurement of the other pair: they were probably "
         "exchanged"
         for (one, a), (two, b) in combinations(failed, 2)
-        if a.name == b.name and one != two and _would_hold(a, b.measured) and _would_hold(b, a.measured)
+        if a.name == b.name and one != two and _within_limit(a, b.measured) and _within_limit(b, a.measured)
     ]
     return exchanged or [
         f"pair '{pair}': {check.name} is off by {100.0 * (check.ours / check.measured - 1.0):+.1f} % while other "
@@ -311,7 +311,7 @@ def _diagnose_lengths(failed: Sequence[tuple[str, Check]], reports: Sequence[Val
     ]
 
 
-def _would_hold(check: Check, measured: float) -> bool:
+def _within_limit(check: Check, measured: float) -> bool:
     return abs(check.ours - measured) <= check.limit_k * check.combined_sigma
 
 
@@ -341,10 +341,12 @@ def _diagnose_angles(report: ValidationReport) -> list[str]:
     if len(failed) > 1 and common:
         words = f"board '{common[0]}' is not at the measured angles; measure it again, or check the calibration"
         return [f"pair '{report.pair_id}': {', '.join(names)}: {words}"]
-    return [f"pair '{report.pair_id}': {name}: {_lone_angle(report, c)}" for c, name in zip(failed, names, strict=True)]
+    return [
+        f"pair '{report.pair_id}': {name}: {_single_angle(report, c)}" for c, name in zip(failed, names, strict=True)
+    ]
 
 
-def _lone_angle(report: ValidationReport, check: Check) -> str:
+def _single_angle(report: ValidationReport, check: Check) -> str:
     """Return the probable cause of a single failed angle: misread, if all other evidence supports ours."""
     angle = next(a for a in report.angles if check.name == f"angle {a.a}-{a.b}" or check.name == f"angle {a.b}-{a.a}")
     if angle.lattice_deg is not None and abs(angle.lattice_deg - check.ours) > 0.5 * abs(check.difference):

@@ -61,17 +61,9 @@ def claim_table(reports: Sequence[ValidationReport], method: str, printed: Paper
     method : estimator whose figures are used for planes and pose types.
     printed : the paper's tables.
     """
-    by_baseline = dict(_baseline_errors(printed))
-    ours = (
-        evaluate_claim(CLAIMS[0], _better(_by_estimator(reports), SCALED, UNSCALED, "deg")),
-        evaluate_claim(CLAIMS[1], _better(_by_estimator(reports), (*UNSCALED[:2], *SCALED), (WORST,), "deg")),
-        *_of_planes({Capture.of(r.pair_id, r.pose_type): _by_plane(r) for r in reports if r.affine_method == method}),
-    )
-    theirs = (
-        evaluate_claim(CLAIMS[0], _better(by_baseline, SCALED, UNSCALED, "mm")),
-        evaluate_claim(CLAIMS[1], _better(by_baseline, (*UNSCALED[:2], *SCALED), (WORST,), "mm")),
-        *_of_planes(_printed_planes(printed)),
-    )
+    by_plane = {Capture.of(r.pair_id, r.pose_type): _by_plane(r) for r in reports if r.affine_method == method}
+    ours = _verdicts(_by_estimator(reports), "deg", by_plane)
+    theirs = _verdicts(dict(_baseline_errors(printed)), "mm", _printed_planes(printed))
     rows = [
         cells(text, Cell(_words(own), failed=own is not None and not own.holds), _words(other))
         for text, own, other in zip(CLAIMS, ours, theirs, strict=True)
@@ -98,8 +90,8 @@ def estimator_order_table(reports: Sequence[ValidationReport], printed: PaperTab
     return Table("order", "The five estimators, over all pairs", heads, tuple(rows))
 
 
-def _of_planes(errors: Errors) -> tuple[Verdict | None, ...]:
-    """Return the verdicts on planes and motions."""
+def _verdicts(by_estimator: Mapping[str, Mapping[str, float]], unit: str, errors: Errors) -> tuple[Verdict | None, ...]:
+    """Return the verdicts on CLAIMS, from errors by estimator for each capture, and by plane."""
     first = (
         Comparison(planes[number], f"{capture.name} plane {number}", planes[1], "plane 1")
         for capture, planes in errors.items()
@@ -107,6 +99,8 @@ def _of_planes(errors: Errors) -> tuple[Verdict | None, ...]:
         if capture.motion != PoseType.GENERAL and number != 1 and 1 in planes
     )
     return (
+        evaluate_claim(CLAIMS[0], _better(by_estimator, SCALED, UNSCALED, unit)),
+        evaluate_claim(CLAIMS[1], _better(by_estimator, (*UNSCALED[:2], *SCALED), (WORST,), unit)),
         evaluate_claim(CLAIMS[2], first),
         evaluate_claim(CLAIMS[3], _between(errors, lambda one, other: other == PoseType.FORWARD)),
         evaluate_claim(CLAIMS[4], _between(errors, lambda one, other: one == PoseType.STANDARD)),

@@ -139,7 +139,7 @@ def fit_plane(
     covariance = np.asarray(covariance_mm2, dtype=np.float64)
     gross = 0
     if used.sum() > 2 * MIN_POINTS:
-        near, telling = _judged(points[used], covariance[used], common[:, used])
+        near, telling = _inliers_and_certain(points[used], covariance[used], common[:, used])
         gross = int((~near).sum())
         used[used] = near & telling
     weights, noise = _weights(points[used], covariance[used], common[:, used])
@@ -183,7 +183,7 @@ def _weights(points: Points, covariance: FloatArray, common: FloatArray) -> tupl
     # the first plane, and so seem to have a small one.
     weights = np.zeros(len(points))
     for _ in range(WEIGHT_ROUNDS):
-        seen = _Across.of(points, covariance, common, centroid, axes)
+        seen = _NormalResiduals.of(points, covariance, common, centroid, axes)
         noise = seen.noise_variance() * seen.variance
         weights = 1.0 / (noise + np.sum(seen.bending(weights) ** 2, axis=1))
         weights /= weights.sum()
@@ -192,7 +192,7 @@ def _weights(points: Points, covariance: FloatArray, common: FloatArray) -> tupl
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Across:
+class _NormalResiduals:
     """Residuals of points along the normal of a plane, and their variances.
 
     Attributes
@@ -213,7 +213,7 @@ class _Across:
     @classmethod
     def of(
         cls, points: Points, covariance: FloatArray, common: FloatArray, centroid: FloatArray, axes: FloatArray
-    ) -> _Across:
+    ) -> _NormalResiduals:
         offsets = points - centroid
         return cls(
             offsets @ axes[:, 0],
@@ -261,7 +261,7 @@ def _variance_across(normal: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray(variance)
 
 
-def _judged(points: Points, covariance: FloatArray, common: FloatArray) -> tuple[BoolArray, BoolArray]:
+def _inliers_and_certain(points: Points, covariance: FloatArray, common: FloatArray) -> tuple[BoolArray, BoolArray]:
     """Return a mask (N,) of the inliers, and one (N,) of the points that are certain enough to use.
 
     Outliers would tilt the plane of all points, so residuals are from a plane that most points share. Bending by the
@@ -276,7 +276,7 @@ def _judged(points: Points, covariance: FloatArray, common: FloatArray) -> tuple
         weights = np.zeros(len(points))
         weights[shared], _ = _weights(points[shared], covariance[shared], common[:, shared])
         centroid, axes = _principal(points, weights)
-    seen = _Across.of(points, covariance, common, centroid, axes)
+    seen = _NormalResiduals.of(points, covariance, common, centroid, axes)
     off = np.abs(seen.residuals)
     scatter = SIGMA_OF_MEDIAN * float(np.median(off / np.sqrt(seen.variance)))
     expected = np.sqrt(scatter**2 * seen.variance + np.sum(seen.bending(weights) ** 2, axis=1))

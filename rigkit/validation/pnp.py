@@ -79,16 +79,16 @@ def moved_pnp(moved: Sequence[Reconstruction]) -> tuple[tuple[Rigid3, AnglesDeg]
 
     Only corners in the field of view of all cameras are used.
     """
-    ones: dict[str, tuple[BoardPose, ...]] = {}
-    twos: dict[str, tuple[BoardPose, ...]] = {}
-    for name, seen in _board_rays(moved).items():
-        ones[name], twos[name] = (
+    each = {
+        name: [
             moved_board_poses(rays, seen.points, board_pose(rays[0], seen.points).cam_from_board)
             for rays in (seen.rays1, seen.rays2)
-        )
+        ]
+        for name, seen in _board_rays(moved).items()
+    }
     out = []
     for m, reconstruction in enumerate(moved):
-        poses = {name: (ones[name][m], twos[name][m]) for name in ones}
+        poses = {name: (ones[m], twos[m]) for name, (ones, twos) in each.items()}
         pose, _ = _mean_pose([_relative(*both) for both in poses.values()], reconstruction.cam2_from_cam1)
         out.append((pose, _angles(poses)))
     return tuple(out)

@@ -20,7 +20,7 @@ from rigkit.io.media.images import read_image
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import covariance_of, plan_views
-from rigkit.validation.sentinel.baseline import judge_since
+from rigkit.validation.sentinel.baseline import check_since
 from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, evidence_of_matches, scene_matches
 from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_of
 from rigkit.validation.sentinel.judge import SentinelCheck
@@ -125,6 +125,6 @@ def _check(pair: ScenePair, before: Sequence[PairMatches], seeds: int, found: di
 def _judged(rig: Monitored, before: Sequence[PairMatches], now: PairMatches) -> SentinelCheck:
     if not before:
         return check_matches(rig, [now])
-    return judge_since(
+    return check_since(
         rig, lambda known: evidence_of_matches(known, before), lambda known: evidence_of_matches(known, [now])
     )

@@ -17,9 +17,9 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.core.identifiers import last_number
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.validation.sentinel.baseline import judge_since
+from rigkit.validation.sentinel.baseline import check_since
 from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_of
-from rigkit.validation.sentinel.flipped import counted_alike
+from rigkit.validation.sentinel.flipped import consistently_numbered
 from rigkit.validation.sentinel.judge import SentinelCheck
 from rigkit.validation.sentinel.watch import monitored_camera, monitored_rig
 from sentinel.tally import FRESH, tell, turned
@@ -76,7 +76,7 @@ def _seen(rig: Monitored, frame: str, each: Sequence[Sequence[BoardView]]) -> li
     """Return a frame, of boards that look the same turned counted from one end by all cameras."""
     out: list[FreshView] = []
     for c, views in enumerate(each):
-        out += [counted_alike(rig, FreshView(frame, c, view), out) for view in views]
+        out += [consistently_numbered(rig, FreshView(frame, c, view), out) for view in views]
     return out
 
 
@@ -97,7 +97,7 @@ def _draws(
         if degrees:
             fresh = [_after_turn(v, monitored.cameras[1], degrees, len(checks)) if v.camera == 1 else v for v in fresh]
         try:
-            check = judge_since(monitored, partial(evidence_of, views=before), partial(evidence_of, views=fresh))
+            check = check_since(monitored, partial(evidence_of, views=before), partial(evidence_of, views=fresh))
         except RigkitError as error:
             print(f"{name}: {error}")
             continue

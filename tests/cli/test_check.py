@@ -29,7 +29,7 @@ from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.calibrations.calibration_file import camera_to_json, load_camera, save_calibration
 from rigkit.io.calibrations.history_file import editions, load_history
 from rigkit.io.media.images import read_image
-from rigkit.report.pages.check_page import _could_have_found
+from rigkit.report.pages.check_page import _power_words
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
@@ -333,7 +333,7 @@ def test_enough_power_asks_for_no_more_pictures() -> None:
     sure = Power(
         kind="focal length", camera="left", size=0.1, unit="px", chance=0.97, found_from=0.08, frames=3, both=None
     )
-    assert _could_have_found(sure).endswith("on).") and "images like these" not in _could_have_found(sure)
+    assert _power_words(sure).endswith("on).") and "images like these" not in _power_words(sure)
 
 
 def test_a_pose_on_another_board_names_the_one_that_is_seen(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

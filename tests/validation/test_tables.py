@@ -17,7 +17,7 @@ from helpers.reconstructions import make_reconstruction
 from rigkit.core.errors import InputError
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
-from rigkit.report.render import render, shown_table
+from rigkit.report.render import render, table_context
 from rigkit.report.tables import (
     measured_words,
     tables_to_csv,
@@ -124,7 +124,7 @@ def test_nothing_is_marked_where_all_estimators_agree(reports: list[ValidationRe
 def test_what_brackets_mean_is_said_wherever_there_are_any(tables: tuple[Table, ...]) -> None:
     for key, words in (("planes", True), ("checks", False)):
         table = by_key(tables, key)
-        page = render("table.html", table=shown_table(table))
+        page = render("table.html", table=table_context(table))
         printed = [tables_to_markdown([table]), tables_to_text([table]), tables_to_latex([table]), page]
         assert [("In brackets" in text) for text in printed] == [words] * 4
 

@@ -90,7 +90,7 @@ def pattern_svg(calibration: Calibration) -> str:
     out = [_opening(calibration, words), marks]
     for chosen, colour in ((~beyond, SOFT), (beyond, MARK)):
         start, by = zoom * places[chosen], zoom * times * mean[chosen]
-        path = strokes(start, by) + _heads(start, by)
+        path = strokes(start, by) + _arrow_heads(start, by)
         out.append(f'<path d="{path}" stroke="{colour}" stroke-width="1.6" fill="none"/>')
     expected = f"{int(beyond.sum())} of {len(beyond)} significant (coloured; {CHANCE * len(beyond):.1f} by chance)"
     return "".join([*out, _scale(calibration, times), _ending(calibration, words, expected)])
@@ -184,7 +184,7 @@ def _scale(calibration: Calibration, times: float) -> str:
     )
 
 
-def _heads(start: FloatArray, by: FloatArray) -> str:
+def _arrow_heads(start: FloatArray, by: FloatArray) -> str:
     """Return arrow heads of two strokes each, without those of short arrows."""
     length = np.linalg.norm(by, axis=-1, keepdims=True)
     long = length[:, 0] > 1.5 * ARROW_HEAD

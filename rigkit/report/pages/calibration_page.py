@@ -28,9 +28,9 @@ from rigkit.report.pages.calibration_facts import (
     training_note,
 )
 from rigkit.report.pages.page_facts import PageFacts, verdict_line
-from rigkit.report.pages.plan_page import shown_views
+from rigkit.report.pages.plan_page import views_context
 from rigkit.report.pictures.scene_view import boards_scene, rig_scene
-from rigkit.report.render import data_uri, drawing, render, shown_table
+from rigkit.report.render import data_uri, drawing, render, table_context
 from rigkit.validation.check import Check
 
 THUMBNAILS_PX = (640, 320)
@@ -120,7 +120,7 @@ def _rig_context(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]
     return {
         **_summary(rig, facts, "frames"),
         "scene": rig_scene(rig),
-        "tables": [shown_table(table) for table in facts.tables],
+        "tables": [table_context(table) for table in facts.tables],
     }
 
 
@@ -134,9 +134,9 @@ def _section_context(section: CalibrationSection) -> dict[str, Any]:
         **_summary(c, facts, "images"),
         "scene": boards_scene(c.views, c.boards),
         "drawings": [(name, drawing(draw(c))) for name, draw in DRAWINGS],
-        "next": [] if section.plan is None else shown_views(section.plan, c.corners.used[0]),
+        "next": [] if section.plan is None else views_context(section.plan, c.corners.used[0]),
         "next_words": "" if section.plan is None else next_words(section.plan),
-        "tables": [shown_table(table, _pictures(table, sources)) for table in facts.tables if table.key != NEXT_KEY],
+        "tables": [table_context(table, _pictures(table, sources)) for table in facts.tables if table.key != NEXT_KEY],
     }
 
 

@@ -76,7 +76,7 @@ def check_facts(check: SentinelCheck) -> PageFacts:
         )
     if check.holds and check.powers:
         worst = min(check.powers, key=lambda power: power.chance)
-        sentences.append(_could_have_found(worst))
+        sentences.append(_power_words(worst))
         if worst.chance < FOUND and len(check.monitored.cameras) == 1:
             sentences.append("For the images that would reveal most: rigkit plan CALIBRATION --check")
     return PageFacts(
@@ -127,7 +127,7 @@ def _nearest_words(check: SentinelCheck, change: Change) -> str:
     return f" {min(best.gain / change.gain, 1.0):.0%} of it is explained by this alone: {best}."
 
 
-def _could_have_found(power: Power) -> str:
+def _power_words(power: Power) -> str:
     """Return the chance to detect the least visible change, and what would raise it, in words."""
     whose = "" if power.camera is None else f" of camera '{power.camera}'"
     size = f"{power.size:g} {power.unit}"

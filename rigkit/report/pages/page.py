@@ -9,7 +9,7 @@ from typing import Any
 from rigkit.core.tables import Table
 from rigkit.report.pages.page_facts import PageFacts
 from rigkit.report.pages.validation_verdict import ValidationVerdict
-from rigkit.report.render import data_uri, render, shown_table
+from rigkit.report.render import data_uri, render, table_context
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -40,7 +40,7 @@ def build_page(
         {
             "pair_id": pair.pair_id,
             "lead": pair.lead,
-            "tables": [shown_table(table) for table in pair.tables],
+            "tables": [table_context(table) for table in pair.tables],
             "images": [(caption, data_uri(mime, data)) for caption, mime, data in pair.images],
             "scene": pair.scene,
             "notes": pair.notes,
@@ -54,7 +54,7 @@ def build_page(
         passed=verdict.passed,
         verdict=_first_screen(verdict, pairs),
         remarks=remarks,
-        summary=[shown_table(table) for table in summary],
+        summary=[table_context(table) for table in summary],
         pairs=shown,
         provenance=provenance,
     )

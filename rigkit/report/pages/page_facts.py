@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rigkit.core.tables import Table
-from rigkit.report.pictures.figures import drawn_dark
-from rigkit.report.render import data_uri, drawing, render, shown_table
+from rigkit.report.pictures.figures import in_dark_colours
+from rigkit.report.render import data_uri, drawing, render, table_context
 from rigkit.report.tables import tables_to_list
 
 PAGE_SCHEMA = "rigkit.page/1"
@@ -90,10 +90,11 @@ def build_facts_page(
         sentences=facts.sentences,
         links=links,
         pictures=[
-            (words, *(data_uri("image/png", data) for data in (draw(), drawn_dark(draw)))) for words, draw in pictures
+            (words, *(data_uri("image/png", data) for data in (draw(), in_dark_colours(draw))))
+            for words, draw in pictures
         ],
         drawings=[(name, drawing(svg)) for name, svg in drawings],
-        tables=[shown_table(table) for table in facts.tables],
+        tables=[table_context(table) for table in facts.tables],
         signed=signed,
         provenance=provenance,
     )

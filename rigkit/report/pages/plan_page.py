@@ -17,7 +17,7 @@ from rigkit.planning.words import placement
 from rigkit.report import svg
 from rigkit.report.pages.page_facts import PageFacts
 from rigkit.report.pictures.board_sheet import black_squares
-from rigkit.report.render import drawing, render, shown_table
+from rigkit.report.render import drawing, render, table_context
 from rigkit.report.svg import INK, MARK
 
 VIEW_WIDTH = 320.0
@@ -147,13 +147,13 @@ def plan_page(
         title=title,
         lead="",
         verdict_line={"words": "", "colour": "", "headline": facts.headline},
-        views=shown_views(plan, taken),
+        views=views_context(plan, taken),
         dots=taken is not None and len(taken) > 0,
-        tables=[shown_table(table) for table in facts.tables],
+        tables=[table_context(table) for table in facts.tables],
         provenance=provenance,
     )
 
 
-def shown_views(plan: Plan, taken: Pixels | None = None) -> list[tuple[str, Any]]:
+def views_context(plan: Plan, taken: Pixels | None = None) -> list[tuple[str, Any]]:
     """Return words and drawing of each view for the template `views.html`."""
     return [(words, drawing(view_svg(plan, k, taken))) for k, words in enumerate(plan_words(plan))]

@@ -150,7 +150,7 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
             on = cloud.board_index == (index if index < len(cloud.board_ids) else -1)
             if not on.any():
                 continue
-            p, n = _upright(scene[on]), _upright(cloud.normals[on]) * square * NORMAL_LENGTH_SQUARES
+            p, n = _in_plot_axes(scene[on]), _in_plot_axes(cloud.normals[on]) * square * NORMAL_LENGTH_SQUARES
             if not reconstruction.boards:
                 # In the colours of the images, with few normals.
                 axis.scatter(*p.T, s=BARE_POINT, c=cloud.colours[on] / 255.0, depthshade=False, linewidths=0)
@@ -218,14 +218,14 @@ def difference_png(difference: CameraDifference) -> bytes:
     return as_png(figure)
 
 
-def _upright(vectors: FloatArray) -> FloatArray:
+def _in_plot_axes(vectors: FloatArray) -> FloatArray:
     """Return vectors in plot axes (x right, y away, z up), from camera axes (x right, y down, z forward)."""
     return np.stack([vectors[..., 0], vectors[..., 2], -vectors[..., 1]], axis=-1)
 
 
 def _pyramid(cam1_from_cam: Rigid3, depth: float) -> FloatArray:
     """Return tip and base (5, 3) of a camera's pyramid, in plot axes."""
-    return _upright(cam1_from_cam.apply(depth * PYRAMID))
+    return _in_plot_axes(cam1_from_cam.apply(depth * PYRAMID))
 
 
 def _draw_pyramid(axis: Any, cam1_from_cam: Rigid3, depth: float, name: str) -> None:
@@ -245,7 +245,7 @@ def _fit_equal(axis: Any, reconstruction: Reconstruction, pyramids: FloatArray) 
     points = reconstruction.cloud.points_mm
     distance = np.linalg.norm(points, axis=1)
     points = points[distance < FAR * np.median(distance)]
-    everything = np.concatenate([_upright(points), pyramids])
+    everything = np.concatenate([_in_plot_axes(points), pyramids])
     low, high = everything.min(axis=0), everything.max(axis=0)
     margin = 0.05 * (high - low).max()
     low, high = low - margin, high + margin
@@ -317,7 +317,7 @@ def as_png(figure: Figure) -> bytes:
     return bytes(cv2.imencode(".png", _drawn(figure), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
 
 
-def drawn_dark(draw: Callable[[], bytes]) -> bytes:
+def in_dark_colours(draw: Callable[[], bytes]) -> bytes:
     """Return the picture of `draw` in the colours of dark pages."""
     import matplotlib
 

@@ -36,7 +36,7 @@ CORRECTIONS = 4
 """Gauss-Newton iterations of the correction: published lenses are off by up to 2 px."""
 
 
-def judge_since(monitored: Monitored, before: Look, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
+def check_since(monitored: Monitored, before: Look, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
     """Return the verdict on the evidence of fresh frames, `look`, against the cameras corrected by the evidence of
     frames from the time when they were trusted, `before`.
 
@@ -79,21 +79,14 @@ class _Disagreement:
     @classmethod
     def of(cls, *times: FreshEvidence) -> _Disagreement:
         """Return that within each of several times; changes between the times do not count."""
-        count = times[0].score.shape[1]
-        information, score = [], []
+        count, frames = times[0].score.shape[1], np.cumsum([0, *(len(evidence.score) for evidence in times)])
+        information = np.zeros((frames[-1], len(times) * count, len(times) * count))
+        score = np.zeros(information.shape[:2])
         for k, evidence in enumerate(times):
-            own = slice(k * count, (k + 1) * count)
-            each = (
-                np.zeros((len(evidence.score), len(times) * count, len(times) * count)),
-                np.zeros((len(evidence.score), len(times) * count)),
-            )
-            each[0][:, own, own], each[1][:, own] = (
-                evidence.information / evidence.variance_px2,
-                evidence.score / evidence.variance_px2,
-            )
-            information.append(each[0])
-            score.append(each[1])
-        return cls(*disagreement(np.concatenate(information), np.concatenate(score)))
+            of, own = slice(frames[k], frames[k + 1]), slice(k * count, (k + 1) * count)
+            information[of, own, own] = evidence.information / evidence.variance_px2
+            score[of, own] = evidence.score / evidence.variance_px2
+        return cls(*disagreement(information, score))
 
     def of_frames(self, evidence: FreshEvidence) -> FreshEvidence:
         """Return the evidence with its variance inflated by the ratio."""

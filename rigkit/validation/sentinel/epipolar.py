@@ -27,6 +27,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, RayJacob
 from rigkit.core.errors import DegenerateError
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
+from rigkit.geometry.relative_pose import relative_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 from rigkit.geometry.sampson import sampson_distances
@@ -68,16 +69,6 @@ class PairMatches:
     pixels2: Pixels
 
 
-def check_scene(
-    monitored: Monitored, frames: Sequence[Sequence[Any]], cost: Sequence[Goal] = (), *, progress: Progress = silent
-) -> SentinelCheck:
-    """Return the verdict on images of a textured scene, one per camera in every frame.
-
-    Raises DegenerateError where too few matches are found.
-    """
-    return check_matches(monitored, matches_of_scenes(monitored, frames, progress=progress), cost)
-
-
 def matches_of_scenes(
     monitored: Monitored, frames: Sequence[Sequence[Any]], *, progress: Progress = silent
 ) -> list[PairMatches]:
@@ -103,15 +94,15 @@ def scene_matches(monitored: Monitored, numbers: tuple[int, int], image1: Any, i
     Raises as `match_affine_features`.
     """
     found = match_affine_features(image1, image2, tilts=(1.0,), features_per_view=FEATURES, unique=True)
-    return straightened(monitored, numbers, found)
+    return without_alignment_bias(monitored, numbers, found)
 
 
-def straightened(monitored: Monitored, numbers: tuple[int, int], found: Correspondences) -> PairMatches:
+def without_alignment_bias(monitored: Monitored, numbers: tuple[int, int], found: Correspondences) -> PairMatches:
     """Return the matches of two cameras without the bias of affine alignment, the curvature of the map."""
     assert found.A21 is not None
     first, second = numbers
     cameras = monitored.cameras[first], monitored.cameras[second]
-    motion = _motion(monitored, first, second)
+    motion = relative_pose(monitored.cam_from_rig[first], monitored.cam_from_rig[second])
     one, two = (
         _SeenRays.by(camera, pixels) for camera, pixels in zip(cameras, (found.pixels1, found.pixels2), strict=True)
     )
@@ -147,7 +138,7 @@ def evidence_of_matches(monitored: Monitored, matches: Sequence[PairMatches]) ->
     for pair, (residual, jacobian, good) in zip(matches, _linearised(monitored, matches), strict=True):
         if len(residual) == 0:
             raise DegenerateError("check: the lenses see none of the matches; check which camera took which picture")
-        left, weight, sigma = _unexplained(residual, jacobian, layout.mount(pair.second))
+        left, weight, sigma = _robust_residuals(residual, jacobian, layout.mount(pair.second))
         by_part = _parts(pair.pixels1[good], monitored.cameras[pair.first].size_px)
         own, score = np.zeros((PARTS**2, n, n)), np.zeros((PARTS**2, n))
         np.add.at(own, by_part, weight[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :])
@@ -209,10 +200,10 @@ def _derivatives(
         camera, lens, mount = monitored.cameras[c], layout.cameras[c], layout.mounts[c]
         for k, step in _steps(lens, reach):
             changed = [camera.with_parameters(camera.parameters + change) for change in (step, -step)]
-            differ(k, [_distances(poses, _but(seen, side, _SeenRays.by(one, pixels[side]))) for one in changed])
+            differ(k, [_distances(poses, _replaced(seen, side, _SeenRays.by(one, pixels[side]))) for one in changed])
         for k, step in _steps(mount, reach) if mount is not None else ():
             moved = [poses[side].moved(change) for change in (step, -step)]
-            differ(k, [_distances(_but(poses, side, one), seen) for one in moved])
+            differ(k, [_distances(_replaced(poses, side, one), seen) for one in moved])
     return residual, jacobian
 
 
@@ -225,12 +216,12 @@ def _steps(own: slice, reach: FloatArray) -> Iterator[tuple[int, FloatArray]]:
             yield own.start + k, step
 
 
-def _but(items: Sequence[Item], at: int, item: Item) -> list[Item]:
+def _replaced(items: Sequence[Item], at: int, item: Item) -> list[Item]:
     """Return `items` with `item` at index `at`."""
     return [*items[:at], item, *items[at + 1 :]]
 
 
-def _unexplained(residual: FloatArray, jacobian: FloatArray, mount: slice) -> tuple[FloatArray, FloatArray, float]:
+def _robust_residuals(residual: FloatArray, jacobian: FloatArray, mount: slice) -> tuple[FloatArray, FloatArray, float]:
     """Return the residuals (M,) after the best change of theta, the weights of the matches, robust to outliers, and
     their standard deviation."""
     left, sigma = residual, float(np.median(np.abs(residual))) * SIGMA_OF_MEDIAN
@@ -285,15 +276,11 @@ class _SeenRays:
 def _distances(poses: Sequence[Rigid3], seen: Sequence[_SeenRays]) -> FloatArray:
     """Return the Sampson distances (N,) px of matches of two cameras with `poses` cam_from_rig, NaN outside the field
     of view of one of them."""
-    motion = poses[1] @ poses[0].inverse()
+    motion = relative_pose(*poses)
     essential = skew(motion.translation_mm) @ motion.rotation
     first, second = seen
     found = sampson_distances(essential, first.rays, second.rays, first.jacobians, second.jacobians)
     return np.where(first.valid & second.valid, found, np.nan)
-
-
-def _motion(monitored: Monitored, first: int, second: int) -> Rigid3:
-    return monitored.cam_from_rig[second] @ monitored.cam_from_rig[first].inverse()
 
 
 def _parts(pixels: Pixels, size_px: tuple[int, int]) -> IntArray:

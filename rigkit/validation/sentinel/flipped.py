@@ -57,7 +57,7 @@ def _fitting_flips(monitored: Monitored, views: Sequence[FreshView], which: tupl
             continue
         # The colours of a mirrored board's ends make its columns or its rows count backwards.
         flips = (0, 1) if np.prod(signs) < 0.0 else (None,)
-        if any(_fits(monitored, _all_put_back(monitored, views, which, signs, flip)) for flip in flips):
+        if any(_fits(monitored, _all_unflipped(monitored, views, which, signs, flip)) for flip in flips):
             fit.append(words)
     return fit
 
@@ -68,7 +68,7 @@ def _moved(camera: Camera, signs: tuple[float, float]) -> float:
     return float(np.linalg.norm(np.where(np.array(signs) < 0.0, off, 0.0))) / max(camera.size_px)
 
 
-def _all_put_back(
+def _all_unflipped(
     monitored: Monitored,
     views: Sequence[FreshView],
     which: tuple[int, ...],
@@ -79,12 +79,12 @@ def _all_put_back(
     out = [view for view in views if view.camera not in which]
     for view in views:
         if view.camera in which:
-            put = _put_back(view, signs, monitored.cameras[view.camera].size_px, backwards)
-            out.append(counted_alike(monitored, put, out))
+            put = _unflipped(view, signs, monitored.cameras[view.camera].size_px, backwards)
+            out.append(consistently_numbered(monitored, put, out))
     return out
 
 
-def counted_alike(monitored: Monitored, fresh: FreshView, before: Sequence[FreshView]) -> FreshView:
+def consistently_numbered(monitored: Monitored, fresh: FreshView, before: Sequence[FreshView]) -> FreshView:
     """Return a view of a rotationally symmetric board, numbered from the same end as by another camera."""
     view, c = fresh.view, fresh.camera
     name = view.board.board_id
@@ -116,7 +116,9 @@ def _fits(monitored: Monitored, views: Sequence[FreshView]) -> bool:
         return False
 
 
-def _put_back(one: FreshView, signs: tuple[float, float], size_px: tuple[int, int], backwards: int | None) -> FreshView:
+def _unflipped(
+    one: FreshView, signs: tuple[float, float], size_px: tuple[int, int], backwards: int | None
+) -> FreshView:
     """Return a view with its flip undone, its columns (0) or rows (1) counted backwards."""
     view = one.view
     pixels = np.where(np.array(signs) < 0.0, np.array(size_px) - 1.0 - view.pixels, view.pixels)

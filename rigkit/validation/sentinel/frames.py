@@ -46,7 +46,7 @@ class Frames:
         for number, board in enumerate(boards):
             for c in range(len(monitored.cameras)):
                 try:
-                    parts.append(cls._before(monitored, c, board, number, reach))
+                    parts.append(cls._frames_of_camera(monitored, c, board, number, reach))
                 except DegenerateError as error:
                     refused = error
         if not parts:
@@ -55,7 +55,7 @@ class Frames:
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
 
     @classmethod
-    def _before(cls, monitored: Monitored, c: int, board: Board, number: int, reach: Reach) -> Frames:
+    def _frames_of_camera(cls, monitored: Monitored, c: int, board: Board, number: int, reach: Reach) -> Frames:
         """Return frames in which camera `c` sees the board, spread evenly, as is every leading part of them."""
         held = held_boards(monitored.cameras[c], board, reach)
         held = held.chosen(np.arange(min(len(held), -(-CANDIDATES_KEPT // len(monitored.cameras)))))

@@ -186,9 +186,9 @@ def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = (
     step, covariance, change = np.zeros(monitored.layout.count), monitored.covariance, None
     fixed, after = monitored, evidence
     if known:
-        chance = _chance_of_any(whitened, known)
+        chance = _family_wise_p_value(whitened, known)
         penalty = float(np.log(max(len(whitened.score), 3)))
-        best = max(known, key=lambda c: _evident(c, penalty))
+        best = max(known, key=lambda c: _log_odds(c, penalty))
         amounts, fixed, after = _refined(monitored, look, best)
         for rival in sorted(known, key=lambda c: _cost(c, penalty)):
             if _cost(rival, penalty) >= _cost(best, penalty) or rival.gain < AS_MUCH * best.gain:
@@ -236,7 +236,7 @@ def unchanged_px(monitored: Monitored, evidence: FreshEvidence) -> float:
     return float(np.sqrt(evidence.expected_px**2 + (max(left_open, 0.0) if np.isfinite(left_open) else 0.0)))
 
 
-def _chance_of_any(whitened: Whitened, known: Sequence[Change]) -> float:
+def _family_wise_p_value(whitened: Whitened, known: Sequence[Change]) -> float:
     """Return the probability that unchanged cameras give a p-value as small as the smallest of these, for any
     hypothesis. Hypotheses overlap, so it is below the sum of their p-values: simulated where enough draws exceed it,
     else Bonferroni's bound."""
@@ -258,7 +258,7 @@ def _chance_of_any(whitened: Whitened, known: Sequence[Change]) -> float:
     return float(min(bound, (1.0 + np.count_nonzero(least <= best)) / (DRAWS + 1.0)))
 
 
-def _evident(change: Change, penalty: float) -> float:
+def _log_odds(change: Change, penalty: float) -> float:
     """Return twice the log odds of a hypothesis: its gain, less the costs of its parameters and of its prior odds."""
     return change.gain - _cost(change, penalty)
 

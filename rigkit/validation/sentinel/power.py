@@ -82,17 +82,10 @@ def powers_of(
         else:
             continue
         alone = alarm_chance / len(hypotheses)
-        now = _Shown.of(several[0], hypothesis, metric, alone)
+        now = _DetectionPower.of(several[0], hypothesis, metric, alone)
         enough, both = (
-            next(
-                (
-                    t
-                    for t, w in zip(TIMES, hypothetical, strict=True)
-                    if _Shown.of(w, hypothesis, metric, alone).finds(size)
-                ),
-                None,
-            )
-            for hypothetical in (several, more_precise)
+            next((t for t, w in w_of if _DetectionPower.of(w, hypothesis, metric, alone).is_detectable(size)), None)
+            for w_of in (zip(TIMES, several, strict=True), zip(TIMES, more_precise, strict=True))
         )
         out.append(
             Power(
@@ -114,7 +107,7 @@ def _repeated(evidence: FreshEvidence, times: int) -> FreshEvidence:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Shown:
+class _DetectionPower:
     """Noncentrality of a change of unit size along each observable axis, the number of `amounts`, and the critical
     values (K,) of chi-squared for the quantiles of the variance."""
 
@@ -123,7 +116,7 @@ class _Shown:
     limits: FloatArray
 
     @classmethod
-    def of(cls, whitened: Whitened, hypothesis: Hypothesis, metric: FloatArray, alarm_chance: float) -> _Shown:
+    def of(cls, whitened: Whitened, hypothesis: Hypothesis, metric: FloatArray, alarm_chance: float) -> _DetectionPower:
         by_amount = whitened.by_theta @ hypothesis.directions
         normal = by_amount.T @ np.linalg.solve(whitened.covariance, by_amount)
         size, axes = np.linalg.eigh(metric)
@@ -141,7 +134,7 @@ class _Shown:
         noncentrality = np.minimum(self.by_axis * np.square(size)[:, None], MAX_NONCENTRALITY)
         return np.asarray(1.0 - chndtr(self.limits, self.amounts, noncentrality[..., None]).mean(axis=(1, 2)))
 
-    def finds(self, size: float) -> bool:
+    def is_detectable(self, size: float) -> bool:
         """Say whether a change of `size` is detectable."""
         return bool(self.chance(np.array([size]))[0] >= FOUND)
 

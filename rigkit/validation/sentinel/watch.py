@@ -71,10 +71,10 @@ def monitored_rig(rig: RigCalibration) -> Monitored:
         freedom=rig.freedom,
         scale_sigma=rig.scale_sigma,
     )
-    return with_pupils(central, rig.pupils)
+    return with_moving_pupils(central, rig.pupils)
 
 
-def with_pupils(central: Monitored, pupils: Mapping[str, SolvedPupil]) -> Monitored:
+def with_moving_pupils(central: Monitored, pupils: Mapping[str, SolvedPupil]) -> Monitored:
     """Return cameras with their moving pupils, by name, and the covariance of all parameters.
 
     A pupil e depends on the lenses and mounts x by their joint covariance, e = W x + rest; the rests of two pupils are

@@ -42,12 +42,12 @@ from rigkit.io.media.images import read_image_of
 from rigkit.report.pages.check_page import check_facts, check_page
 from rigkit.report.pages.page_facts import PageFacts
 from rigkit.validation.certificate.contracts import Task
-from rigkit.validation.sentinel.baseline import judge_since
+from rigkit.validation.sentinel.baseline import check_since
 from rigkit.validation.sentinel.epipolar import evidence_of_matches, matches_of_scenes
 from rigkit.validation.sentinel.evidence import SAME_BOARD, FreshView, Monitored, evidence_of
-from rigkit.validation.sentinel.flipped import counted_alike, flipped_pictures
+from rigkit.validation.sentinel.flipped import consistently_numbered, flipped_pictures
 from rigkit.validation.sentinel.judge import Look, SentinelCheck, check_views, evaluate_evidence
-from rigkit.validation.sentinel.watch import monitored_camera, with_pupils
+from rigkit.validation.sentinel.watch import monitored_camera, with_moving_pupils
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.camera_files import require_sure, warn_if_bad
 from rigkit.workflows.inputs.identify_board import explained
@@ -130,7 +130,7 @@ def check_pictures(
     with about(source):
         look, views = pictures.seen(now, scene=options.scene)
         if before:
-            check = judge_since(monitored, pictures.seen(before, scene=options.scene)[0], look, goals)
+            check = check_since(monitored, pictures.seen(before, scene=options.scene)[0], look, goals)
         else:
             check = evaluate_evidence(monitored, look, goals)
         if views and not check.holds:
@@ -201,7 +201,7 @@ def _monitored_rig(known: SavedRig, source: Path) -> Monitored:
         freedom=known.freedom,
         scale_sigma=known.scale_sigma,
     )
-    return with_pupils(central, known.pupils)
+    return with_moving_pupils(central, known.pupils)
 
 
 def _as_known(boards: Sequence[Board], known: Sequence[Board]) -> tuple[Board, ...]:
@@ -301,7 +301,7 @@ def _views(
             if str(path) not in own[c]:
                 continue
             views, reason = views_of_image(path.name, own[c][str(path)], boards, whose[c])
-            out += [counted_alike(monitored, FreshView(name, c, view), out) for view in views]
+            out += [consistently_numbered(monitored, FreshView(name, c, view), out) for view in views]
             if reason is not None:
                 left_out.append((str(path), reason))
     return out

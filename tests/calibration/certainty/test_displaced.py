@@ -38,7 +38,7 @@ def displaced(name: str, *, amounts: tuple[float, float]) -> DisplacedCamera:
     return DisplacedCamera(SIZE, np.concatenate([known.parameters, amounts]), known, modes, turns)
 
 
-def departing(seed: int) -> Calibration:
+def with_model_inadequacy(seed: int) -> Calibration:
     """Return a calibration without decentring of a lens that has some."""
     views, _, _ = random_views(lens("fish"), 20, np.random.default_rng(seed), reach_deg=80.0, noise_px=0.02)
     moved = [np.einsum("ijn,j->ni", displacements(np.asarray(view.pixels), SIZE), DEPARTS) for view in views]
@@ -85,7 +85,7 @@ def far_variance(known: UncertainCamera, calibration: Calibration, pixels: Float
 
 
 def test_the_covariance_with_departures_is_that_of_the_projection(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = departing(0)
+    found = with_model_inadequacy(0)
     pixels = grid_pixels(SIZE, (20, 15)).reshape(-1, 2)
     pixels = pixels[found.camera.unproject(pixels)[1]]
     covered, rays = covered_by_boards(found, pixels), found.camera.unproject(pixels)[0]
@@ -107,7 +107,7 @@ def test_the_covariance_with_departures_is_that_of_the_projection(monkeypatch: p
 def test_model_inadequacy_contains_no_rotation() -> None:
     """Decentring, a shift of the principal point and a turn look nearly alike where boards were. Which way a lens looks
     that departs from its model only the model says: stated normals were a quarter too wide for that turn."""
-    found = departing(0)
+    found = with_model_inadequacy(0)
     known, p = uncertain_camera(found).camera, found.camera.parameters.size
     assert isinstance(known, DisplacedCamera) and known.turns is not None
     rays = FarProjection.of(found).corners.rays
@@ -135,9 +135,9 @@ def test_a_lens_that_is_its_model_stays_as_it_is(rng: np.random.Generator) -> No
 
 def test_knowledge_with_departures_is_the_joint_covariance() -> None:
     """As a plan has it: information of parameters and amounts, of which a view of a board tells both."""
-    found = departing(0)
+    found = with_model_inadequacy(0)
     own, modes = Knowledge.of(found), lens_modes(found)
-    known, p = own.departing(modes), found.camera.parameters.size
+    known, p = own.with_model_inadequacy(modes), found.camera.parameters.size
     (camera,), joint = with_modes((found.camera,), covariance_of(own.information)[:p, :p], (modes,))
     size, sigma = camera.parameters.size, np.sqrt(np.diag(joint))
     assert covariance_of(known.information)[:size, :size] / np.outer(sigma, sigma) == pytest.approx(

@@ -15,7 +15,7 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.report.pages.check_page import check_facts
-from rigkit.validation.sentinel.baseline import judge_since
+from rigkit.validation.sentinel.baseline import check_since
 from rigkit.validation.sentinel.epipolar import PairMatches, evidence_of_matches
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Monitored, evidence_of
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, Look, evaluate_evidence
@@ -63,7 +63,7 @@ def test_a_wrong_rig_is_checked_for_changes_since_earlier_frames(seed: int) -> N
     rng = np.random.default_rng(seed)
     before, same, moved = (_scenes(_turned(MOUNT, d), n, rng) for d, n in ((0.0, 2), (0.0, 1), (TURN_DEG, 1)))
     assert not evaluate_evidence(_file(), same).holds
-    quiet, check = (judge_since(_file(), before, look) for look in (same, moved))
+    quiet, check = (check_since(_file(), before, look) for look in (same, moved))
     assert quiet.holds and quiet.baseline is not None and quiet.baseline.frames == 2
     assert quiet.baseline.rms_corrected_px < 0.5 * quiet.baseline.rms_px
     assert quiet.baseline.chance < ALARM_CHANCE
@@ -91,9 +91,9 @@ def test_pictures_of_before_of_two_moments_are_refused() -> None:
             views.append(FreshView(f"{k}", 1, noisy_view(camera, held, f"{k}", rng, NOISE_PX)))
         return lambda now: evidence_of(now, views)
 
-    assert judge_since(rig, boards(0), boards(0)).holds
+    assert check_since(rig, boards(0), boards(0)).holds
     with pytest.raises(InputError, match="the images of --before do not fit"):
-        judge_since(rig, boards(1), boards(0))
+        check_since(rig, boards(1), boards(0))
 
 
 def _known(focus: float) -> tuple[Camera, Monitored]:
@@ -122,8 +122,8 @@ def test_a_wrong_lens_is_checked_for_changes_since_earlier_frames(seed: int) -> 
         _boards(c, rng, which) for c, which in ((camera, slice(BEFORE)), (camera, fresh), (longer, fresh))
     )
     assert not evaluate_evidence(file, same).holds
-    assert judge_since(file, before, same).holds
-    check = judge_since(file, before, moved)
+    assert check_since(file, before, same).holds
+    check = check_since(file, before, moved)
     assert not check.holds and check.change is not None and check.change.hypothesis.kind == "focus"
     assert check.change.amounts == pytest.approx([0.1], abs=4.0 * float(check.change.sigmas[0]))
 
@@ -142,5 +142,5 @@ def test_frames_that_disagree_count_less() -> None:
         reported = _boards(camera, rng, slice(count))
         return look
 
-    checks = [judge_since(file, erring(4, rng), erring(4, rng)) for rng in map(np.random.default_rng, range(3))]
+    checks = [check_since(file, erring(4, rng), erring(4, rng)) for rng in map(np.random.default_rng, range(3))]
     assert all(check.holds for check in checks)

@@ -23,7 +23,7 @@ from rigkit.planning.candidates import Reach
 from rigkit.report.pages.check_page import check_facts
 from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import measured_points
-from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, evidence_of_matches, straightened
+from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, evidence_of_matches, without_alignment_bias
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Monitored
 from rigkit.validation.sentinel.judge import ALARM_PX, SentinelCheck, check_views, evaluate_evidence
 from rigkit.workflows.calibration.next_pictures import TASK_CELLS, length_goals
@@ -130,7 +130,7 @@ def _aligned(rng: np.random.Generator) -> tuple[PairMatches, PairMatches]:
     design = weight[:, None] * np.column_stack([np.ones(len(u)), u])
     warp = np.linalg.pinv(design) @ (weight[:, None] * pixels2[kept])
     found = Correspondences(pixels1[kept], warp[:, 0], np.swapaxes(warp[:, 1:], 1, 2))
-    return PairMatches(0, 1, found.pixels1, found.pixels2), straightened(DISTORTED, (0, 1), found)
+    return PairMatches(0, 1, found.pixels1, found.pixels2), without_alignment_bias(DISTORTED, (0, 1), found)
 
 
 def test_what_an_affine_warp_leaves_of_the_map_between_lenses_is_taken_back(rng: np.random.Generator) -> None:
