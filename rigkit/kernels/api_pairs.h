@@ -108,7 +108,7 @@ typedef struct {
     double turn;
 } plane_grid_t;
 
-EXPORT void fit_planes(
+EXPORT int64_t fit_planes(
     const plane_grid_t *grid, RESULT(double, planes, grid.rows, grid.columns, 3),
     RESULT(double, normals, grid.rows, grid.columns, 3, 3), RESULT(double, support, grid.rows, grid.columns),
     RESULT(double, squares, grid.rows, grid.columns));

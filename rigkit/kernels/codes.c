@@ -64,17 +64,17 @@ FOR_EACH_PROCESSOR void read_modules(
         spread[n] = read_tag(grey, bytes, width, height, quads + 8 * n, side, bright + side * side * n);
 }
 
-/* Set `best` to the code that each tag is most like, the first of several, and `likeness` to their correlation; both 0 where the
- * modules differ by less than `min_contrast`. `bright` (count, side, side) is scratch. */
+/* Set `best` to the code with the largest correlation with each tag, the first of several, and `likeness` to that correlation;
+ * both 0 where the standard deviation of the modules is below `min_contrast`. `bright` (count, side, side) is scratch. */
 FOR_EACH_PROCESSOR void read_codes(
     const void *grey, int64_t bytes, int64_t width, int64_t height, const double *quads, int64_t count, int64_t side,
     const double *patterns, int64_t codes, double min_contrast, double *bright, int64_t *best, double *likeness)
 {
     const int64_t modules = side * side, last = codes - 1;
     for (int64_t n = 0; n < count; n++) {
-        best[n] = 0;
-        likeness[n] =
-            read_tag(grey, bytes, width, height, quads + 8 * n, side, bright + modules * n) >= min_contrast ? -INFINITY : 0.0;
+        /* -1 for tags that no code is compared with. */
+        best[n] = read_tag(grey, bytes, width, height, quads + 8 * n, side, bright + modules * n) >= min_contrast ? 0 : -1;
+        likeness[n] = best[n] < 0 ? 0.0 : -INFINITY;
     }
     /* Four codes at once, as the sum of one waits for itself, with all tags: the codes of a board are more than the first cache. */
     for (int64_t c = 0; c < codes; c += 4) {
@@ -84,7 +84,7 @@ FOR_EACH_PROCESSOR void read_codes(
         for (int64_t n = 0; n < count; n++) {
             const double *own = bright + modules * n;
             double sum1 = 0.0, sum2 = 0.0, sum3 = 0.0, sum4 = 0.0;
-            if (likeness[n] == 0.0)
+            if (best[n] < 0)
                 continue;
 #pragma omp simd reduction(+ : sum1, sum2, sum3, sum4)
             for (int64_t k = 0; k < modules; k++) {
@@ -101,4 +101,6 @@ FOR_EACH_PROCESSOR void read_codes(
                 }
         }
     }
+    for (int64_t n = 0; n < count; n++)
+        best[n] = best[n] < 0 ? 0 : best[n];
 }

@@ -95,10 +95,11 @@ void collect_window(
     const double crossed = a[0] * b[1] - a[1] * b[0], area = fabs(crossed) > 1.0 ? crossed : 1.0;
     window->count = 0;
     window->size = 2.0;
-    if (!isfinite(a[0] + a[1] + b[0] + b[1] + pixel[0] + pixel[1]))
-        return;
     window->centre_u = rint(pixel[0]);
     window->centre_v = rint(pixel[1]);
+    /* A pixel this far from any image has no window, and its coordinates may exceed int64_t. */
+    if (!isfinite(a[0] + a[1] + b[0] + b[1]) || !(fabs(pixel[0]) + fabs(pixel[1]) < 1e9))
+        return;
     const double off_u = pixel[0] - window->centre_u, off_v = pixel[1] - window->centre_v;
     const double across_u = fabs(a[0]) + fabs(b[0]), across_v = fabs(a[1]) + fabs(b[1]);
     double radius = rules->reach * (across_u > across_v ? across_u : across_v);

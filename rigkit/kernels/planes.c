@@ -114,9 +114,9 @@ INLINE void solve_planes(fits_t *fits)
     }
 }
 
-/* Fill planes, the normal matrices of their fits, the sums of weights, and those of weighted squares of the distances from
- * the planes; NaN where there is no plane. */
-FOR_EACH_PROCESSOR void fit_planes(const plane_grid_t *g, double *planes, double *normals, double *support, double *squares)
+/* Fill planes, the normal matrices of their fits, the sums of the weights, and the weighted sums of squared distances from the
+ * planes, in sigmas; NaN where there is no plane. Return 0 if there is no memory, else 1. */
+FOR_EACH_PROCESSOR int64_t fit_planes(const plane_grid_t *g, double *planes, double *normals, double *support, double *squares)
 {
     static const int entry[9] = {XX, XY, XZ, XY, YY, YZ, XZ, YZ, ZZ};
     const double loss = 1.0 / (3.0 * g->turn * g->turn);
@@ -129,7 +129,7 @@ FOR_EACH_PROCESSOR void fit_planes(const plane_grid_t *g, double *planes, double
     }
     sums_t sums;
     if (!make_sums(g, &sums))
-        return;
+        return 0;
     for (int64_t row = 0; row < g->rows; row++) {
         for (int64_t start = 0; start < g->columns; start += LANES) {
             const double *here = sums.terms + (row + g->reach) * sums.columns + start + g->reach;
@@ -173,4 +173,5 @@ FOR_EACH_PROCESSOR void fit_planes(const plane_grid_t *g, double *planes, double
         }
     }
     free(sums.terms);
+    return 1;
 }

@@ -31,4 +31,7 @@ def fitted_planes(
     grid = make_struct(
         "plane_grid_t", values=values, information=information, frames=frames, reach=reach, rounds=rounds, turn=turn
     )
-    return PlaneFits(*kernels().fit_planes(grid))
+    done, *fits = kernels().fit_planes(grid)
+    if not done:
+        raise MemoryError
+    return PlaneFits(*fits)

@@ -75,13 +75,12 @@ class TagBoardFit:
         kernels().refit_tag_corners(self._fit)
 
     def add(self, rounds: int, *, by_this_map: bool = False) -> bool:
-        """Add missing corners in at most `rounds` rounds, predicted by the corners of the previous round, or by the map
-        before the last fit of all corners; return whether the last round added any."""
+        """Add missing corners in at most `rounds` rounds, predicted by the corners known before each of them, or by the
+        map before the last fit of all corners; return whether any were added."""
         return bool(kernels().add_tag_corners(self._fit, rounds, by_this_map))
 
     def drop(self, rounds: int) -> bool:
-        """Drop corners that contradict their neighbours in at most `rounds` rounds; return whether the last dropped
-        any."""
+        """Drop corners that contradict their neighbours in at most `rounds` rounds; return whether any were dropped."""
         return bool(kernels().drop_tag_corners(self._fit, rounds))
 
     def sigma_factor(self, rules: FactorRules) -> float:

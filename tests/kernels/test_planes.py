@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from kernels.reference import planes as reference
 
 from rigkit.geometry.rotation import unit
@@ -53,3 +54,10 @@ def test_an_edge_stays_sharp(rng: np.random.Generator) -> None:
     assert off.max() < 0.01
     # The other plane's nodes say nothing of how this one's scatter; the loss leaves three quarters of a variance of 1.
     assert 0.6 < np.median((fits.squares / fits.support)[good]) / 3.0 < 0.9
+
+
+def test_planes_without_memory_are_an_error(rng: np.random.Generator) -> None:
+    """A million nodes to each side of the grid are more than an address space holds."""
+    values, information, frames, _ = step_edge(rng)
+    with pytest.raises(MemoryError):
+        fitted_planes(values, information, frames, reach=1_000_000, rounds=1, turn=TURN)

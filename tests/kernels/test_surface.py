@@ -145,3 +145,14 @@ def test_codes(dtype: type, rng: np.random.Generator) -> None:
     np.testing.assert_allclose(likeness, theirs, atol=0.03)
     assert likeness[2] == 0.0
     assert read_codes(image, QUADS, 6, patterns, 1e3)[1].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_code_without_any_correlation_hides_no_other() -> None:
+    """The image is exactly as like the first four codes as unlike them, and is the fifth."""
+    own = np.array([[255, 255], [0, 0]], np.uint8)
+    image = np.kron(own, np.ones((20, 20), np.uint8))
+    quads = np.array([[[-0.5, -0.5], [39.5, -0.5], [39.5, 39.5], [-0.5, 39.5]]])
+    patterns = np.array([[0.5, -0.5, 0.5, -0.5]] * 4 + [[0.5, 0.5, -0.5, -0.5]])
+    best, likeness = read_codes(image, quads, 2, patterns, 1.5)
+    assert best.tolist() == [4]
+    np.testing.assert_allclose(likeness, 1.0)
