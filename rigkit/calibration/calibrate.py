@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.certainty.uncertainty import FarProjection
-from rigkit.calibration.choosing.begun import BegunCalibration, about_camera, begin
+from rigkit.calibration.choosing.begun import BegunCalibration, begin, camera_named_in_errors
 from rigkit.calibration.choosing.between_models import (
     rival_fits,
     rival_shapes,
@@ -22,7 +22,7 @@ from rigkit.calibration.choosing.between_models import (
     with_rivals,
 )
 from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut, choose, described, models_of
-from rigkit.calibration.choosing.lens_choice import ModelChoice, best_sizes, choose_lenses, twins
+from rigkit.calibration.choosing.lens_choice import ModelChoice, best_sizes, choose_lenses, like_cameras
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.choosing.one_model import ModelOutcome, on_same_images
 from rigkit.calibration.judging.moved import moved_lens
@@ -34,7 +34,7 @@ from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.with_pupil import (
     against_central,
     kept_central,
-    pupil_moves_significantly,
+    pupil_is_significant,
     require_known,
     solved_with_pupil,
 )
@@ -99,9 +99,9 @@ def calibrate_together(
 ) -> list[Calibration]:
     """Return the calibration of each camera of a rig, given as (name, views, options).
 
-    Each is calibrated by itself, but like cameras (`twins`) choose among the models of "auto" together. `known` are
-    earlier calibrations; one of the same views and options is not repeated. Raises as `calibrate`, with the camera's
-    name in the message unless it is "".
+    Each is calibrated by itself, but `like_cameras` choose among the models of "auto" together. `known` are earlier
+    calibrations; one of the same views and options is not repeated. Raises as `calibrate`, with the camera's name in
+    the message unless it is "".
     """
     begun = []
     for k, (name, views, request) in enumerate(cameras):
@@ -109,7 +109,7 @@ def calibrate_together(
         done = (one.asked(name, views, request) for one in known)
         begun.append(next((one for one in done if one is not None), None) or begin(name, views, request))
     out: dict[int, Calibration] = {}
-    for group in twins([choose(one.tried, MIN_SIGMAS).fit.state.camera for one in begun]):
+    for group in like_cameras([choose(one.tried, MIN_SIGMAS).fit.state.camera for one in begun]):
         out |= dict(zip(group, _finish([begun[k] for k in group]), strict=True))
     progress("cameras", len(cameras), len(cameras))
     return [out[k] for k in range(len(begun))]
@@ -140,7 +140,7 @@ def _finish(group: Sequence[BegunCalibration]) -> list[Calibration]:
         choices = [ModelChoice(c.model, HeldOut.of([r]).likely()) for c, r in zip(choices, rivals, strict=True)]
     out = []
     for begun, one, options, choice, compared in zip(group, found, tried, choices, rivals, strict=True):
-        with about_camera(begun.name, begun.observations.views):
+        with camera_named_in_errors(begun.name, begun.observations.views):
             out.append(_result(begun, one, options, compared, choice.likely))
     return out
 
@@ -176,9 +176,7 @@ def _result(
         moving, compared = replace(moving, candidates=[*candidates, *moving.candidates]), kept_central(candidates)
         with suppress(DegenerateError):
             result, far_of_moving = _assembled(begun, moving, tried, rivals, likely)
-            if result.pupil is not None and (
-                request.pupil == "moving" or (better and pupil_moves_significantly(result))
-            ):
+            if result.pupil is not None and (request.pupil == "moving" or (better and pupil_is_significant(result))):
                 return _with_verdicts(begun, moving, tried, result, far_of_moving)
     if request.pupil == "moving":
         raise DegenerateError(

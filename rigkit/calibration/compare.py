@@ -193,8 +193,8 @@ class _Modes:
         known = (self.expected + COVARIANCE_FLOOR_PX**2)[:, None]
         null = self.null**2
         likely = [
-            _exceeded(float((self.found**2).sum()) + self.beyond, null.sum(axis=0)),
-            _exceeded(
+            _p_values(float((self.found**2).sum()) + self.beyond, null.sum(axis=0)),
+            _p_values(
                 float((self.found**2 / known[:, 0]).sum()) + self.beyond / COVARIANCE_FLOOR_PX**2,
                 (null / known).sum(axis=0),
             ),
@@ -204,14 +204,14 @@ class _Modes:
             inverse = np.linalg.pinv(weighted.T @ (self.expected[:, None] * weighted), hermitian=True)
             size, by_chance = weighted.T @ self.found, weighted.T @ self.null
             null_size = np.einsum("in,ij,jn->n", by_chance, inverse, by_chance)
-            likely.append(_exceeded(float(size @ inverse @ size), null_size))
+            likely.append(_p_values(float(size @ inverse @ size), null_size))
         least = np.min(likely, axis=0)
         return float(np.count_nonzero(least <= least[0]) / len(least)), float(
             np.quantile(least[1:], 1.0 - TYPICAL_SHARE)
         )
 
 
-def _exceeded(size: float, null: FloatArray) -> FloatArray:
+def _p_values(size: float, null: FloatArray) -> FloatArray:
     """Return the p-values (N + 1,) of `size` and of each of `null` (N,): the part of all of them at least as large."""
     everything = np.concatenate([[size], null])
     order = np.argsort(np.argsort(-everything, kind="stable"), kind="stable")

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, choose, described
-from rigkit.calibration.choosing.models_tried import Request, compared, enough_agree, reweighted
+from rigkit.calibration.choosing.models_tried import Request, cross_validated, enough_agree, reweighted
 from rigkit.calibration.choosing.one_model import ModelOutcome, chosen_of_sizes, on_same_images
 from rigkit.calibration.judging.pupil import BY_CHANCE
 from rigkit.calibration.result import Calibration, Candidate
@@ -45,7 +45,7 @@ def solved_with_pupil(found: ModelOutcome, everything: Observations, request: Re
             found = replace(found, observations=reweighted(found.observations, options))
     if not options:
         return None
-    sizes = compared(found.observations, options, request)
+    sizes = cross_validated(found.observations, options, request)
     return chosen_of_sizes(found.observations, sizes, request, used=found.used, reasons=found.reasons)
 
 
@@ -99,7 +99,7 @@ def against_central(central: ModelOutcome, moving: ModelOutcome, request: Reques
     """Return whether the held-out error is lower with the moving pupil, on the same corners, and both as candidates."""
     options = on_same_images(central, moving, (CENTRAL, MOVING))
     if moving.observations is central.observations:
-        options = compared(central.observations, options, request)
+        options = cross_validated(central.observations, options, request)
     chosen = choose(options, MIN_SIGMAS)
     return chosen.name == MOVING, described(options, chosen)
 
@@ -112,7 +112,7 @@ def kept_central(candidates: Sequence[Candidate]) -> list[Candidate]:
     return [replace(c, chosen=c.name == CENTRAL, reason=reasons[c.name]) for c in candidates]
 
 
-def pupil_moves_significantly(calibration: Calibration) -> bool:
+def pupil_is_significant(calibration: Calibration) -> bool:
     """Return whether the pupil of a calibration moves significantly."""
     return calibration.pupil is not None and calibration.pupil.chance(calibration.freedom) <= BY_CHANCE
 

@@ -39,7 +39,7 @@ class Assignment:
     ----------
     matches : the boards seen in both images.
     pose : the joint fit, boards in the order of `matches`.
-    chi2_1, chi2_2 : chi2 of every detection in image 1 and 2, at most that of an unassigned one (`give_up`).
+    chi2_1, chi2_2 : chi2 of every detection in image 1 and 2, at most `chi2_of_leaving_out`.
     """
 
     matches: tuple[BoardMatch, ...]
@@ -193,7 +193,7 @@ def _settle(
         chosen = wider
     kept = tuple(matches[n] for n in chosen)
     pose = _fit(motion, kept, view1, view2, kinds)
-    chi2_1, chi2_2 = view1.give_up(), view2.give_up()
+    chi2_1, chi2_2 = view1.chi2_of_leaving_out(), view2.chi2_of_leaving_out()
     for match, (one, two) in zip(kept, pose.chi2, strict=True):
         chi2_1[match.first] = min(one, chi2_1[match.first])
         chi2_2[match.second] = min(two, chi2_2[match.second])

@@ -102,7 +102,7 @@ class ImageObservations:
         small = np.minimum(GATE_PX, GATE_SMALL_SQUARES * self.spacing_px)
         return np.asarray(np.maximum(GATE_SQUARES * self.spacing_px, small))
 
-    def give_up(self) -> FloatArray:
+    def chi2_of_leaving_out(self) -> FloatArray:
         """Return the chi2 (D,) of each detection with all residuals at the gate: the cost of leaving it out."""
         both = zip(self.gate_px, self.observations, strict=True)
         return np.array([((gate / observation.sigma_px) ** 2).sum() for gate, observation in both])

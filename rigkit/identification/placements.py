@@ -143,10 +143,10 @@ def placements(detection: BoardDetection, kind: BoardKind) -> list[Placement]:
             Placement(turn, right, down) for down in range(rows - size[1] + 1) for right in range(columns - size[0] + 1)
         ]
     pattern = kind.board.pattern
-    return out if pattern.even_steps else [place for place in out if _same_form(detection, place, pattern)]
+    return out if pattern.even_steps else [place for place in out if _same_positions(detection, place, pattern)]
 
 
-def _same_form(detection: BoardDetection, placement: Placement, pattern: Pattern) -> bool:
+def _same_positions(detection: BoardDetection, placement: Placement, pattern: Pattern) -> bool:
     """Return whether the corners have the same relative positions on the board as on the detection's own grid; with
     staggered rows not every placement preserves them."""
     own = pattern.positions(detection.grid.astype(np.float64))

@@ -147,7 +147,7 @@ def _products(
     derivatives by the parameters of a camera in units of `sigmas` (P,), the `fields` if given, the displacements and
     the residuals. `turn` rotates rays of the calibrated camera to those of `camera`."""
     corners = calibration.corners
-    used, count = _enough(np.flatnonzero(corners.kept), corners.view)
+    used, count = _thinned(np.flatnonzero(corners.kept), corners.view)
     view = corners.view[used]
     lever = np.einsum("nij,nj->in", corners.rotation[view], corners.points_mm[used])
     centre = corners.translation_mm.T[:, view]
@@ -160,7 +160,7 @@ def _products(
     u, v, valid = camera.derivatives(x, y, z, d_pixels_d_point, d_pixels_d_parameters)
     if fields is not None:
         of_lens = d_pixels_d_parameters[:, : calibration.camera.parameters.size]
-        more = fields(np.concatenate([of_lens, turned_rays(np.stack([x, y, z]), d_pixels_d_point)], axis=1))
+        more = fields(np.concatenate([of_lens, rotation_derivatives(np.stack([x, y, z]), d_pixels_d_point)], axis=1))
         d_pixels_d_parameters, sigmas = (
             np.concatenate([d_pixels_d_parameters, more], axis=1),
             np.append(sigmas, np.ones(more.shape[1])),
@@ -177,7 +177,7 @@ def _products(
     return out, 2 * len(used) - POSE * len(count)
 
 
-def turned_rays(along: FloatArray, d_pixels_d_point: FloatArray) -> FloatArray:
+def rotation_derivatives(along: FloatArray, d_pixels_d_point: FloatArray) -> FloatArray:
     """Return d pixel / d W (2, 3, N) for a rotation W of the points `along` (3, N), from d pixel / d point there."""
     out = np.empty_like(d_pixels_d_point)
     for k in range(3):
@@ -186,7 +186,7 @@ def turned_rays(along: FloatArray, d_pixels_d_point: FloatArray) -> FloatArray:
     return out
 
 
-def _enough(kept: IntArray, view: IntArray) -> tuple[IntArray, IntArray]:
+def _thinned(kept: IntArray, view: IntArray) -> tuple[IntArray, IntArray]:
     """Return the indices of a subset of the corners `kept` (N,), all unless there are very many, and the number in
     every view that has any. `view` is that of each corner."""
     count = np.bincount(view[kept])

@@ -25,7 +25,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.certainty.departures import Departures, information_of_lens, turned_rays
+from rigkit.calibration.certainty.departures import Departures, information_of_lens, rotation_derivatives
 from rigkit.calibration.certainty.series import TERMS, Remainder
 from rigkit.calibration.result import Calibration, CalibrationCorners, Rival
 from rigkit.cameras.base import Camera
@@ -176,7 +176,7 @@ class FarProjection:
     def covariance(self, rays: FloatArray) -> FloatArray:
         """Return the covariance (M, 2, 2) of the projection along rays (M, 3)."""
         at, p = Along.of(self.camera, rays), len(self.sigmas)
-        own = _less_rotation(self.sigmas[:, None] * at.design[:, :p], self.compensation, at.design[:, p:])
+        own = _after_rotation(self.sigmas[:, None] * at.design[:, :p], self.compensation, at.design[:, p:])
         return _propagated(self.correlation, own) + self.beyond_model(at)
 
     def beyond_model(self, at: Along) -> FloatArray:
@@ -224,7 +224,7 @@ class FarProjection:
     def unabsorbed(self, at: Along) -> FloatArray:
         """Return the displacements less the part that parameters and rotation absorb, (2, J, M) px."""
         left = self.departures.unabsorbed(at.pixels, at.design)
-        return _less_rotation(left, self.departure_compensation, at.design[:, len(self.sigmas) :])
+        return _after_rotation(left, self.departure_compensation, at.design[:, len(self.sigmas) :])
 
     def shifts_px(self, at: Along) -> list[FloatArray]:
         """Return the displacements (M, 2) px of the rays in other lenses that may be the true one: each rival, with the
@@ -294,7 +294,7 @@ class _Alone:
     def along(self, rays: Rays) -> FloatArray:
         """Return the covariance (M, 2, 2) of the projection along rays (M, 3) of the lens itself."""
         design, p = projection_design(self.camera, rays), len(self.covariance)
-        return _propagated(self.covariance, _less_rotation(design[:, :p], self.compensation, design[:, p:]))
+        return _propagated(self.covariance, _after_rotation(design[:, :p], self.compensation, design[:, p:]))
 
 
 def _compensating_rotations(turned: FloatArray, moved: FloatArray) -> FloatArray:
@@ -304,7 +304,7 @@ def _compensating_rotations(turned: FloatArray, moved: FloatArray) -> FloatArray
     return np.asarray(symmetric_pinv(square) @ (turned @ np.swapaxes(moved, 1, 2)).sum(axis=0))
 
 
-def _less_rotation(moved: FloatArray, compensation: FloatArray, turned: FloatArray) -> FloatArray:
+def _after_rotation(moved: FloatArray, compensation: FloatArray, turned: FloatArray) -> FloatArray:
     """Return displacements (2, K, M) after the rotations `compensation` (3, K) that compensate them."""
     return np.asarray(moved - np.einsum("wk,iwm->ikm", compensation, turned))
 
@@ -335,7 +335,7 @@ def _projected(camera: Camera, rays: FloatArray, range_mm: float) -> tuple[Pixel
     pixels = np.stack([u, v], axis=-1)
     if not valid.all():
         pixels[~valid] = np.nan
-    design[:, p : p + 3] = turned_rays(ray, by_x)
+    design[:, p : p + 3] = rotation_derivatives(ray, by_x)
     if count > p + 3:
         design[:, p + 3 :] = by_x / range_mm
     return pixels, design

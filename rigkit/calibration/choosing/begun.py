@@ -25,7 +25,7 @@ from rigkit.core.errors import DegenerateError, InputError
 
 
 @contextmanager
-def about_camera(name: str, views: Sequence[BoardView]) -> Iterator[None]:
+def camera_named_in_errors(name: str, views: Sequence[BoardView]) -> Iterator[None]:
     """Add the camera's name to errors, and the cause where all images are near-duplicates."""
     try:
         yield
@@ -72,7 +72,7 @@ class BegunCalibration:
     def solved(self, model: str) -> ModelOutcome:
         """Return the outcome of a camera model."""
         if model not in self._solved:
-            with about_camera(self.name, self.observations.views):
+            with camera_named_in_errors(self.name, self.observations.views):
                 own = [option for option in self.options if option.model == model]
                 wanted = [one for one in self.wanted if one.camera.model == model]
                 self._solved[model] = solved(self.observations, own, wanted, self.failed, self.request)
@@ -101,7 +101,7 @@ def _same(a: BoardView, b: BoardView) -> bool:
 
 def begin(name: str, views: Sequence[BoardView], request: Request) -> BegunCalibration:
     """Return a camera with all models of `request` fitted; raises as `calibrate`, with the camera's name."""
-    with about_camera(name, views):
+    with camera_named_in_errors(name, views):
         wanted = wanted_models(request)
         used, dropped = usable_views(views, request.size_px)
         observations = Observations.from_views(used)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.solving.fit import Fit
-from rigkit.calibration.solving.shape import often_seen, released_sigma
+from rigkit.calibration.solving.shape import in_enough_views, released_sigma
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3
@@ -33,7 +33,7 @@ KNOWN = 0.5
 """Part of the views that must be certain of their orientation: otherwise the common deviation is chance."""
 
 
-def same_looks(board: Board) -> tuple[int, ...]:
+def symmetry_turns(board: Board) -> tuple[int, ...]:
     """Return the quarter turns after which the board looks as before."""
     return (0, *board.turns)
 
@@ -47,7 +47,7 @@ def board_turn(board: Board, quarter_turns: int) -> Rigid3:
     return Rigid3(turn, -(corners @ turn.T).min(axis=0))
 
 
-def with_views_turned(
+def with_boards_renumbered(
     observations: Observations, state: State, views: BoolArray, quarter_turns: int
 ) -> tuple[Observations, State]:
     """Return observations and state with the boards of the chosen `views` (V,) numbered from another corner. Residuals
@@ -66,12 +66,12 @@ def with_views_turned(
     return observations, replace(state, rotation=rotation, translation_mm=translation)
 
 
-def turned_views(observations: Observations, fit: Fit, quarter_turns: int) -> BoolArray:
+def misnumbered_views(observations: Observations, fit: Fit, quarter_turns: int) -> BoolArray:
     """Return the views (V,) whose board is certainly numbered by so many quarter turns differently from most others."""
     out = np.zeros(len(observations.views), dtype=bool)
-    often = often_seen(observations)
+    often = in_enough_views(observations)
     for b, board in enumerate(observations.boards):
-        if often[b] and quarter_turns in same_looks(board):
+        if often[b] and quarter_turns in symmetry_turns(board):
             views = np.flatnonzero(observations.board == b)
             odds = _Patterns.of(observations, fit, b, views, _Turn.of(board, quarter_turns)).log_odds()
             alike, turned = odds > SURE, odds < -SURE
@@ -153,7 +153,7 @@ class _Patterns:
         shown = (by_board[..., None] * monomials[:, :, None, None, :]).reshape(len(views), 2 * corner.shape[1], -1)
         fields = np.linalg.qr(shown)[0]
         left = residual.reshape(len(views), -1)
-        left = left - _within(fields, left)
+        left = left - _projected_onto(fields, left)
         freedom = 2 * int((weight > 0.0).sum()) - fields.shape[2] * len(views)
         sigma = float(np.sqrt((left**2).sum() / max(freedom, 1))) or 1.0
         by_board, left = by_board / sigma, left / sigma
@@ -180,12 +180,12 @@ class _Patterns:
         total = self.information.sum(axis=0) + prior
         solved = np.linalg.solve(total, self.pull[..., None])[..., 0].reshape(views, -1)
         alike = solved @ self.pull.reshape(views, -1).T
-        others = _agreeing_without_each(alike - np.diag(np.diag(alike)))
+        others = _signs_without_each(alike - np.diag(np.diag(alike)))
         rest = total - self.information
         departure = np.linalg.solve(rest, np.tensordot(others, self.pull, axes=1)[..., None])[..., 0]
         here = np.repeat(np.take_along_axis(departure, self.corner[..., None], axis=1), 2, axis=1)
         expected = (self.by_board * here).sum(axis=-1)
-        expected = expected - _within(self.fields, expected)
+        expected = expected - _projected_onto(self.fields, expected)
         size = np.maximum(np.linalg.norm(expected, axis=1), np.finfo(float).tiny)
         # For a view numbered as the others the mean is `size`, with unit variance if the others' deviation is exact.
         found = (self.left * expected).sum(axis=1) / size
@@ -193,12 +193,12 @@ class _Patterns:
         return np.asarray(2.0 * found * size / spread)
 
 
-def _within(basis: FloatArray, values: FloatArray) -> FloatArray:
+def _projected_onto(basis: FloatArray, values: FloatArray) -> FloatArray:
     """Return the part of `values` (V, N) that lies in the orthonormal `basis` (V, N, K)."""
     return np.asarray((basis @ (np.swapaxes(basis, -1, -2) @ values[..., None]))[..., 0])
 
 
-def _agreeing_without_each(alike: FloatArray) -> FloatArray:
+def _signs_without_each(alike: FloatArray) -> FloatArray:
     """Return for each view (V, V) the signs of the others that maximise s^T `alike` s without that view, most of them
     positive, and zero for itself. The diagonal of `alike` is zero."""
     signs = _improved(alike, np.where(np.linalg.eigh(alike)[1][:, -1:].T < 0.0, -1.0, 1.0))

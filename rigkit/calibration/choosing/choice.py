@@ -54,7 +54,7 @@ def models_of(options: Sequence[FittedModel]) -> list[str]:
     return list(dict.fromkeys(option.model for option in options))
 
 
-def settled(options: Sequence[FittedModel]) -> Sequence[FittedModel]:
+def converged_ones(options: Sequence[FittedModel]) -> Sequence[FittedModel]:
     """Return the options whose solver converged, if any did. The others are unidentifiable: a model with more
     parameters than the lens needs (a double sphere for a lens without distortion) has many solutions."""
     return [option for option in options if option.fit.convergence.converged] or options
@@ -70,14 +70,14 @@ def choose(options: Sequence[FittedModel], min_sigmas: float | None = None) -> F
     """
     if len(options) == 1:
         return options[0]
-    judged = [o for o in settled(options) if o.heldout is not None]
+    judged = [o for o in converged_ones(options) if o.heldout is not None]
     if not judged:
         return min(options, key=_bic)
-    good = _as_good(np.array([o.heldout for o in judged]), min_sigmas)
+    good = _as_good_as_best(np.array([o.heldout for o in judged]), min_sigmas)
     return min((o for o, fine in zip(judged, good, strict=True) if fine), key=lambda o: o.count)
 
 
-def _as_good(heldout: FloatArray, min_sigmas: float | None) -> BoolArray:
+def _as_good_as_best(heldout: FloatArray, min_sigmas: float | None) -> BoolArray:
     """Return which of M options are as good as the best, from their squared held-out residuals (M, N) of N images."""
     total = heldout.sum(axis=1)
     within = total <= float(total.min()) * (1.0 + MARGIN) ** 2
@@ -114,7 +114,7 @@ class HeldOut:
     @classmethod
     def of(cls, cameras: Sequence[Sequence[FittedModel]]) -> HeldOut:
         """Combine the held-out errors of several cameras."""
-        known = [{o.name: o for o in settled(options) if o.heldout is not None} for options in cameras]
+        known = [{o.name: o for o in converged_ones(options) if o.heldout is not None} for options in cameras]
         names = [name for name in known[0] if all(name in own for own in known)]
         counts = [max(own[name].count for own in known) for name in names]
         parts = [np.array([own[name].heldout for name in names]) for own in known]
@@ -128,7 +128,7 @@ class HeldOut:
 
     def chosen(self) -> str:
         """Return the name of the option that `choose` would choose."""
-        good = np.flatnonzero(_as_good(self.heldout, MIN_SIGMAS)).tolist()
+        good = np.flatnonzero(_as_good_as_best(self.heldout, MIN_SIGMAS)).tolist()
         return self.names[min(good, key=lambda k: self.counts[k])]
 
     def contradicts(self, name: str, own: str) -> bool:

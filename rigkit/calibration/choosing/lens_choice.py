@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut, choose, models_of, settled
+from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut, choose, converged_ones, models_of
 from rigkit.calibration.choosing.heldout import heldout_squares
-from rigkit.calibration.choosing.models_tried import Request, agreeing, compared, reweighted
+from rigkit.calibration.choosing.models_tried import Request, agreeing_views, cross_validated, reweighted
 from rigkit.calibration.choosing.one_model import ModelOutcome
 from rigkit.calibration.solving.fit import fit_kept, fit_other_lens
 from rigkit.calibration.views.observations import Observations
@@ -37,14 +37,14 @@ def lenses_on_flat_boards(
     observations: Observations, options: list[FittedModel], request: Request
 ) -> list[FittedModel]:
     """Return the options refitted to the same corners of the views that agree with them, with held-out errors."""
-    keep, _ = agreeing(observations, options)
+    keep, _ = agreeing_views(observations, options)
     chosen = np.flatnonzero(keep)
     seen = observations.subset(chosen)
     if not keep.all():
         fits = [fit_kept(seen, o.fit.state.subset(chosen), o.fit.kept[chosen], settle=True) for o in options]
         options = [replace(option, fit=fit) for option, fit in zip(options, fits, strict=True)]
     seen = reweighted(seen, options)
-    return compared(seen, options, request)
+    return cross_validated(seen, options, request)
 
 
 def best_sizes(cameras: Sequence[Sequence[FittedModel]]) -> list[str]:
@@ -84,7 +84,7 @@ def lenses_on_boards(
             if done[name].heldout is None:
                 done[name] = replace(done[name], heldout=heldout_squares(observations, done[name].fit, request.folds))
             judged.append(done[name])
-    return list(settled(judged))
+    return list(converged_ones(judged))
 
 
 def choose_lenses(cameras: Sequence[Sequence[FittedModel]]) -> list[ModelChoice]:
@@ -109,7 +109,7 @@ def choose_lenses(cameras: Sequence[Sequence[FittedModel]]) -> list[ModelChoice]
     return out
 
 
-def twins(cameras: Sequence[Camera]) -> list[list[int]]:
+def like_cameras(cameras: Sequence[Camera]) -> list[list[int]]:
     """Return groups of like cameras, as lists of their indices: same image size, nearly the same focal length."""
     groups: list[list[int]] = []
     for k, camera in enumerate(cameras):

@@ -104,7 +104,9 @@ def fit_all(
     return options, failed
 
 
-def agreeing(observations: Observations, options: list[FittedModel]) -> tuple[BoolArray, tuple[tuple[str, str], ...]]:
+def agreeing_views(
+    observations: Observations, options: list[FittedModel]
+) -> tuple[BoolArray, tuple[tuple[str, str], ...]]:
     """Return which views agree with the model of the least scatter, and (image, reason) of the others."""
     best = _best(observations, options)
     kept = best.fit.kept.sum(axis=1)
@@ -142,7 +144,7 @@ def reweighted(observations: Observations, options: list[FittedModel]) -> Observ
     return observations.with_common_error(squared, best.fit.kept)
 
 
-def compared(observations: Observations, options: list[FittedModel], request: Request) -> list[FittedModel]:
+def cross_validated(observations: Observations, options: list[FittedModel], request: Request) -> list[FittedModel]:
     """Return the options refitted to the same corners where they are not yet, with their held-out errors."""
     sigma = [robust_sigma(o.fit, observations) for o in options] if len(options) > 1 else [0.0]
     near = [o.fit.kept for o, s in zip(options, sigma, strict=True) if s <= COMPARABLE * min(sigma)]

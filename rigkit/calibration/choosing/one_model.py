@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.choosing.board_orientation import turned_views, with_views_turned
+from rigkit.calibration.choosing.board_orientation import misnumbered_views, with_boards_renumbered
 from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, choose, described
 from rigkit.calibration.choosing.models_tried import (
     ModelInQuestion,
     Request,
-    agreeing,
-    compared,
+    agreeing_views,
+    cross_validated,
     fit_all,
     larger_sizes,
     reweighted,
@@ -22,7 +22,7 @@ from rigkit.calibration.result import Candidate
 from rigkit.calibration.solving.evidence import fit_shapes
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.linearise import normal_equations
-from rigkit.calibration.solving.shape import often_seen
+from rigkit.calibration.solving.shape import in_enough_views
 from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray
 
@@ -58,16 +58,16 @@ def solved(
     request: Request,
 ) -> ModelOutcome:
     """Return the outcome of one camera model, independent of the other models."""
-    keep, reasons = agreeing(observations, options)
+    keep, reasons = agreeing_views(observations, options)
     if reasons:
         observations = observations.subset(np.flatnonzero(keep))
         options, failed = fit_all(observations, request, wanted)
     observations = reweighted(observations, options)
-    options = compared(observations, options, request)
+    options = cross_validated(observations, options, request)
     beyond = [] if request.degree is not None else larger_sizes(choose(options, MIN_SIGMAS))
     if beyond:
         options, unfit = fit_all(observations, request, beyond, options)
-        options = compared(observations, options, request)
+        options = cross_validated(observations, options, request)
         failed = [*failed, *unfit]
     return chosen_of_sizes(observations, options, request, used=keep, reasons=reasons, failed=failed, beyond=beyond)
 
@@ -115,7 +115,7 @@ def with_board_shape(
     """Return the views, the fit with the board shape requested from that with `flat` boards, the shapes compared, and
     those as candidates. With "auto" the shape has the smallest held-out error. In the views returned, boards with
     rotational symmetry are numbered from the same corner."""
-    if request.board == "flat" or not often_seen(observations).any():
+    if request.board == "flat" or not in_enough_views(observations).any():
         return observations, flat, [flat], []
     observations, flat, fits = _fit_shapes(observations, flat, request.board)
     shapes, untried = _shapes(observations, flat, fits, request)
@@ -133,9 +133,9 @@ def _fit_shapes(
     fits = fit_shapes(observations, flat.fit, board)
     for quarter_turns in (1, 2):
         *_, richest = fits.values()
-        views = turned_views(observations, richest, quarter_turns)
+        views = misnumbered_views(observations, richest, quarter_turns)
         if views.any():
-            observations, state = with_views_turned(observations, flat.fit.state, views, quarter_turns)
+            observations, state = with_boards_renumbered(observations, flat.fit.state, views, quarter_turns)
             data = normal_equations(observations, state, flat.fit.weight(observations))
             flat = replace(flat, fit=replace(flat.fit, state=state, data=data))
             fits = fit_shapes(observations, flat.fit, board)
@@ -152,4 +152,4 @@ def _shapes(
         if "released" not in fits:
             reason = "not tried: residuals of the warp are consistent with noise"
             untried = [Candidate("board released", 0, float("nan"), None, False, reason)]
-    return compared(observations, options, request), untried
+    return cross_validated(observations, options, request), untried

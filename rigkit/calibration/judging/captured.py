@@ -88,7 +88,7 @@ def diagnose_capture(calibration: Calibration, clusters: IntArray, *, upright: b
     images = [view.image for view in calibration.views]
     number = clusters.tolist()
     return [
-        *(_repeated(images, number) if _hardly_any(images, number) else []),
+        *(_repeated(images, number) if _few_different(images, number) else []),
         *_too_few(images, number),
         *hardly_tilted(calibration),
         *_distances(calibration),
@@ -104,11 +104,11 @@ def hardly_tilted(c: Calibration) -> list[Finding]:
 def few_repeated(calibration: Calibration, clusters: IntArray) -> Iterator[Finding]:
     """Yield a finding about near-duplicate images where enough others are left."""
     images, number = [view.image for view in calibration.views], clusters.tolist()
-    if not _hardly_any(images, number):
+    if not _few_different(images, number):
         yield from _repeated(images, number)
 
 
-def _hardly_any(images: Sequence[str], number: Sequence[int]) -> bool:
+def _few_different(images: Sequence[str], number: Sequence[int]) -> bool:
     """Return whether few different images are left, or no more than half of all."""
     return len(set(number)) < FEW_IMAGES or 2 * len(set(number)) <= len(set(images))
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.assemble import with_solution
-from rigkit.calibration.judging.turned import flipped_pictures
+from rigkit.calibration.judging.turned import flipped_images
 from rigkit.calibration.judging.two_kinds import two_kinds
 from rigkit.calibration.judging.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
@@ -110,7 +110,7 @@ def changing(
         return []
     if solved is not None:
         shifted = changes["shift"].ratio >= MIN_VARIANCE_RATIO
-        flipped = flipped_pictures(calibration, evidence, *solved, clusters, shifted=shifted)
+        flipped = flipped_images(calibration, evidence, *solved, clusters, shifted=shifted)
         if flipped is not None:
             return [flipped]
     if not but and changes["lens"].ratio >= MIN_VARIANCE_RATIO and (kinds := two_kinds(calibration, evidence)):

@@ -54,7 +54,7 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
     scores, order = _ImageScores.of(fit, number), np.arange(len(images))
     first = scores.split_at(order)
     later = order >= first
-    named = _named_alike(images)
+    named = _of_other_name_kind(images)
     if named is not None and not (named == later).all() and not (named != later).all():
         distance = _lens_difference_sigmas(observations, fit, state, number, named, scores)
         if distance is not None:
@@ -163,7 +163,7 @@ class _ImageScores:
         return reached / (ORDERS + 1)
 
 
-def _named_alike(images: Sequence[str]) -> BoolArray | None:
+def _of_other_name_kind(images: Sequence[str]) -> BoolArray | None:
     """Return which images (N,) have another kind of name (without digits) than the first; None unless there are exactly
     two kinds with enough images each."""
     kinds = [DIGITS.sub("", name) for name in images]

@@ -58,7 +58,7 @@ NOT_FOLLOWED = 1e-10
 """Relative singular value up to which a direction common to all images is undetermined."""
 DISTANCES = (0.05, 0.95)
 """Quantiles of the corners' distances that are reported."""
-NOT_ONE_POINT = "the lens is not central"
+NOT_CENTRAL = "the lens is not central"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -91,7 +91,7 @@ class MovingPupil:
         gram = whole / np.outer(scale, scale)
         pupil = len(gram) - 2
         common = np.arange(pupil)
-        follow = _following(gram, common, pupil)
+        follow = _regression(gram, common, pupil)
         left = float(gram[pupil, pupil] - follow @ gram[common, pupil])
         if not left > MIN_PUPIL_PART:
             return None
@@ -100,14 +100,14 @@ class MovingPupil:
         information = left * scale[pupil] ** 2
         own, pull = products[:, :-1, :-1], products[:, :-1, -1]
         amount = float((pull @ direction).sum()) / information
-        step = _following(gram, np.arange(pupil + 1), -1) * scale[-1] / scale[:-1]
+        step = _regression(gram, np.arange(pupil + 1), -1) * scale[-1] / scale[:-1]
         after = np.bincount(image, (pull - own @ step) @ direction)
         share = np.bincount(image, own @ direction @ direction) / information
         variance = float((after**2 / np.maximum(1.0 - share, MIN_LEFT)).sum()) / information**2
         # Images of high leverage count for several.
         freedom = max(1.0 / float((share**2).sum()) - 1.0, 1.0)
         # The calibration itself could adapt its parameters and board shapes, but no displacements.
-        alone = _following(gram, np.append(common[:p], common[-BOWS:]), pupil)[:p] * scale[pupil] / scale[:p]
+        alone = _regression(gram, np.append(common[:p], common[-BOWS:]), pupil)[:p] * scale[pupil] / scale[:p]
         return cls(amount, float(np.sqrt(variance)), freedom, -amount * alone)
 
     @property
@@ -161,7 +161,7 @@ def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatA
     return np.concatenate(parts, axis=1), count
 
 
-def _following(gram: FloatArray, rows: IntArray, what: int) -> FloatArray:
+def _regression(gram: FloatArray, rows: IntArray, what: int) -> FloatArray:
     """Return the coefficients of the regression of the row `what` on `rows`, from their products `gram`."""
     return np.asarray(np.linalg.lstsq(gram[np.ix_(rows, rows)], gram[rows, what], rcond=NOT_FOLLOWED)[0])
 
@@ -176,10 +176,10 @@ def moving_pupil(calibration: Calibration, correlation: float, far: FarProjectio
     off = pupil.far_px(far)
     if off <= max(far.typical_px, SMALL_PX):
         return
-    nearest, farthest, rim = _shown(calibration)
+    nearest, farthest, rim = _distances_and_rim(calibration)
     moved = abs(pupil.mm_per_rad2) * rim**2
     yield Finding.look(
-        f"{NOT_ONE_POINT}: its entrance pupil moves by at least {moved:.1f} mm between the optical axis and the "
+        f"{NOT_CENTRAL}: its entrance pupil moves by at least {moved:.1f} mm between the optical axis and the "
         f"outermost corners (boards {nearest:.0f} to {farthest:.0f} mm away), which is not modelled; distant "
         f"points are projected with an error of at least {off:.2f} px",
         "calibrate at the distance of what is to be measured (with a larger board)",
@@ -190,10 +190,10 @@ def modelled_pupil(calibration: Calibration) -> Iterator[Finding]:
     """Yield a finding with the movement of a pupil that is part of the calibration."""
     if calibration.pupil is None:
         return
-    nearest, farthest, rim = _shown(calibration)
+    nearest, farthest, rim = _distances_and_rim(calibration)
     mm, sigma = calibration.pupil.shift_mm(rim)
     yield Finding.good(
-        f"{NOT_ONE_POINT}, which is modelled: its entrance pupil moves by {mm:.2f} +- "
+        f"{NOT_CENTRAL}, which is modelled: its entrance pupil moves by {mm:.2f} +- "
         f"{calibration.widening * sigma:.2f} mm between the optical axis and the outermost corners "
         f"({np.degrees(rim):.0f} degrees; boards {nearest:.0f} to {farthest:.0f} mm away); exports to central "
         "models omit it and are exact for distant points only"
@@ -211,7 +211,7 @@ def may_move(calibration: Calibration) -> bool:
     return pupil.far_px(FarProjection.of(calibration)) > MIN_FOUND * SMALL_PX
 
 
-def _shown(calibration: Calibration) -> tuple[float, float, float]:
+def _distances_and_rim(calibration: Calibration) -> tuple[float, float, float]:
     """Return the DISTANCES of the corners, mm, and their largest angle from the axis, rad."""
     points = calibration.corners.in_cam(np.flatnonzero(calibration.corners.kept))
     distance = np.linalg.norm(points, axis=1)

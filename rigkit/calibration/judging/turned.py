@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.assemble import with_solution
-from rigkit.calibration.choosing.board_orientation import with_views_turned
+from rigkit.calibration.choosing.board_orientation import with_boards_renumbered
 from rigkit.calibration.judging.two_kinds import MIN_LEAD, split_entropy, split_in_two
 from rigkit.calibration.judging.view_evidence import ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
@@ -58,7 +58,7 @@ class _Back:
     squares: float
 
 
-def flipped_pictures(
+def flipped_images(
     calibration: Calibration,
     evidence: ViewEvidence,
     observations: Observations,
@@ -74,9 +74,9 @@ def flipped_pictures(
     """
     before = float(weighted_squares(fit.state, observations, fit.weight(observations)).sum())
     tried = [
-        _put_back_in_turn(way, at, turns, observations, fit, before)
+        _alternated(way, at, turns, observations, fit, before)
         for way in WAYS
-        for at, turns in _first_guesses(way, evidence if shifted else None, observations, fit)
+        for at, turns in _initial_flips(way, evidence if shifted else None, observations, fit)
     ]
     if not tried or not before > 0.0:
         return None
@@ -87,13 +87,13 @@ def flipped_pictures(
     return None if now is None else _finding_of(back, before, now)
 
 
-def _first_guesses(
+def _initial_flips(
     way: str, evidence: ViewEvidence | None, observations: Observations, fit: Fit
 ) -> Iterator[tuple[BoolArray, IntArray]]:
     """Yield which views (V,) may be flipped, and the quarter turns by which their boards are then numbered differently:
     the views that fit better flipped with lens and boards held, and those of one of two clusters of principal points.
     """
-    better, gain, turns = _better_put_back(way, observations, fit.state, fit)
+    better, gain, turns = _fitting_better_flipped(way, observations, fit.state, fit)
     if gain > MIN_FIRST_GAIN and not better.all():
         yield better, turns
     kinds = evidence and split_in_two(
@@ -105,22 +105,20 @@ def _first_guesses(
         yield at, turns
 
 
-def _put_back_in_turn(
-    way: str, at: BoolArray, turns: IntArray, observations: Observations, fit: Fit, before: float
-) -> _Back:
+def _alternated(way: str, at: BoolArray, turns: IntArray, observations: Observations, fit: Fit, before: float) -> _Back:
     """Return the solution from a first guess of which views are flipped, by alternating solution and test. A guess that
     explains nothing of the sum of squares `before` is not improved: as many views are wrong in it as right."""
-    begun, state = _put_back(way, at, turns, observations, fit.state)
+    begun, state = _flipped(way, at, turns, observations, fit.state)
     state, _ = refine_poses(begun, state, fit.weight(observations), tolerance=START_TOLERANCE)
     for _ in range(ROUNDS):
         found = _solved(way, at, begun, state, fit)
         if found.squares >= before:
             break
-        wrong, _, turns = _better_put_back(way, found.observations, found.state, fit)
+        wrong, _, turns = _fitting_better_flipped(way, found.observations, found.state, fit)
         at = at ^ wrong
         if not wrong.any() or at.all() or not at.any():
             break
-        begun, state = _put_back(way, wrong, turns, found.observations, found.state)
+        begun, state = _flipped(way, wrong, turns, found.observations, found.state)
     return found
 
 
@@ -130,14 +128,16 @@ def _solved(way: str, at: BoolArray, observations: Observations, state: State, f
     return _Back(way, at, observations, state, float(weighted_squares(state, observations, weight).sum()))
 
 
-def _better_put_back(way: str, observations: Observations, state: State, fit: Fit) -> tuple[BoolArray, float, IntArray]:
+def _fitting_better_flipped(
+    way: str, observations: Observations, state: State, fit: Fit
+) -> tuple[BoolArray, float, IntArray]:
     """Return which views (V,) fit better flipped, with lens and boards held, the relative decrease of the sum of
     squares, and the quarter turns (V,) by which their boards are then numbered differently: a mirrored board is
     numbered from either end, as is one with rotational symmetry."""
     every, weight = np.ones(len(observations.views), dtype=bool), fit.weight(observations)
     now, costs = weighted_squares(state, observations, weight), []
     for turns in (0, 2):
-        flipped, start = _put_back(way, every, np.full(len(every), turns), observations, state)
+        flipped, start = _flipped(way, every, np.full(len(every), turns), observations, state)
         cost = refine_poses(flipped, start, weight, tolerance=START_TOLERANCE)[1]
         numbered = turns == 2 and WAYS[way].prod() > 0.0
         costs.append(np.where([numbered and not view.board.looks_same_turned for view in flipped.views], np.inf, cost))
@@ -147,7 +147,7 @@ def _better_put_back(way: str, observations: Observations, state: State, fit: Fi
     return better, gain, 2 * np.argmin(costs, axis=0)
 
 
-def _put_back(
+def _flipped(
     way: str, at: BoolArray, turns: IntArray, observations: Observations, state: State
 ) -> tuple[Observations, State]:
     """Return observations and poses with the images of the views `at` (V,) flipped in one of the `WAYS`, and their
@@ -169,7 +169,7 @@ def _put_back(
         rotation[k], translation[k] = picture[:, None] * rotation[k] * board, picture * translation[k]
     out = replace(observations, pixels=pixels, corner=corner, views=tuple(views))
     state = replace(state, rotation=rotation, translation_mm=translation)
-    return with_views_turned(out, state, at & (turns == 2), 2)
+    return with_boards_renumbered(out, state, at & (turns == 2), 2)
 
 
 def _finding_of(back: _Back, before: float, evidence: ViewEvidence) -> Finding | None:

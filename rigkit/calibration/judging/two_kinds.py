@@ -81,7 +81,7 @@ def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | Non
     name = min(found, key=lambda name: found[name].cost, default=None)
     if name is None or (best := found[name]).cost > -MIN_LEAD:
         return None
-    if best.cost > _otherwise(calibration, evidence, best) - MIN_LEAD:
+    if best.cost > _criterion_of_other_causes(calibration, evidence, best) - MIN_LEAD:
         return None
     how = f" (focal lengths {100.0 * abs(best.step[0]):.1f} % apart)" if name in ("focus", "lens") else ""
     views = [calibration.views[k] for k in evidence.views]
@@ -160,7 +160,7 @@ def _explained(amount: FloatArray, weight: FloatArray, causes: FloatArray) -> Fl
     return np.asarray((len(amount) - 2) * np.log(np.maximum(left, np.finfo(float).eps)))
 
 
-def _otherwise(calibration: Calibration, evidence: ViewEvidence, kinds: Kinds) -> float:
+def _criterion_of_other_causes(calibration: Calibration, evidence: ViewEvidence, kinds: Kinds) -> float:
     """Return the information criterion of the best other cause of the amounts: position, distance and tilt of the
     boards, and which board it was; each as a linear function or as a step."""
     at = np.array(evidence.views)

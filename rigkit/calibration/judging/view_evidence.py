@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.certainty.departures import turned_rays
+from rigkit.calibration.certainty.departures import rotation_derivatives
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.core.arrays import FloatArray, IntArray, Points
 
@@ -214,7 +214,7 @@ def rows_of(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[Floa
     x, y = flat / np.maximum.reduceat(np.abs(flat).max(axis=0), start)[view]
     centre = calibration.camera.axis_px
     along_u, along_v = centred(pixels) / np.array(calibration.camera.size_px)[:, None]
-    rows[:, :3] = turned_rays(lever, d_pixels_d_point)
+    rows[:, :3] = rotation_derivatives(lever, d_pixels_d_point)
     of_kind = {kind: rows[:, own] for kind, own in columns_of(rows.shape[1]).items()}
     out_of_plane = (d_pixels_d_point * rotation[:, 2]).sum(axis=1)
     for k, bow in enumerate((x * x, x * y, y * y)):

@@ -23,7 +23,7 @@ is not flat), some tens for boards that moved by a millimetre against each other
 LIKE_BOARDS = "{0} boards of {1}x{2} corners"
 
 
-def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[Finding, ...]:
+def suggest_rigid_boards(views: Sequence[BoardView], calibration: Calibration) -> tuple[Finding, ...]:
     """Return a finding if boards kept their relative poses in all images that show several of them.
 
     `views` are those of the calibration, with their boards.

@@ -13,21 +13,21 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
-from rigkit.calibration.choosing.begun import BegunCalibration, about_camera
+from rigkit.calibration.choosing.begun import BegunCalibration, camera_named_in_errors
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig
 from rigkit.calibration.rig.heldout import heldout_rms
-from rigkit.calibration.rig.joint import BAD, JointRig, solve_jointly
+from rigkit.calibration.rig.joint import BAD_COST_SIGMAS, JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.known import KnownCameras
 from rigkit.calibration.rig.solving.lags import TIMINGS
 from rigkit.calibration.rig.verdicts import diagnose_rig
 from rigkit.calibration.rig.views.board_places import board_places
-from rigkit.calibration.rig.views.mispaired import put_together_wrongly, same_pictures, why_nothing_agrees
+from rigkit.calibration.rig.views.mispaired import duplicate_images, mixup_of_all_frames, mixups_of_frames
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews, frame_observations
-from rigkit.calibration.with_pupil import pupil_moves_significantly, require_known
+from rigkit.calibration.with_pupil import pupil_is_significant, require_known
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
@@ -95,7 +95,7 @@ def calibrate_rig(
     def each_alone(seen: Views) -> RigViews:
         return _each_alone(seen, requests, known, begun, progress)
 
-    same = same_pictures(views)
+    same = duplicate_images(views)
     every, notes = each_alone(views), tuple[Finding, ...]()
     if rigid_boards:
         every, notes = _on_rigid_boards(every, views, rigid_boards, each_alone, shaped=board != "flat")
@@ -150,16 +150,16 @@ def _mistakes_named(views: RigViews) -> Iterator[None]:
     try:
         yield
     except DegenerateError as error:
-        cause = why_nothing_agrees(views)
+        cause = mixup_of_all_frames(views)
         raise error if cause is None else DegenerateError(f"rig: {cause.text} ({error})") from error
 
 
 def _mispaired(rig: RigCalibration, views: RigViews, cost_sigmas: float) -> list[Finding]:
     """Return findings on file mix-ups that explain the frames left out, or all frames if most of them disagree."""
-    if cost_sigmas > BAD and (cause := why_nothing_agrees(views)):
+    if cost_sigmas > BAD_COST_SIGMAS and (cause := mixup_of_all_frames(views)):
         return [cause]
     mounts, left_out = [camera.cam_from_rig for camera in rig.cameras], [key[:2] for key in rig.left_out]
-    return put_together_wrongly(views, mounts, left_out)
+    return mixups_of_frames(views, mounts, left_out)
 
 
 def _require_entries(views: Views, **given: object) -> None:
@@ -223,7 +223,7 @@ def _each_alone(
             asked.append((name, alone, request))
             continue
         lens, _ = known.cameras[name]
-        with about_camera(name, ()):
+        with camera_named_in_errors(name, ()):
             found[name] = posed_calibration(alone, lens, known.of_lens(name), board=request.board, folds=request.folds)
     names = [name for name, _, _ in asked]
     found |= dict(zip(names, calibrate_together(asked, known=begun, progress=progress), strict=True))
@@ -242,7 +242,7 @@ def _with_pupils_too(cameras: Sequence[tuple[str, Sequence[BoardView], Request]]
             (moving,) = calibrate_together([(name, views, replace(request, pupil="moving"))])
         except DegenerateError:
             continue
-        if pupil_moves_significantly(moving):
+        if pupil_is_significant(moving):
             out[name] = moving
     return out
 

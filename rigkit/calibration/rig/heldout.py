@@ -6,7 +6,7 @@ import numpy as np
 
 from rigkit.calibration.choosing.heldout import MIN_IMAGES_OF_FIT
 from rigkit.calibration.rig.joint import JointRig
-from rigkit.calibration.rig.solving.shutters import read_on, readout_steps
+from rigkit.calibration.rig.solving.shutters import readout_steps, with_longer_readouts
 from rigkit.calibration.rig.solving.solver import refine_frames, solve_rig
 from rigkit.calibration.rig.solving.state import RigObservations
 from rigkit.calibration.solving.solver import FROM_OPTIMUM
@@ -37,7 +37,7 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
         solved = solve_rig(train, state, joint.sigma_px, FROM_OPTIMUM).state
         part, start = observations.subset(test), solved.with_frames(state)
         if joint.timing == "readouts":
-            part = read_on(part, start, readout_steps(train, solved)[0])
+            part = with_longer_readouts(part, start, readout_steps(train, solved)[0])
         found = refine_frames(part, start)
         for c, (own, weight) in enumerate(zip(part.cameras, part.weights, strict=True)):
             squared[c] += float(weighted_squares(found.of_camera(c, part), own, weight).sum())

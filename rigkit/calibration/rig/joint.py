@@ -18,17 +18,23 @@ from rigkit.calibration.rig.views.board_sizes import board_size_conflicts
 from rigkit.calibration.rig.views.disagree import (
     DISAGREES,
     MIN_PX,
-    bad_ones,
     cost_of_sharing,
-    masked,
-    part,
-    part_far,
+    outlier_may_be_hidden,
+    outlier_targets,
+    reason_left_out,
+    separate_distant_views,
+    separate_views,
     shared_keys,
     typical_cost,
     typical_distance_px,
-    why,
 )
-from rigkit.calibration.rig.views.frames import first_frames, mounts_of, places_of, separation, turned_alike
+from rigkit.calibration.rig.views.frames import (
+    initial_target_poses,
+    mounts_of,
+    places_of,
+    view_distances_px,
+    with_common_orientation,
+)
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews
 from rigkit.calibration.solving.solver import Solution
 from rigkit.calibration.views.folds import folds_of
@@ -41,12 +47,12 @@ from rigkit.core.identifiers import natural_key
 from rigkit.core.progress import Progress
 from rigkit.geometry.rigid3 import Rigid3
 
-NOTHING_IN_COMMON = 0.1
+MAX_DISTANCE_OF_SIZE = 0.1
 """Typical distance between views that share a pose, as a part of the boards' size in the images, from which the cameras
 do not see the same. A board that moves in front of cameras without a common trigger gives a pixel or two, 1 or 2 % of
 its size; such frames are still measurements, whose error is in the scatter between frames. Different boards, or frames
 that do not belong together, are as far apart as they are large."""
-BAD = 10.0
+BAD_COST_SIGMAS = 10.0
 """Typical cost of sharing a pose, as a multiple of the corners' noise, from which a rig is not good: it is so much
 worse than its cameras."""
 MIN_SHARE = 0.5
@@ -133,11 +139,11 @@ def solve_jointly(
     """
     mounts, notes = mounts_of(views)
     mounts = list(mounts) if known is None else known.mounts(views.names, mounts)
-    views = turned_alike(views, mounts)
+    views = with_common_orientation(views, mounts)
     seen, single = views.seen, views.single
     sizes, also = board_size_conflicts(views), tuple[Finding, ...]()
     shared = len(shared_keys(seen))
-    left_out = part_far(seen, separation(views, mounts))
+    left_out = separate_distant_views(seen, view_distances_px(views, mounts))
     sigma = _sigma(single)
     for i in range(MAX_ROUNDS):
         progress("rig", i, MAX_ROUNDS)
@@ -146,27 +152,27 @@ def solve_jointly(
         observations, solution = _with_lags(views, observations, solution, sigma, timing)
         cost = cost_of_sharing(observations, solution, seen)
         typical = typical_cost(cost, sigma)
-        worse = bad_ones(cost, typical)
-        if not worse and masked(cost, sigma):
-            worse = _one_bad(views, mounts, sigma, cost, known)
+        worse = outlier_targets(cost, typical)
+        if not worse and outlier_may_be_hidden(cost, sigma):
+            worse = _single_outlier(views, mounts, sigma, cost, known)
         if not worse or i == MAX_ROUNDS - 1:
             break
         for key in worse:
             how = f"{np.sqrt(cost[key] / max(sigma, MIN_PX) ** 2):.1f} times the corners' noise"
-            left_out.append((*key, why(seen, key, how)))
-            part(seen, key)
+            left_out.append((*key, reason_left_out(seen, key, how)))
+            separate_views(seen, key)
         state = solution.state
         mounts = [Rigid3(r, t) for r, t in zip(state.mount_rotation, state.mount_mm, strict=True)]
     progress("rig", MAX_ROUNDS, MAX_ROUNDS)
     typical_sigmas = float(np.sqrt(typical) / max(sigma, MIN_PX))
     typical_px, size_px = typical_distance_px(observations, cost), _boards_px(seen)
-    if typical_px > NOTHING_IN_COMMON * size_px:
+    if typical_px > MAX_DISTANCE_OF_SIZE * size_px:
         raise DegenerateError(
             f"rig: the views of a frame disagree by {typical_px:.0f} px on the boards' poses (boards are {size_px:.0f} "
             f"px large); {_advice(seen)}"
         )
     if typical_sigmas > DISAGREES:
-        observations = replace(observations, held=_held(single, sigma, typical_sigmas**2 - 1.0))
+        observations = replace(observations, held=_lens_priors(single, sigma, typical_sigmas**2 - 1.0))
         if known is not None:
             observations = known.hold(observations, solution.state, views.names)
         solution = solve_rig(observations, solution.state, sigma)
@@ -187,7 +193,7 @@ def _solved(
     views: RigViews, mounts: Sequence[Rigid3], sigma: float, known: KnownCameras | None
 ) -> tuple[RigObservations, Solution[RigState]]:
     observations, unknowns = _observations(views, sigma)
-    frame_rotation, frame_mm = first_frames(observations.keys, views, mounts)
+    frame_rotation, frame_mm = initial_target_poses(observations.keys, views, mounts)
     boards = observations.cameras[0].boards
     board_rotation, board_mm = places_of((board.board_id for board in boards), views.places)
     start = RigState(
@@ -239,10 +245,14 @@ def _disagreement(cost: Mapping[Key, float], sigma: float, typical: tuple[float,
         f"{frames}; intrinsics are held near those of each camera alone, and the rig's sigmas follow from the "
         "disagreement between frames"
     )
-    return Finding(severity=Severity.BAD if typical_sigmas > BAD else Severity.LOOK, message=message, remedy=remedy)
+    return Finding(
+        severity=Severity.BAD if typical_sigmas > BAD_COST_SIGMAS else Severity.LOOK, message=message, remedy=remedy
+    )
 
 
-def _held(single: Sequence[Calibration], sigma: float, weight: float) -> tuple[tuple[FloatArray, FloatArray], ...]:
+def _lens_priors(
+    single: Sequence[Calibration], sigma: float, weight: float
+) -> tuple[tuple[FloatArray, FloatArray], ...]:
     """Return the prior mean and information of each lens: that of its own calibration, times `weight`.
 
     If sharing poses typically costs s times as much as by chance, the constraints from shared poses have s times the
@@ -256,7 +266,7 @@ def _held(single: Sequence[Calibration], sigma: float, weight: float) -> tuple[t
     return tuple(out)
 
 
-def _one_bad(
+def _single_outlier(
     views: RigViews, mounts: Sequence[Rigid3], sigma: float, cost: Mapping[Key, float], known: KnownCameras | None
 ) -> list[Key]:
     """Return the one target, if any, without which the others agree: with few targets an outlier shifts the mounts so
@@ -264,7 +274,7 @@ def _one_bad(
     found: list[tuple[float, float, Key]] = []
     for key in sorted(cost, key=lambda k: -cost[k])[:TRIED]:
         trial = views.with_seen([dict(own) for own in views.seen])
-        part(trial.seen, key)
+        separate_views(trial.seen, key)
         try:
             mounts_of(trial)
         except InputError:

@@ -43,14 +43,14 @@ def fit_shapes(observations: Observations, fit: Fit, board: str) -> dict[str, Fi
     boards. With "auto" corners are only released where they deviate significantly from the warp."""
     shape = shape_model("warp", observations)
     start = replace(fit.state, shape=shape, unknowns=np.zeros(shape.count))
-    state, kept = _evident(observations, start, fit.kept)
+    state, kept = _with_estimated_priors(observations, start, fit.kept)
     found: dict[str, Fit] = {}
     if board != "released":
         found["warp"] = warp = fit_kept(observations, state, kept, settle=True)
         state, kept = warp.state, warp.kept
-    if board == "released" or (board == "auto" and _stray(observations, state, kept)):
+    if board == "released" or (board == "auto" and _corners_depart(observations, state, kept)):
         shape, unknowns = state.shape.richer("released", observations, state.unknowns)
-        state, kept = _evident(observations, replace(state, shape=shape, unknowns=unknowns), kept)
+        state, kept = _with_estimated_priors(observations, replace(state, shape=shape, unknowns=unknowns), kept)
         found["released"] = fit_kept(observations, state, kept, settle=True)
     return found
 
@@ -61,7 +61,7 @@ def chance_limit(count: int) -> float:
     return float(count + CHANCE_SIGMAS * np.sqrt(2.0 * count))
 
 
-def _stray(observations: Observations, state: State, kept: BoolArray) -> bool:
+def _corners_depart(observations: Observations, state: State, kept: BoolArray) -> bool:
     """Return whether corners deviate significantly from the warp: the decrease of the cost by releasing each alone,
     g^T H^-1 g, is chi-squared with as many degrees of freedom as the views determine directions of it."""
     shape = replace(shape_model("released", observations), basis=state.shape.basis)
@@ -82,7 +82,7 @@ def _stray(observations: Observations, state: State, kept: BoolArray) -> bool:
     return bool(less.sum() > variance * chance_limit(count))
 
 
-def _evident(observations: Observations, state: State, kept: BoolArray) -> tuple[State, BoolArray]:
+def _with_estimated_priors(observations: Observations, state: State, kept: BoolArray) -> tuple[State, BoolArray]:
     """Return the state, roughly solved, with prior widths that maximise the evidence, and the corners to keep."""
     norm = evaluate(state, observations).weighted(observations)
     for _ in range(SIZE_ROUNDS):

@@ -87,7 +87,7 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
         here = _Found.at(start, normal_equations(observations, start), observations)
         if not np.isfinite(here.sigma_px):
             continue
-        found = _clean(observations, here) or _robust(observations, start, here.sigma_px)
+        found = _without_outliers(observations, here) or _robust(observations, start, here.sigma_px)
         if best is None or found.sigma_px < best.sigma_px:
             best = found
         if found.sigma_px < GOOD_ENOUGH * size_px[0]:
@@ -122,7 +122,7 @@ class _Found:
         return cls(state, data.residuals[0].px, norm, sigma_of(norm, observations.present), data)
 
 
-def _clean(observations: Observations, start: _Found) -> _Found | None:
+def _without_outliers(observations: Observations, start: _Found) -> _Found | None:
     """Return the state after one step of least squares if it has no outlier, None otherwise: a robust solve is then
     unnecessary."""
     sigma = start.sigma_px
@@ -250,10 +250,12 @@ def identifiable(fit: Fit) -> bool:
     camera = fit.state.camera
     sigma = fit.sigma_px * np.sqrt(np.diag(fit.normal.covariance[0])[: camera.parameters.size])
     # Models limit each parameter by itself: if all steps at once are within the limits, each alone is.
-    return _exists(camera, sigma) or all(_exists(camera, step) or _exists(camera, -step) for step in np.diag(sigma))
+    return _within_limits(camera, sigma) or all(
+        _within_limits(camera, step) or _within_limits(camera, -step) for step in np.diag(sigma)
+    )
 
 
-def _exists(camera: Camera, step: FloatArray) -> bool:
+def _within_limits(camera: Camera, step: FloatArray) -> bool:
     """Return whether the parameters plus `step` (P,) are within the model's limits."""
     try:
         camera.with_parameters(camera.parameters + step)

@@ -105,28 +105,28 @@ def shape_model(kind: str, observations: Observations) -> ShapeModel:
     if kind == "warp":
         return warp
     # Released corners move relative to a warp: a bow costs a few numbers, not the prior of every corner.
-    often = often_seen(observations)
+    often = in_enough_views(observations)
     released = np.flatnonzero(np.repeat(often, np.diff(observations.first_row)))
     each = [flat[_rows(observations, board)] for board in np.flatnonzero(often).tolist()]
     sigma = np.concatenate([warp.sigma, *(np.tile(released_sigma(points), len(points)) for points in each)])
     return ShapeModel("released", flat, warp.basis, sigma, released)
 
 
-def often_seen(observations: Observations) -> BoolArray:
+def in_enough_views(observations: Observations) -> BoolArray:
     """Return which boards, (boards,), are in enough views to determine their shape (in one view a bow is a pose)."""
     return np.bincount(observations.board, minlength=len(observations.boards)) >= MIN_VIEWS
 
 
 def warp_groups(observations: Observations) -> Iterator[IntArray]:
     """Yield the unknowns of the warp with a common prior width, board by board: bows, stretches."""
-    for i in range(int(often_seen(observations).sum())):
+    for i in range(int(in_enough_views(observations).sum())):
         yield from (WARP_UNKNOWNS * i + part for part in (BOWS, STRETCHES))
 
 
 def released_groups(observations: Observations, first: int) -> Iterator[IntArray]:
     """Yield the unknowns of the released corners, from index `first` on, with a common prior width: in the plane, and
     out of it. Border corners have widths of their own: paper curls there, and a detector sees one neighbour less."""
-    for board in (b for b, often in zip(observations.boards, often_seen(observations), strict=True) if often):
+    for board in (b for b, often in zip(observations.boards, in_enough_views(observations), strict=True) if often):
         grid = board.grid()
         border = ((grid == 0) | (grid == np.array(board.size) - 1)).any(axis=1)
         for chosen in (border, ~border):
@@ -149,7 +149,7 @@ def _half_diagonal(points: Points) -> float:
 
 
 def _warp(observations: Observations, flat: Points) -> ShapeModel:
-    often = np.flatnonzero(often_seen(observations))
+    often = np.flatnonzero(in_enough_views(observations))
     basis = np.zeros((len(flat), 3, WARP_UNKNOWNS * len(often)))
     sigma = [np.zeros(0)]
     for i, board in enumerate(often.tolist()):

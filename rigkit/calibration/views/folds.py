@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.calibration.views.repeats import close_pairs, joined, places_of
+from rigkit.calibration.views.repeats import close_pairs, connected_components, places_of
 from rigkit.core.arrays import FloatArray, IntArray, Pixels
 
 NEARLY_ALIKE = 0.02
@@ -37,7 +37,7 @@ def folds_of(pixels: Sequence[Pixels], clusters: IntArray, folds: int) -> IntArr
     places = _means(places_of(pixels)[:, 1:], clusters)
     folds = min(folds, len(places))
     group = _nearly_alike(places, folds)
-    return _dealt(_means(places, group), np.bincount(group), folds)[group]
+    return _assigned(_means(places, group), np.bincount(group), folds)[group]
 
 
 def _means(values: FloatArray, group: IntArray) -> FloatArray:
@@ -52,13 +52,13 @@ def _nearly_alike(places: FloatArray, folds: int) -> IntArray:
     reach, most = NEARLY_ALIKE * float(places[:, 2:].mean()), -(-len(places) // folds)
     while True:
         one, other = close_pairs(places, reach)
-        group = np.unique(joined(one, other, len(places)), return_inverse=True)[1].astype(np.int64)
+        group = np.unique(connected_components(one, other, len(places)), return_inverse=True)[1].astype(np.int64)
         if not len(one) or np.bincount(group).max() <= most:
             return group
         reach *= 0.5
 
 
-def _dealt(places: FloatArray, size: IntArray, folds: int) -> IntArray:
+def _assigned(places: FloatArray, size: IntArray, folds: int) -> IntArray:
     """Return the fold (G,) of groups of so many images each. Groups are assigned in the order of their distance from
     the mean, each to the fold, of those with the fewest images so far, whose sum is most opposite to it."""
     centre, extents = places[:, :2], np.maximum(places[:, 2:], np.finfo(float).tiny)

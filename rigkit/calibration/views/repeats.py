@@ -40,7 +40,7 @@ def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequen
     number = {image: i for i, image in enumerate(shown)}
     for group in alike.values():
         one, other = close_pairs(places[np.array(group)].reshape(len(group), -1), REPEATED_PX)
-        for later, first in enumerate(joined(one, other, len(group)).tolist() if len(one) else ()):
+        for later, first in enumerate(connected_components(one, other, len(group)).tolist() if len(one) else ()):
             number[images[group[later][0]]] = number[images[group[first][0]]]
     _, dense = np.unique([number[name] for name in images], return_inverse=True)
     return dense.astype(np.int64)
@@ -74,7 +74,7 @@ def close_pairs(points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
     return pairs[:, 0], pairs[:, 1]
 
 
-def joined(one: IntArray, other: IntArray, count: int) -> IntArray:
+def connected_components(one: IntArray, other: IntArray, count: int) -> IntArray:
     """Return for each of `count` things the first one of its connected component, for edges (P,) each."""
     first = np.arange(count)
     while True:

@@ -111,7 +111,7 @@ def other_size(
     a declared board and never that board: in the other images it was part of a larger board.
     """
     listed = {frozenset(board.size) for board in boards}
-    found = [_put_together(own) for own in detections.values() if own]
+    found = [_extents_in_image(own) for own in detections.values() if own]
     # Sizes in the units of each pattern: tags, not the corners of tags.
     declared = sorted(boards, key=lambda board: board.size)
     sizes = ", ".join(dict.fromkeys(b.describe().split(", ")[0].removesuffix(" inner corners") for b in declared))
@@ -181,7 +181,7 @@ class _Extent:
     whole: bool
 
 
-def _put_together(own: Sequence[BoardDetection]) -> list[_Extent]:
+def _extents_in_image(own: Sequence[BoardDetection]) -> list[_Extent]:
     """Return the grids of an image; two that touch along a whole side are merged."""
     seen = [_Extent((one.columns, one.rows), _reach(one), one.complete) for one in own]
     for i, j in combinations(range(len(own)), 2):

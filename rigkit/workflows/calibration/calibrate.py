@@ -9,7 +9,7 @@ from pathlib import Path
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging.verdicts import diagnose_session
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig.board_ties import suggest_ties
+from rigkit.calibration.rig.board_ties import suggest_rigid_boards
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.printing import brief
@@ -153,7 +153,7 @@ def calibration_from(
             if shown is None:
                 raise
             raise InputError(f"{shown} ({error})") from error
-    also = [*suggest_ties(views, result), *interlaced(result, named_images(session))]
+    also = [*suggest_rigid_boards(views, result), *interlaced(result, named_images(session))]
     verdicts = diagnose_session(result, dropped, also)
     if verdicts[0].severity is Severity.BAD:
         shown = misread(session.images, session.boards)

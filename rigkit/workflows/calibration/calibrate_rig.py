@@ -9,7 +9,7 @@ from pathlib import Path
 from rigkit.calibration.certainty.coverage import outline_of_corners
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig.board_ties import suggest_ties
+from rigkit.calibration.rig.board_ties import suggest_rigid_boards
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.errors import DegenerateError, InputError
@@ -221,7 +221,9 @@ def rig_from(
     rig = named_by_rule(session, rig)
     if not session.rigid_boards:
         ties = [
-            s for own, c in zip(views.values(), rig.single, strict=True) for s in suggest_ties([v for _, v in own], c)
+            s
+            for own, c in zip(views.values(), rig.single, strict=True)
+            for s in suggest_rigid_boards([v for _, v in own], c)
         ]
         rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(ties)))
     if rig.verdicts[0].severity is Severity.BAD:

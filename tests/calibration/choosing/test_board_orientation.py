@@ -9,7 +9,7 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_difference, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.choosing.board_orientation import _improved, board_turn, same_looks, with_views_turned
+from rigkit.calibration.choosing.board_orientation import _improved, board_turn, symmetry_turns, with_boards_renumbered
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.state import State, evaluate
 from rigkit.calibration.views.observations import Observations
@@ -121,7 +121,7 @@ def test_the_worst_sign_is_turned_as_long_as_that_gains() -> None:
 def test_a_board_with_a_first_corner_is_left_alone(rng: np.random.Generator) -> None:
     board = Board("9x6", 9, 6, 30.0, 30.0)
     views, _ = scene("print", board, 15, rng)
-    assert same_looks(board) == (0,)
+    assert symmetry_turns(board) == (0,)
     assert not changed(calibrate(views, SIZE, model="brown", board="released"), views).any()
 
 
@@ -145,7 +145,7 @@ def test_recounting_moves_no_flat_corner(board: Board, quarter_turns: int, rng: 
     views, rotation, translation = random_views(lens("reg"), 3, rng, reach_deg=30.0, board=board)
     observations = Observations.from_views(views)
     state = State.start(lens("reg"), rotation, translation, observations)
-    again, moved = with_views_turned(observations, state, np.array([True, False, True]), quarter_turns)
+    again, moved = with_boards_renumbered(observations, state, np.array([True, False, True]), quarter_turns)
     assert (again.views[1].grid == views[1].grid).all() and (again.views[0].grid != views[0].grid).any()
     assert np.allclose(evaluate(moved, again).px, evaluate(state, observations).px, atol=1e-8)
     back = board_turn(board, quarter_turns).apply(board.points())
@@ -162,6 +162,6 @@ def test_recounting_keeps_the_table_of_boards(rng: np.random.Generator) -> None:
     both = Observations.from_views([(*views[0], *views[1])[i] for i in order]).subset(np.arange(1, 4))
     poses = np.concatenate(rotation)[order[1:]], np.concatenate(translation)[order[1:]]
     state = State.start(lens("reg"), *poses, both)
-    again, moved = with_views_turned(both, state, np.array([True, True, False]), 2)
+    again, moved = with_boards_renumbered(both, state, np.array([True, True, False]), 2)
     off = evaluate(moved, again).px - evaluate(state, both).px
     assert np.abs(off[both.present]).max() < 1e-8

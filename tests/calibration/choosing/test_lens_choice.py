@@ -20,7 +20,7 @@ from rigkit.calibration.certainty.uncertainty import (
 )
 from rigkit.calibration.choosing.between_models import rival_fits, rival_shapes
 from rigkit.calibration.choosing.choice import FittedModel, HeldOut, choose, described, settled
-from rigkit.calibration.choosing.lens_choice import choose_lenses, twins
+from rigkit.calibration.choosing.lens_choice import choose_lenses, like_cameras
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.choosing.one_model import ModelOutcome
 from rigkit.calibration.result import Rival
@@ -98,9 +98,9 @@ def test_models_that_err_alike_but_for_rounding_share() -> None:
 def test_twins_have_images_of_one_size_and_nearly_one_focal_length() -> None:
     reg, wide = lens("reg"), lens("wide")
     near = reg.with_parameters(reg.parameters * np.array([1.03, 1.03, *[1.0] * 7]))
-    assert twins([reg, wide, near]) == [[0, 2], [1]]
+    assert like_cameras([reg, wide, near]) == [[0, 2], [1]]
     small = KannalaBrandt((800, 600), wide.parameters)
-    assert twins([wide, small]) == [[0], [1]]
+    assert like_cameras([wide, small]) == [[0], [1]]
 
 
 def test_a_model_that_did_not_converge_is_not_chosen_beside_one_that_did(

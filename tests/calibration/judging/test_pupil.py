@@ -173,7 +173,7 @@ def test_the_option_pupil_decides_whether_one_is_solved_for() -> None:
 
 
 def test_an_insignificant_pupil_is_dropped_with_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rigkit.calibration.calibrate.pupil_moves_significantly", lambda _: False)
+    monkeypatch.setattr("rigkit.calibration.calibrate.pupil_is_significant", lambda _: False)
     found = session(NEAR, MM_PER_RAD2, 0, pupil="auto")
     assert found.pupil is None
     printed = {c.name: c for c in found.candidates}

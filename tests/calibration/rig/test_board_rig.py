@@ -13,7 +13,7 @@ from helpers.calibration_scenes import lens
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
-from rigkit.calibration.rig.board_ties import suggest_ties
+from rigkit.calibration.rig.board_ties import suggest_rigid_boards
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.compare import compare_board_rigs
 from rigkit.calibration.rig.result import RigCalibration
@@ -290,7 +290,7 @@ def test_boards_that_keep_their_places_are_noticed(alike: bool, rng: np.random.G
         # As the program has them where no name can be told: every view shows a board of its own.
         views = [replace(v, board=replace(v.board, board_id=f"part {k}")) for k, v in enumerate(views)]
     result = calibrate(views, REG["reg"][0].size_px, model="brown", board="flat")
-    (printed,) = suggest_ties(views, result)
+    (printed,) = suggest_rigid_boards(views, result)
     assert "kept their relative poses in 5 images" in str(printed)
     assert (
         ("3 boards of 8x6 corners" in str(printed))
@@ -306,7 +306,7 @@ def test_boards_that_move_are_not_taken_for_mounted(rng: np.random.Generator) ->
         own = target_views(rng, REG, DIFFERENT, room, 1, noise_px=NOISE_PX, distance_mm=1000.0)["reg"]
         views += [replace(view, image=f"{k}.png") for _, view in own]
     result = calibrate(views, REG["reg"][0].size_px, model="brown", board="flat")
-    assert suggest_ties(views, result) == ()
+    assert suggest_rigid_boards(views, result) == ()
 
 
 def test_mounts_that_did_not_move_are_told_apart_as_often_as_chance_says(rng: np.random.Generator) -> None:

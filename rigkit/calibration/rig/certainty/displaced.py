@@ -13,7 +13,7 @@ import numpy as np
 
 from rigkit.calibration.certainty.displaced import LensModes, significant_modes
 from rigkit.calibration.certainty.uncertainty import FarProjection
-from rigkit.calibration.rig.solving.pose_jacobians import gone_in_cam, pose_jacobians
+from rigkit.calibration.rig.solving.pose_jacobians import board_velocities, pose_jacobians
 from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.calibration.solving.normal_equations import NormalEquations
 from rigkit.calibration.solving.solver import Solution
@@ -55,7 +55,7 @@ def _of_camera(
     late = None
     if state.moments is not None:
         information = state.moments.information[c, observations.frame[c]]
-        late = gone_in_cam(observations, state, c, alone.translation_mm), information
+        late = board_velocities(observations, state, c, alone.translation_mm), information
     by_globals[layout.cameras[c]], by_own = _products(alone, own, observations.weights[c], modes, late)
     by_pose = np.zeros((len(observations.keys), 6, modes.shape[1]))
     for part in pose_jacobians(observations, state, c, alone.translation_mm):

@@ -11,7 +11,7 @@ import numpy as np
 
 from rigkit.calibration.rig.certainty.between_models import globals_between
 from rigkit.calibration.rig.joint import JointRig
-from rigkit.calibration.rig.solving.shutters import read_on, readout_steps
+from rigkit.calibration.rig.solving.shutters import readout_steps, with_longer_readouts
 from rigkit.calibration.rig.solving.solver import solve_rig
 from rigkit.calibration.solving.solver import FROM_OPTIMUM
 from rigkit.core.arrays import FloatArray
@@ -31,7 +31,7 @@ def readout_error(joint: JointRig) -> tuple[FloatArray, FloatArray]:
     before, alone, _ = readout_steps(observations, state)
     for c in np.flatnonzero(alone).tolist():
         step = np.where(np.arange(cameras) == c, alone, 0.0)
-        moved = read_on(observations, state, step)
+        moved = with_longer_readouts(observations, state, step)
         there = solve_rig(moved, state, joint.sigma_px, FROM_OPTIMUM).state
         left = float((before - readout_steps(moved, there)[0])[c] / alone[c])
         followed = globals_between(layout, state, there) / np.sqrt(max(left, MIN_LEFT))

@@ -23,8 +23,8 @@ import numpy as np
 from rigkit.calibration.rig.certainty.frame_covariance import frame_covariance, residual_sigma
 from rigkit.calibration.rig.solving.flatness import STEP_DAMPING
 from rigkit.calibration.rig.solving.moments import Lag, Moments, trajectories_through
-from rigkit.calibration.rig.solving.pose_jacobians import at_own_moment
-from rigkit.calibration.rig.solving.shutters import read_on, readout_steps
+from rigkit.calibration.rig.solving.pose_jacobians import pose_jacobians_at_exposure
+from rigkit.calibration.rig.solving.shutters import readout_steps, with_longer_readouts
 from rigkit.calibration.rig.solving.solver import rig_normal, solve_rig
 from rigkit.calibration.rig.solving.state import Key, RigObservations, RigState
 from rigkit.calibration.solving.clustered import LARGE_FREEDOM
@@ -82,12 +82,12 @@ def with_lags(
     cameras, keys = len(observations.cameras), len(observations.keys)
     none = np.zeros((cameras, keys))
     start = Moments(none[:, 0], np.zeros((keys, 0, 6)), none, np.full_like(none, np.inf), none[:, 0])
-    start = _through(start, solution.state, observations, times)
+    start = _with_trajectories(start, solution.state, observations, times)
     if (
         timing == "trigger"
         or cameras < 2
         or not start.trajectories.any()
-        or not _asked(observations, solution.state, start, sigma_px)
+        or not _lags_lower_cost(observations, solution.state, start, sigma_px)
     ):
         return observations, solution
     lagging = replace(solution, state=replace(solution.state, moments=start))
@@ -112,7 +112,7 @@ def _solved_again(
     """Return the solution with trajectories through its own poses, and with the images' times estimated from them."""
     state = lagging.state
     assert state.moments is not None
-    moments = _through(state.moments, state, observations, times)
+    moments = _with_trajectories(state.moments, state, observations, times)
     if own_times:
         sigma = residual_sigma(observations, lagging, sigma_px)
         moments = _with_own_times(replace(state, moments=moments), moments, observations, sigma)
@@ -134,7 +134,7 @@ def _with_readouts(
     for _ in range(MAX_ROUNDS):
         state, before = lagging.state, lagging.normal.cost
         assert state.moments is not None
-        observations = read_on(observations, state, step)
+        observations = with_longer_readouts(observations, state, step)
         moments = replace(state.moments, readouts=state.moments.readouts + step)
         lagging = replace(lagging, state=replace(state, moments=moments))
         lagging = _solved_again(observations, lagging, sigma_px, times, own_times=True)
@@ -158,13 +158,13 @@ def lags_of(names: Sequence[str], state: RigState, covariance: FloatArray, lags:
     return out
 
 
-def _through(moments: Moments, state: RigState, observations: RigObservations, times: FloatArray) -> Moments:
+def _with_trajectories(moments: Moments, state: RigState, observations: RigObservations, times: FloatArray) -> Moments:
     """Return the moments with trajectories through the poses of a state."""
     targets = [target for _, target in observations.keys]
     return replace(moments, trajectories=trajectories_through(state.frame_rotation, state.frame_mm, targets, times))
 
 
-def _asked(observations: RigObservations, state: RigState, start: Moments, sigma_px: float) -> bool:
+def _lags_lower_cost(observations: RigObservations, state: RigState, start: Moments, sigma_px: float) -> bool:
     """Say whether a step with lags lowers the cost by more than chance would."""
     state = replace(state, moments=start)
     normal, more = rig_normal(observations, state, sigma_px), len(state.cameras) - 1
@@ -190,7 +190,7 @@ def _with_own_times(state: RigState, moments: Moments, observations: RigObservat
     all but the poses held; `sigma_px` is the standard deviation of a corner."""
     by_target = _by_target(state, observations)
     free = _free(by_target)
-    products = _with_times(by_target, moments.speeds_at_all())
+    products = _with_times(by_target, moments.all_speeds())
     spread, own = np.where(free.any(axis=0), FIRST_SPREAD, 0.0), moments.own.T
     for _ in range(SPREAD_ROUNDS):
         system, information = _regularised(products, free, (sigma_px / np.maximum(spread, MIN_SPREAD)) ** 2)
@@ -215,7 +215,7 @@ def _by_target(state: RigState, observations: RigObservations) -> tuple[FloatArr
         normal = normal_equations(own, alone.with_corners_held(), observations.weights[c])
         turned = state.targets(c, observations)[0] @ np.swapaxes(state.frame_rotation[frame], -1, -2)
         follow[c, frame, :3, :3] = turned
-        for part in at_own_moment(observations, state, c, alone.translation_mm):
+        for part in pose_jacobians_at_exposure(observations, state, c, alone.translation_mm):
             back = np.swapaxes(part.target, -1, -2)
             np.add.at(information[c], part.poses, back @ normal.pp[part.views] @ part.target)
             np.add.at(score[c], part.poses, (back @ normal.p[part.views][:, :, None])[..., 0])

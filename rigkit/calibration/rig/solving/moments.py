@@ -24,7 +24,7 @@ from rigkit.geometry.board_pose import stepped
 POINTS, MIN_POINTS = 5, 3
 """Poses that a trajectory passes through, the frame's own included. For swings of 1.5 s at six frames a second, a
 fifth order's speeds are 1 % off in the middle and 5 % at the ends, a third order's 8 and 16 %."""
-WAY_REACH = 4.0
+MAX_TIME_OF_TRAJECTORY = 4.0
 """Largest time between a frame and those through which its trajectory passes."""
 
 
@@ -79,7 +79,7 @@ class Moments:
         )
         return speeds
 
-    def speeds_at_all(self) -> FloatArray:
+    def all_speeds(self) -> FloatArray:
         """Return the speeds of all targets at the times of all cameras, (n, F, 6)."""
         keys = np.arange(len(self.trajectories))
         return np.array([self.speeds(c, keys) for c in range(len(self.lags))])
@@ -128,7 +128,7 @@ def without_own_times(
 
 def trajectories_through(rotation: Mat3, place: Points, targets: Sequence[str], times: FloatArray) -> FloatArray:
     """Return the trajectories (F, POINTS - 1, 6) through the poses (F, 3, 3) and (F, 3) of `targets`, at `times` (F,):
-    zeros where times are unknown, or where fewer than MIN_POINTS poses are within WAY_REACH."""
+    zeros where times are unknown, or where fewer than MIN_POINTS poses are within MAX_TIME_OF_TRAJECTORY."""
     trajectories = np.zeros((len(times), POINTS - 1, 6))
     for target in dict.fromkeys(targets):
         own = np.array([f for f, t in enumerate(targets) if t == target and np.isfinite(times[f])], dtype=np.int64)
@@ -136,7 +136,11 @@ def trajectories_through(rotation: Mat3, place: Points, targets: Sequence[str], 
         for i, f in enumerate(own):
             first = min(max(i - POINTS // 2, 0), max(len(own) - POINTS, 0))
             near = np.array(
-                [k for k in own[first : first + POINTS] if k != f and abs(times[k] - times[f]) <= WAY_REACH]
+                [
+                    k
+                    for k in own[first : first + POINTS]
+                    if k != f and abs(times[k] - times[f]) <= MAX_TIME_OF_TRAJECTORY
+                ]
             )
             if len(near) + 1 < MIN_POINTS:
                 continue

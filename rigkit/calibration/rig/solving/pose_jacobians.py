@@ -27,7 +27,7 @@ def pose_jacobians(
 ) -> list[PoseJacobians]:
     """Return the derivatives for the views of camera `c`, with boards at `translation_mm` (V, 3): by targets, by its
     mount and lag if unknown, and by the boards' places on targets, then in one part for each board."""
-    parts = at_own_moment(observations, state, c, translation_mm)
+    parts = pose_jacobians_at_exposure(observations, state, c, translation_mm)
     if state.moments is None:
         return parts
     frame, lag = observations.frame[c], state.layout(observations).lags.start + c - 1
@@ -35,17 +35,17 @@ def pose_jacobians(
     return [state.moments.at_reference(part, c, meanwhile[part.views], lag) for part in parts]
 
 
-def gone_in_cam(observations: RigObservations, state: RigState, c: int, translation_mm: Points) -> FloatArray:
+def board_velocities(observations: RigObservations, state: RigState, c: int, translation_mm: Points) -> FloatArray:
     """Return the velocities of the boards in all views of camera `c` when the images were taken, (V, 6) per unit of
     time."""
     out = np.zeros((len(translation_mm), 6))
-    for part in at_own_moment(observations, state, c, translation_mm):
+    for part in pose_jacobians_at_exposure(observations, state, c, translation_mm):
         if state.moments is not None:
             out[part.views] = (part.target @ state.moments.speeds(c, part.poses)[:, :, None])[..., 0]
     return out
 
 
-def at_own_moment(
+def pose_jacobians_at_exposure(
     observations: RigObservations, state: RigState, c: int, translation_mm: Points
 ) -> list[PoseJacobians]:
     """Return the derivatives for the views of camera `c` by the targets' poses when it took them, mount and places."""

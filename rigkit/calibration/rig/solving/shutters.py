@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.rig.solving.pose_jacobians import gone_in_cam
+from rigkit.calibration.rig.solving.pose_jacobians import board_velocities
 from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rotation import skew
@@ -33,11 +33,11 @@ class Readout:
     sigma: float
 
 
-def read_on(observations: RigObservations, state: RigState, steps: FloatArray) -> RigObservations:
+def with_longer_readouts(observations: RigObservations, state: RigState, steps: FloatArray) -> RigObservations:
     """Return the observations with the corners corrected for readouts of the n cameras that are longer by `steps`
     (n,)."""
     moved = [
-        replace(own, pixels=own.pixels - step * _while_read(observations, state, c)[0])
+        replace(own, pixels=own.pixels - step * _readout_displacements(observations, state, c)[0])
         for c, (own, step) in enumerate(zip(observations.cameras, steps.tolist(), strict=True))
     ]
     return replace(observations, cameras=tuple(moved))
@@ -73,7 +73,7 @@ def _step(score: FloatArray, information: FloatArray) -> tuple[float, float, flo
 
 def _readout_information(observations: RigObservations, state: RigState, c: int) -> tuple[FloatArray, FloatArray]:
     """Return score and information (V,) of every view of camera `c` on its readout, the view's pose eliminated."""
-    motion, by_pose, residuals = _while_read(observations, state, c)
+    motion, by_pose, residuals = _readout_displacements(observations, state, c)
     weight = observations.weights[c][:, :, None]
     views = len(weight)
     motion, residuals = ((weight * part).reshape(views, -1) for part in (motion, residuals))
@@ -86,7 +86,9 @@ def _readout_information(observations: RigObservations, state: RigState, c: int)
     return (motion * residuals).sum(axis=1), (motion**2).sum(axis=1)
 
 
-def _while_read(observations: RigObservations, state: RigState, c: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _readout_displacements(
+    observations: RigObservations, state: RigState, c: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the displacement of the corners of camera `c` until they are read, px per unit of readout (V, C, 2), their
     derivatives by the pose of the view (V, C, 2, 6), and residuals (V, C, 2); zero for corners that are not used."""
     own, alone = observations.cameras[c], state.of_camera(c, observations)
@@ -94,7 +96,7 @@ def _while_read(observations: RigObservations, state: RigState, c: int) -> tuple
     pixels, valid, by_point, _ = alone.camera.project_with_jacobians(points)
     used = (valid & (observations.weights[c] > 0.0))[..., None]
     by_pose = np.where(used[..., None], np.concatenate([by_point @ -skew(lever), by_point], axis=-1), 0.0)
-    speed = np.einsum("vcij,vj->vci", by_pose, gone_in_cam(observations, state, c, alone.translation_mm))
+    speed = np.einsum("vcij,vj->vci", by_pose, board_velocities(observations, state, c, alone.translation_mm))
     height = alone.camera.size_px[1]
     below = (own.pixels[..., 1:] - 0.5 * (height - 1.0)) / height
     return speed * below, by_pose, np.where(used, own.pixels - pixels, 0.0)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.rig.solving.moments import without_own_times
-from rigkit.calibration.rig.solving.pose_jacobians import gone_in_cam, pose_jacobians
+from rigkit.calibration.rig.solving.pose_jacobians import board_velocities, pose_jacobians
 from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.calibration.solving.linearise import normal_equations
 from rigkit.calibration.solving.normal_equations import NormalEquations
@@ -36,7 +36,7 @@ def rig_data(observations: RigObservations, state: RigState) -> NormalEquations:
         alone = state.of_camera(c, observations)
         n = normal_equations(own, alone, observations.weights[c])
         if (moments := state.moments) is not None:
-            f, gone = observations.frame[c], gone_in_cam(observations, state, c, alone.translation_mm)
+            f, gone = observations.frame[c], board_velocities(observations, state, c, alone.translation_mm)
             n = without_own_times(n, gone, moments.own[c, f], moments.information[c, f])
         each.append(n)
         size = alone.camera.parameters.size

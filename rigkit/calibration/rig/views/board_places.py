@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.choosing.board_orientation import same_looks
+from rigkit.calibration.choosing.board_orientation import symmetry_turns
 from rigkit.calibration.rig.views.observations import FrameObservations, Observation, RigViews, outer_corners
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
@@ -73,8 +73,8 @@ def board_places(
             raise InputError(
                 f"rigid boards {', '.join(group)}: no image shows two of them; take images that show several at once"
             )
-        known, readings = found
-        single = _never_read(group, known, scenes, readings)
+        known, labellings = found
+        single = _unidentified_board(group, known, scenes, labellings)
         if single is not None:
             raise InputError(
                 f"rigid boards {', '.join(group)}: '{single}' is never seen together with the others; take images that "
@@ -84,9 +84,9 @@ def board_places(
         origin = known[first].inverse()
         for name, pose in known.items():
             places[name] = (first, origin @ pose)
-        for scene, reading in zip(scenes, readings, strict=True):
-            _rename(out[scene[0].camera], scene, reading, first)
-        open_scenes = sum(r is None and len(s) > 1 for s, r in zip(scenes, readings, strict=True))
+        for scene, labelling in zip(scenes, labellings, strict=True):
+            _rename(out[scene[0].camera], scene, labelling, first)
+        open_scenes = sum(r is None and len(s) > 1 for s, r in zip(scenes, labellings, strict=True))
         if open_scenes:
             notes.append(
                 Finding.look(
@@ -97,12 +97,12 @@ def board_places(
     return replace(views, seen=out, places=places), tuple(notes)
 
 
-def _rename(own: FrameObservations, scene: Sequence[_BoardSeen], reading: Reading | None, target: str) -> None:
+def _rename(own: FrameObservations, scene: Sequence[_BoardSeen], labelling: Labelling | None, target: str) -> None:
     """Set the ids of the boards of one scene, in the observations of their camera, and the key of their target."""
     old = [own.pop(entry.key) for entry in scene]
     for k, (entry, before) in enumerate(zip(scene, old, strict=True)):
         frame, board_id = before.frame, entry.key[1]
-        label = None if reading is None else reading.get(k)
+        label = None if labelling is None else labelling.get(k)
         if label is not None:
             own[(frame, label.board_id)] = replace(label, key=(frame, target))
             continue
@@ -111,18 +111,18 @@ def _rename(own: FrameObservations, scene: Sequence[_BoardSeen], reading: Readin
         own[(alone, board_id)] = replace(before, key=(alone, board_id))
 
 
-def _never_read(
+def _unidentified_board(
     group: Sequence[str],
     known: Mapping[str, Rigid3],
     scenes: Sequence[list[_BoardSeen]],
-    readings: Sequence[Reading | None],
+    labellings: Sequence[Labelling | None],
 ) -> str | None:
     """Return a board that was seen, but in no scene that determines its pose on the target; None if there is none."""
     read: dict[str, bool] = {}
-    for scene, reading in zip(scenes, readings, strict=True):
+    for scene, labelling in zip(scenes, labellings, strict=True):
         for k, entry in enumerate(scene):
             name = entry.key[1]
-            read[name] = read.get(name, False) or (reading is not None and k in reading)
+            read[name] = read.get(name, False) or (labelling is not None and k in labelling)
     return next((name for name in group if name not in known and not read.get(name, True)), None)
 
 
@@ -149,34 +149,34 @@ def _labels(entry: Observation, members: Sequence[Board]) -> list[_Label]:
         )
         across = board.size == own.size[::-1] and board.square_x_mm == own.square_y_mm
         across = across and board.square_y_mm == own.square_x_mm
-        turns = [*(same_looks(own) if straight else ()), *((1, 3) if across and own.columns != own.rows else ())]
+        turns = [*(symmetry_turns(own) if straight else ()), *((1, 3) if across and own.columns != own.rows else ())]
         for count in turns:
             seen = entry.turned(count, board)
             found.append(_Label(seen, seen.cam_from_board.apply(outer_corners(board))))
     return found
 
 
-Reading = dict[int, Observation]
+Labelling = dict[int, Observation]
 """Index of the board in its scene -> the observation with the id and orientation assigned."""
 
 
 def _best_reference(
     scenes: Sequence[list[_BoardSeen]], members: Sequence[Board]
-) -> tuple[dict[str, Rigid3], list[Reading | None]] | None:
+) -> tuple[dict[str, Rigid3], list[Labelling | None]] | None:
     """Return target_from_board of every board found, in the frame of the reference, and the reading of every scene;
     None if no scene has two boards."""
     order = sorted((s for s in scenes if len(s) > 1), key=lambda s: -len(s))
     best = None
     for reference in order[:REFERENCES]:
-        known, readings, residual = _read(reference, scenes, members)
+        known, labellings, residual = _labelled_from(reference, scenes, members)
         if best is None or (len(known), -residual) > (len(best[0]), -best[2]):
-            best = known, readings, residual
+            best = known, labellings, residual
     return None if best is None else (best[0], best[1])
 
 
-def _read(
+def _labelled_from(
     reference: list[_BoardSeen], scenes: Sequence[list[_BoardSeen]], members: Sequence[Board]
-) -> tuple[dict[str, Rigid3], list[Reading | None], float]:
+) -> tuple[dict[str, Rigid3], list[Labelling | None], float]:
     """Return the boards' poses on the target, the readings of all scenes with one of them as the reference, and the
     median misfit, as a part of the distance."""
     far = {b.board_id: outer_corners(b) for b in members}
@@ -185,28 +185,28 @@ def _read(
         label = next((w.seen for w in entry.labels if w.seen.board_id not in known), None)
         if label is not None:
             known[label.board_id] = label.cam_from_board
-    readings: dict[int, Reading | None] = {}
+    labellings: dict[int, Labelling | None] = {}
     residuals: list[float] = []
     # Scenes that add a known board are read before the ones that need it.
     waiting = sorted(range(len(scenes)), key=lambda i: -len(scenes[i]))
     for last in (False, True):
         left = []
         for i in waiting:
-            reading, residual = _named(scenes[i], known, far)
-            if reading is None and not last:
+            labelling, residual = _labelled(scenes[i], known, far)
+            if labelling is None and not last:
                 left.append(i)
                 continue
-            readings[i] = reading
-            if reading is not None:
+            labellings[i] = labelling
+            if labelling is not None:
                 residuals.append(residual)
         waiting = left
-    middles = _middles([r for r in readings.values() if r is not None], known)
-    return middles, [readings[i] for i in range(len(scenes))], float(np.median(residuals)) if residuals else np.inf
+    middles = _median_poses([r for r in labellings.values() if r is not None], known)
+    return middles, [labellings[i] for i in range(len(scenes))], float(np.median(residuals)) if residuals else np.inf
 
 
-def _named(
+def _labelled(
     scene: list[_BoardSeen], known: dict[str, Rigid3], far: Mapping[str, FloatArray]
-) -> tuple[Reading | None, float]:
+) -> tuple[Labelling | None, float]:
     """Return the reading of a scene, None if it is ambiguous, and its misfit. Boards that are not in `known` are added
     to it if the others determine the target's pose."""
     names = list(known)
@@ -246,19 +246,19 @@ def _named(
     rival = next((t for t, other, _ in tried if other != chosen), np.inf)
     if most > 1 and rival <= RIVAL * max(total, FLOOR):
         return None, np.inf
-    reading = {k: flat[m][1].seen for k, m in chosen.items()}
+    labelling = {k: flat[m][1].seen for k, m in chosen.items()}
     back = scene_from_target.inverse()
     for k, entry in enumerate(scene):
         vacant = [w.seen for w in entry.labels if w.seen.board_id not in known]
-        if k not in reading and vacant:
-            reading[k] = vacant[0]
+        if k not in labelling and vacant:
+            labelling[k] = vacant[0]
             known[vacant[0].board_id] = back @ vacant[0].cam_from_board
-    return reading, total
+    return labelling, total
 
 
-def _middles(readings: Sequence[Reading], known: Mapping[str, Rigid3]) -> dict[str, Rigid3]:
+def _median_poses(labellings: Sequence[Labelling], known: Mapping[str, Rigid3]) -> dict[str, Rigid3]:
     """Return the median poses of the boards over the scenes, in the frame of the board that is seen most."""
-    by_name = [{s.board_id: s.cam_from_board for s in reading.values()} for reading in readings]
+    by_name = [{s.board_id: s.cam_from_board for s in labelling.values()} for labelling in labellings]
     counts = {name: sum(name in scene for scene in by_name) for name in known}
     anchor = max(known, key=lambda name: counts[name])
     out = {}

@@ -79,19 +79,21 @@ def typical_cost(cost: Mapping[Key, float], sigma_px: float, *, mean: bool = Fal
     return max(typical, max(sigma_px, MIN_PX) ** 2)
 
 
-def bad_ones(cost: Mapping[Key, float], typical: float) -> list[Key]:
+def outlier_targets(cost: Mapping[Key, float], typical: float) -> list[Key]:
     """Return the targets whose cost is not chance, of several only the worst, which may affect the others."""
     worst = max(cost.values(), default=0.0)
     return [key for key in sorted(cost) if cost[key] > max(DISAGREES**2 * typical, 0.25 * worst)]
 
 
-def masked(cost: Mapping[Key, float], sigma_px: float) -> bool:
+def outlier_may_be_hidden(cost: Mapping[Key, float], sigma_px: float) -> bool:
     """Return whether one of few targets may be an outlier although none stands out."""
     worst = max(cost.values(), default=0.0)
     return 2 < len(cost) <= FEW and worst > DISAGREES**2 * max(sigma_px, MIN_PX) ** 2
 
 
-def part_far(seen: Sequence[FrameObservations], off_px: Mapping[Key, float]) -> list[tuple[str, str, str]]:
+def separate_distant_views(
+    seen: Sequence[FrameObservations], off_px: Mapping[Key, float]
+) -> list[tuple[str, str, str]]:
     """Separate the views of targets with a large distance `off_px`; return (frame, target, reason) of each."""
     shared = shared_keys(seen)
     typical = max(float(np.median([off_px[key] for key in shared])) if shared else 0.0, MIN_PX)
@@ -100,12 +102,12 @@ def part_far(seen: Sequence[FrameObservations], off_px: Mapping[Key, float]) -> 
     for key in sorted(shared):
         if off_px[key] > max(MAX_DISTANCE_RATIO * typical, 0.5 * worst):
             words = f"by {digits(off_px[key])} px, {off_px[key] / typical:.0f} times the median"
-            out.append((*key, why(seen, key, words)))
-            part(seen, key)
+            out.append((*key, reason_left_out(seen, key, words)))
+            separate_views(seen, key)
     return out
 
 
-def why(seen: Sequence[FrameObservations], key: Key, how: str) -> str:
+def reason_left_out(seen: Sequence[FrameObservations], key: Key, how: str) -> str:
     """Return words for why a target is left out."""
     cameras = [k for k, own in enumerate(seen) if any(e.key == key for e in own.values())]
     if len(cameras) > 1:
@@ -116,7 +118,7 @@ def why(seen: Sequence[FrameObservations], key: Key, how: str) -> str:
     return f"its boards disagree on its pose ({how}); one of them was moved relative to the others"
 
 
-def part(seen: Sequence[FrameObservations], key: Key) -> None:
+def separate_views(seen: Sequence[FrameObservations], key: Key) -> None:
     """Give every view of the target a separate pose: they still constrain their camera's intrinsics."""
     for k, own in enumerate(seen):
         for place, entry in own.items():

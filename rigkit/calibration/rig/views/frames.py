@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.choosing.board_orientation import board_turn, same_looks
+from rigkit.calibration.choosing.board_orientation import board_turn, symmetry_turns
 from rigkit.calibration.rig.solving.state import Key
 from rigkit.calibration.rig.views.observations import (
     FrameObservations,
@@ -88,7 +88,7 @@ def _targets(own: FrameObservations, places: Places) -> dict[Key, _Target]:
     out = {}
     boards = {entry.board_id: entry.view.board for entry in best.values()}
     looks = {
-        name: (outer_corners(board), tuple(board_turn(board, turns) for turns in same_looks(board)))
+        name: (outer_corners(board), tuple(board_turn(board, turns) for turns in symmetry_turns(board)))
         for name, board in boards.items()
     }
     for (key, entry), rotation, shift in zip(best.items(), *target_poses(list(best.values()), places), strict=True):
@@ -175,14 +175,14 @@ def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | 
     return middle, Rigid3(rotation[tried[others[0]]], shift[tried[others[0]]]) if others else None
 
 
-def turned_alike(views: RigViews, mounts: Sequence[Rigid3]) -> RigViews:
+def with_common_orientation(views: RigViews, mounts: Sequence[Rigid3]) -> RigViews:
     """Return the views with every board numbered from the same corner as in the first camera that sees it."""
     out: list[FrameObservations] = []
     for k, own in enumerate(views.seen):
         mine: FrameObservations = {}
         for key, entry in own.items():
             before = next((i for i in range(k) if key in views.seen[i]), None)
-            looks = same_looks(entry.view.board)
+            looks = symmetry_turns(entry.view.board)
             if before is None or len(looks) == 1 or entry.board_id in views.places:
                 mine[key] = entry
                 continue
@@ -195,7 +195,7 @@ def turned_alike(views: RigViews, mounts: Sequence[Rigid3]) -> RigViews:
     return views.with_seen(out)
 
 
-def separation(views: RigViews, mounts: Sequence[Rigid3]) -> dict[Key, float]:
+def view_distances_px(views: RigViews, mounts: Sequence[Rigid3]) -> dict[Key, float]:
     """Return for each target the distance in px between views that share its pose, by transfer of its corners: for two
     cameras the smaller of both directions (a board's pose may be inaccurate in one image), for more the worst pair of
     cameras or of boards."""
@@ -269,7 +269,7 @@ def _transfer_px(
     return out
 
 
-def first_frames(keys: Sequence[Key], views: RigViews, mounts: Sequence[Rigid3]) -> tuple[Mat3, Points]:
+def initial_target_poses(keys: Sequence[Key], views: RigViews, mounts: Sequence[Rigid3]) -> tuple[Mat3, Points]:
     """Return rig_from_target of every key, from the view with the most corners."""
     best: dict[Key, tuple[int, int, Observation]] = {}
     for k, own in enumerate(views.seen):

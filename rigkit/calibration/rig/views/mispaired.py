@@ -21,7 +21,7 @@ import numpy as np
 
 from rigkit.calibration.rig.solving.state import Key
 from rigkit.calibration.rig.views.disagree import shared_keys
-from rigkit.calibration.rig.views.frames import mounts_of, separation, turned_alike
+from rigkit.calibration.rig.views.frames import mounts_of, view_distances_px, with_common_orientation
 from rigkit.calibration.rig.views.observations import FrameObservations, Observation, RigViews
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
@@ -30,18 +30,18 @@ from rigkit.core.findings import Finding
 from rigkit.core.identifiers import natural_key
 from rigkit.geometry.rigid3 import Rigid3
 
-ONE_PICTURE_PX = 0.1
+SAME_IMAGE_PX = 0.1
 """RMS difference of corners up to which two images are copies, perhaps compressed again: two cameras have at least
 different noise."""
-PUT_RIGHT = 0.1
+MAX_LEFT_OF_DISTANCE = 0.1
 """Distance between views after correcting a mix-up, over that before, up to which it explains the disagreement. Before,
 it is the movement of the boards between frames, a hundred pixels and more; after, the error of lenses calibrated from
 mixed images: 2 to 8 px for exchanged images of bouguet-stereo (REAL)."""
 STEPS = (1, -1, 2, -2)
 """Numbers of frames that a camera may be off by."""
-MIN_PUT_RIGHT = 3
+MIN_FRAMES_CORRECTED = 3
 """Fewest frames that must agree after renumbering: the six parameters of a mount fit one frame exactly."""
-MIN_SHARE_PUT_RIGHT = 0.6
+MIN_SHARE_CORRECTED = 0.6
 """Part of the disagreeing frames that must agree then: some may be bad for another reason."""
 NAMED = 3
 """Number of frames that a message lists."""
@@ -51,7 +51,7 @@ def _all(frames: int) -> str:
     return "their only frame" if frames == 1 else f"all {frames} frames"
 
 
-def same_pictures(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> list[Finding]:
+def duplicate_images(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> list[Finding]:
     """Return a finding for every two cameras with copies of one image in some frames; `views` are (frame, view) by
     camera.
 
@@ -61,7 +61,7 @@ def same_pictures(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> list[
     shown = {name: {(frame, view.board.board_id): view for frame, view in own} for name, own in views.items()}
     for (a, own), (b, other) in combinations(shown.items(), 2):
         shared = own.keys() & other.keys()
-        frames = _in_order({key[0] for key in shared if _one_picture(own[key], other[key])})
+        frames = _in_order({key[0] for key in shared if _same_image(own[key], other[key])})
         if not frames:
             continue
         total = len({frame for frame, _ in shared})
@@ -71,20 +71,20 @@ def same_pictures(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> list[
             )
         out.append(
             Finding.bad(
-                f"cameras '{a}' and '{b}' have identical images in {_named(frames)} of {total} frames",
+                f"cameras '{a}' and '{b}' have identical images in {_frames_in_words(frames)} of {total} frames",
                 "give each camera its own images, and calibrate again",
             )
         )
     return out
 
 
-def put_together_wrongly(views: RigViews, mounts: Sequence[Rigid3], left_out: Iterable[Key]) -> list[Finding]:
+def mixups_of_frames(views: RigViews, mounts: Sequence[Rigid3], left_out: Iterable[Key]) -> list[Finding]:
     """Return findings on the frames `left_out` that agree with the `mounts` of the others after exchanging the images
     of two cameras, rotating those of one, or renumbering them. `views` include the frames left out.
     """
     frames, names = {frame for frame, _ in left_out}, views.names
     those = views.with_seen([_of_frames(one, frames) for one in views.seen])
-    own, now = those.seen, _by_frame(_off(those, mounts))
+    own, now = those.seen, _by_frame(_distances_px(those, mounts))
     tried: list[tuple[RigViews, str, str, str]] = []
     for i, j in combinations(range(len(own)), 2):
         trial = those.with_camera(i, own[j]).with_camera(j, own[i])
@@ -92,19 +92,19 @@ def put_together_wrongly(views: RigViews, mounts: Sequence[Rigid3], left_out: It
             (trial, f"'{names[i]}' and '{names[j]}' are exchanged", "exchanging them back", "correct their names")
         )
     for k, camera in enumerate(views.cameras):
-        trial = those.with_camera(k, _turned(own[k], camera))
+        trial = those.with_camera(k, _rotated_by_180(own[k], camera))
         remedy = "use the image files as the camera wrote them"
         tried.append((trial, f"'{names[k]}' are rotated by 180 degrees", "rotating them back", remedy))
     out = []
     for trial, what, mended, remedy in tried:
-        if right := _put_right(now, _by_frame(_off(trial, mounts))):
+        if right := _frames_corrected(now, _by_frame(_distances_px(trial, mounts))):
             agree = "makes the cameras agree on the boards' poses"
-            message = f"the images of {what} in {_named(right)}: {mended} {agree}"
+            message = f"the images of {what} in {_frames_in_words(right)}: {mended} {agree}"
             out.append(Finding.bad(message, f"{remedy}, and calibrate again"))
-    return [*out, *_miscounted(views, mounts, now)]
+    return [*out, *_offset_of_frames(views, mounts, now)]
 
 
-def _miscounted(views: RigViews, mounts: Sequence[Rigid3], now: Mapping[str, float]) -> list[Finding]:
+def _offset_of_frames(views: RigViews, mounts: Sequence[Rigid3], now: Mapping[str, float]) -> list[Finding]:
     """Return a finding where frames left out, with distances `now`, agree with frames before or after them."""
     if not now:
         return []
@@ -115,29 +115,30 @@ def _miscounted(views: RigViews, mounts: Sequence[Rigid3], now: Mapping[str, flo
     for k in range(1, len(seen)):
         for step in STEPS:
             trial = [_of_frames(own, typical.keys() - agree) for own in seen]
-            trial[k] = _of_frames(_counted(seen, k, step), typical.keys() - agree)
-            right = _put_right(typical, _by_frame(_off(views.with_seen(trial), mounts)))
-            if len(right) >= max(MIN_PUT_RIGHT, MIN_SHARE_PUT_RIGHT * len(now)):
+            trial[k] = _of_frames(_with_offset(seen, k, step), typical.keys() - agree)
+            right = _frames_corrected(typical, _by_frame(_distances_px(views.with_seen(trial), mounts)))
+            if len(right) >= max(MIN_FRAMES_CORRECTED, MIN_SHARE_CORRECTED * len(now)):
                 moments = _in_order(typical)
                 called = [moments[moments.index(frame) + step] for frame in right]
+                where = f"'{views.names[k]}' in {_frames_in_words(called)}"
                 message = (
-                    f"the images of '{views.names[k]}' in {_named(called)} belong to {_steps(step)}: with "
-                    "that shift the cameras agree on the boards' poses; an image is missing, or was taken twice"
+                    f"the images of {where} belong to {_offset_in_words(step)}: with that shift the cameras agree on "
+                    "the boards' poses; an image is missing, or was taken twice"
                 )
                 return [Finding.bad(message, "give simultaneous images the same number, and calibrate again")]
     return []
 
 
-def why_nothing_agrees(views: RigViews) -> Finding | None:
+def mixup_of_all_frames(views: RigViews) -> Finding | None:
     """Return a finding on the mix-up whose correction makes the frames agree, if most disagree; None if there is
     none."""
     names, seen = views.names, views.seen
-    limit = PUT_RIGHT * _typical_px(views)
+    limit = MAX_LEFT_OF_DISTANCE * _typical_px(views)
     for k, camera in enumerate(views.cameras):
         for step in STEPS if k else ():
-            if _typical_px(views.with_camera(k, _counted(seen, k, step))) <= limit:
+            if _typical_px(views.with_camera(k, _with_offset(seen, k, step))) <= limit:
                 return Finding.bad(
-                    f"the images of '{names[k]}' belong to {_steps(step)} in all frames: with that shift the "
+                    f"the images of '{names[k]}' belong to {_offset_in_words(step)} in all frames: with that shift the "
                     "cameras agree; an image is missing, or the cameras did not start together",
                     "give simultaneous images the same number",
                 )
@@ -150,13 +151,13 @@ def why_nothing_agrees(views: RigViews) -> Finding | None:
                     f"the images of {who} are mirrored: undoing that makes the cameras agree",
                     "use the image files as the camera wrote them",
                 )
-        turned = _turned(seen[k], camera)
-        for sides in _as_one_frame_has_it(views, k, turned):
+        turned = _rotated_by_180(seen[k], camera)
+        for sides in _frames_better_changed(views, k, turned):
             some = {key: turned[key] if key[0] in sides else entry for key, entry in seen[k].items()}
             if sides and _typical_px(views.with_camera(k, some)) <= limit:
                 return Finding.bad(
-                    f"the images of '{names[k]}' are rotated by 180 degrees in {_named(_in_order(sides))}, or in "
-                    "all others: undoing that makes the cameras agree",
+                    f"the images of '{names[k]}' are rotated by 180 degrees in {_frames_in_words(_in_order(sides))}, "
+                    "or in all others: undoing that makes the cameras agree",
                     "use the image files as the camera wrote them",
                 )
     return None
@@ -168,11 +169,11 @@ def _typical_px(views: RigViews) -> float:
         mounts, _ = mounts_of(views)
     except InputError:
         return np.inf
-    off = _off(views, mounts)
-    return float(np.median(list(off.values()))) if len(_by_frame(off)) >= MIN_PUT_RIGHT else np.inf
+    off = _distances_px(views, mounts)
+    return float(np.median(list(off.values()))) if len(_by_frame(off)) >= MIN_FRAMES_CORRECTED else np.inf
 
 
-def _as_one_frame_has_it(views: RigViews, k: int, changed: FrameObservations) -> Iterator[set[str]]:
+def _frames_better_changed(views: RigViews, k: int, changed: FrameObservations) -> Iterator[set[str]]:
     """Yield for each frame, with the mounts that it alone gives, the frames in which camera k agrees better
     `changed`."""
     trial = views.with_camera(k, changed)
@@ -181,12 +182,12 @@ def _as_one_frame_has_it(views: RigViews, k: int, changed: FrameObservations) ->
             mounts, _ = mounts_of(views.with_seen([_of_frames(own, {frame}) for own in views.seen]))
         except InputError:
             continue
-        now, then = (_by_frame(_off(one, mounts)) for one in (views, trial))
+        now, then = (_by_frame(_distances_px(one, mounts)) for one in (views, trial))
         yield {name for name, value in then.items() if value < now[name]}
 
 
-def _off(views: RigViews, mounts: Sequence[Rigid3]) -> dict[Key, float]:
-    return separation(turned_alike(views, mounts), mounts)
+def _distances_px(views: RigViews, mounts: Sequence[Rigid3]) -> dict[Key, float]:
+    return view_distances_px(with_common_orientation(views, mounts), mounts)
 
 
 def _by_frame(off_px: Mapping[Key, float]) -> dict[str, float]:
@@ -197,9 +198,9 @@ def _by_frame(off_px: Mapping[Key, float]) -> dict[str, float]:
     return out
 
 
-def _put_right(now: Mapping[str, float], then: Mapping[str, float]) -> list[str]:
-    """Return the frames in which the distance `then` is at most PUT_RIGHT times that `now`."""
-    return _in_order(frame for frame, value in then.items() if value <= PUT_RIGHT * now.get(frame, 0.0))
+def _frames_corrected(now: Mapping[str, float], then: Mapping[str, float]) -> list[str]:
+    """Return the frames in which the distance `then` is at most MAX_LEFT_OF_DISTANCE times that `now`."""
+    return _in_order(frame for frame, value in then.items() if value <= MAX_LEFT_OF_DISTANCE * now.get(frame, 0.0))
 
 
 def _frames_of(seen: Sequence[FrameObservations]) -> set[str]:
@@ -210,7 +211,7 @@ def _of_frames(own: FrameObservations, frames: Iterable[str]) -> FrameObservatio
     return {key: entry for key, entry in own.items() if key[0] in frames}
 
 
-def _counted(seen: Sequence[FrameObservations], k: int, step: int) -> FrameObservations:
+def _with_offset(seen: Sequence[FrameObservations], k: int, step: int) -> FrameObservations:
     """Return the observations of camera k with every image assigned to the frame `step` frames before."""
     frames = _in_order(_frames_of(seen))
     before = {frames[n]: frames[n - step] for n in range(len(frames)) if 0 <= n - step < len(frames)}
@@ -221,7 +222,7 @@ def _counted(seen: Sequence[FrameObservations], k: int, step: int) -> FrameObser
     }
 
 
-def _turned(own: FrameObservations, camera: Camera) -> FrameObservations:
+def _rotated_by_180(own: FrameObservations, camera: Camera) -> FrameObservations:
     """Return a camera's observations in images rotated by 180 degrees about the optical axis."""
     half = Rigid3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     return {
@@ -251,14 +252,14 @@ def _mirrored(entry: Observation, camera: Camera, axis: int) -> Observation:
     return replace(entry, view=replace(view, pixels=pixels, grid=grid), cam_from_board=pose)
 
 
-def _one_picture(one: BoardView, other: BoardView) -> bool:
+def _same_image(one: BoardView, other: BoardView) -> bool:
     """Return whether two views have the same corners at the same pixels."""
     if one.grid.shape != other.grid.shape or (one.grid != other.grid).any():
         return False
-    return bool(np.sqrt(np.mean(np.sum((one.pixels - other.pixels) ** 2, axis=1))) <= ONE_PICTURE_PX)
+    return bool(np.sqrt(np.mean(np.sum((one.pixels - other.pixels) ** 2, axis=1))) <= SAME_IMAGE_PX)
 
 
-def _steps(step: int) -> str:
+def _offset_in_words(step: int) -> str:
     count = "one frame" if abs(step) == 1 else f"{abs(step)} frames"
     return f"{count} {'earlier' if step > 0 else 'later'}"
 
@@ -267,7 +268,7 @@ def _in_order(frames: Iterable[str]) -> list[str]:
     return sorted(frames, key=natural_key)
 
 
-def _named(frames: Sequence[str]) -> str:
+def _frames_in_words(frames: Sequence[str]) -> str:
     if len(frames) == 1:
         return f"frame '{frames[0]}'"
     more = f" and {len(frames) - NAMED} more" if len(frames) > NAMED else ""

@@ -18,7 +18,7 @@ from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.lags import Timing, times_of
-from rigkit.calibration.rig.solving.shutters import read_on
+from rigkit.calibration.rig.solving.shutters import with_longer_readouts
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
@@ -164,7 +164,7 @@ def test_heldout_frames_do_not_choose_their_readouts() -> None:
     moments = replace(state.moments, readouts=state.moments.readouts + wrong)
     moved = replace(
         joint,
-        observations=read_on(joint.observations, state, wrong),
+        observations=with_longer_readouts(joint.observations, state, wrong),
         solution=replace(joint.solution, state=replace(state, moments=moments)),
     )
     again, _ = heldout_rms(moved, 5)
