@@ -124,6 +124,36 @@ def test_paper_that_covers_a_part_of_a_row_does_not_end_a_board() -> None:
     assert next_row(replace(MARKED, rows=4), whole) is not False
 
 
+@pytest.mark.parametrize(("below", "determined"), [(5.0, False), (1.0, None)])
+def test_the_frame_may_end_soon_after_a_board(below: float, determined: bool | None) -> None:
+    assert next_row(MARKED, [image[: int(461 + below)].copy() for image in straight(MARKED)]) is determined
+
+
+@pytest.mark.parametrize("first", [295, 325])
+@pytest.mark.parametrize("board", [MARKED, LEGACY], ids=["today", "legacy"])
+def test_paper_laid_along_rows_does_not_end_a_board(board: Board, first: int) -> None:
+    """The fifth row of squares ends 310 px down."""
+    whole = straight(board)
+    for image in whole:
+        image[first:] = 235.0
+    assert next_row(replace(board, rows=4), whole) is not False
+
+
+def test_a_textured_cover_does_not_end_a_board() -> None:
+    whole = straight(MARKED)
+    for image in whole:
+        image[311:] = np.random.default_rng(0).uniform(20.0, 235.0, image[311:].shape)
+    assert next_row(replace(MARKED, rows=4), whole) is None
+
+
+def test_a_board_cut_out_along_its_squares_ends_in_front_of_anything() -> None:
+    """Black squares end where a dark room begins a tenth of a square later."""
+    whole = straight(MARKED)
+    for image in whole:
+        image[465:] = np.random.default_rng(0).uniform(20.0, 60.0, image[465:].shape)
+    assert next_row(MARKED, whole) is False
+
+
 def test_paper_laid_aslant_over_a_board_does_not_end_it() -> None:
     row, column = np.indices((520, 720))
     whole = straight(MARKED)

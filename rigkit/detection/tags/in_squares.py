@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import grid_turned
 from rigkit.core.patterns.aprilgrid import AprilGrid
@@ -145,18 +145,48 @@ def likeness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, numbers
 
 
 def brightness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, board: Board) -> FloatArray:
-    """Return the brightness (N, K) of the marker modules in these squares; NaN and arguments as for `likeness_at`."""
+    """Return the brightness (N, K) of the marker modules in these squares, of inverted boards 255 minus it; NaN and
+    arguments as for `likeness_at`."""
     modules = marker_codes(board).modules
     middles = (np.stack(np.meshgrid(*2 * [np.arange(modules)]), axis=-1).reshape(-1, 2) + 0.5) / modules
-    quads = _outlines(image, pixels, squares, board)
-    out, seen = np.full((len(squares), len(middles)), np.nan), np.isfinite(quads).all(axis=(1, 2))
+    return _sampled(_as_printed(image, board), _outlines(image, pixels, squares, board), middles)
+
+
+def brightness_around(
+    image: GreyImage, pixels: FloatArray, squares: IntArray, at: FloatArray, board: Board
+) -> FloatArray:
+    """Return the brightness (N, K), as `brightness_at`, at the positions `at` (K, 2), in sides of each square from its
+    first corner, which may be beyond the square; NaN outside of the image."""
+    return _sampled(_as_printed(image, board), _square_corners(pixels, squares), at)
+
+
+def _sampled(image: GreyImage, quads: FloatArray, at: FloatArray) -> FloatArray:
+    """Return the brightness (N, K) at the positions `at` (K, 2) in the unit squares that are imaged to `quads`
+    (N, 4, 2); NaN outside of the image, and where quads are unknown."""
+    out, seen = np.full((len(quads), len(at)), np.nan), np.isfinite(quads).all(axis=(1, 2))
     if seen.any():
-        out[seen] = sample(image, transferred(maps_of_quads(quads[seen]), middles))
+        places = transferred(maps_of_quads(quads[seen]), at)
+        out[seen] = np.where(_in_image(image, places), sample(image, places), np.nan)
     return out
+
+
+def _in_image(image: GreyImage, places: FloatArray) -> BoolArray:
+    return np.asarray(((places >= 0.0) & (places <= np.array(image.shape[::-1]) - 1.0)).all(axis=-1))
 
 
 def _outlines(image: GreyImage, pixels: FloatArray, squares: IntArray, board: Board) -> FloatArray:
     """Return the outlines (N, 4, 2) of the markers in squares; NaN and arguments as for `likeness_at`."""
+    quads = _square_corners(pixels, squares)
+    inside = _in_image(image, quads).all(axis=1)
+    out = np.full(quads.shape, np.nan)
+    if inside.any():
+        out[inside] = _within(quads[inside], board)
+    return out
+
+
+def _square_corners(pixels: FloatArray, squares: IntArray) -> FloatArray:
+    """Return the corners (N, 4, 2) of squares, also of those outside of the image; NaN where they cannot be predicted;
+    arguments as for `likeness_at`."""
     grown = np.pad(pixels, ((2, 2), (2, 2), (0, 0)), constant_values=np.nan)
     wanted = np.zeros(grown.shape[:2], np.bool_)
     rows, columns = (squares[:, k, None] + 1 + np.array(step) for k, step in ((1, (0, 0, 1, 1)), (0, (0, 1, 1, 0))))
@@ -164,12 +194,7 @@ def _outlines(image: GreyImage, pixels: FloatArray, squares: IntArray, board: Bo
     wanted &= np.isnan(grown[..., 0])
     ahead = predicted(grown, wanted)
     grown[wanted] = np.where(ahead.gain[:, None] < MAX_PREDICTION_GAIN, ahead.pixels, np.nan)
-    quads = grown[rows, columns]
-    inside = ((quads >= 0.0) & (quads <= np.array(image.shape[::-1]) - 1.0)).all(axis=(1, 2))
-    out = np.full(quads.shape, np.nan)
-    if inside.any():
-        out[inside] = _within(quads[inside], board)
-    return out
+    return np.asarray(grown[rows, columns])
 
 
 def _pattern(board: Board) -> Charuco:
