@@ -5,15 +5,30 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.once import once_a_run
 from helpers.schemas import faults
+from helpers.trihedral_captures import write_capture
 
 from rigkit.io.disk import writing
+from rigkit.synthetic.pairs import StereoScene
 
 SHOWN, NUMBERS_SHOWN = 6, 2
 """Of a long list so many of its first and last: there is more of the same between, which takes a checker seconds."""
+
+
+@pytest.fixture(scope="session")
+def trihedral(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, StereoScene]]:
+    """A folder of `helpers.trihedral_captures`, read-only, and the scenes of its pairs."""
+
+    def make() -> tuple[Path, dict[str, StereoScene]]:
+        folder = tmp_path_factory.mktemp("trihedral")
+        return folder, write_capture(folder)
+
+    return once_a_run(tmp_path_factory, "trihedral", make)
 
 
 @pytest.fixture(autouse=True)

@@ -31,19 +31,19 @@ def test_the_surface_goes_through_the_points(tmp_path: Path, capsys: pytest.Capt
     assert len(mesh.vertices) == printed["vertices"]
     assert mesh.has_vertex_normals() and mesh.has_vertex_colors()
     # Normals that pointed to the wrong side would turn the surface inside out and far away from the points.
-    surface = np.asarray(mesh.sample_points_uniformly(50_000).points)
+    surface = np.asarray(mesh.sample_points_uniformly(10_000).points)
     nearest = np.array([np.linalg.norm(surface - p, axis=1).min() for p in cloud.points_mm])
     assert np.median(nearest) < 0.25 * SQUARE_MM
 
 
 def test_a_cloud_of_one_view_is_closed_along_lines_of_sight(tmp_path: Path) -> None:
-    cloud = square_before_wall()
+    cloud = square_before_wall(31)
     meshes = {}
     for from_origin in (False, True):
         write_ply(tmp_path / "cloud.ply", replace(cloud, from_origin=from_origin), force=True)
         assert read_ply(tmp_path / "cloud.ply").from_origin == from_origin
         for option in ("", "--no-one-view" if from_origin else "--one-view"):
-            options = ["--depth", "5", "--cut", "0", "--force", *option.split()]
+            options = ["--depth", "4", "--cut", "0", "--force", *option.split()]
             assert main(["mesh", str(tmp_path / "cloud.ply"), *options]) == 0
             meshes[from_origin, option] = (tmp_path / "cloud-mesh.ply").read_bytes()
     # What the command says holds; else what the file says.

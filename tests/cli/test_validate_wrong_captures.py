@@ -4,93 +4,20 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterable
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
+from helpers.trihedral_captures import BOARDS, pair_toml, write_manifest
 
-from rigkit.cameras.base import Camera
-from rigkit.cameras.brown import Brown
-from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cli.main import main
-from rigkit.core.boards import Board
-from rigkit.core.posetype import PoseType
-from rigkit.io.calibrations.calibration_file import save_camera
-from rigkit.synthetic.pairs import StereoScene, trihedral_pair
-from rigkit.synthetic.photometry import Photometry
-from rigkit.synthetic.render import Optics
+from rigkit.synthetic.pairs import StereoScene
 
-SIZE = (640, 480)
-BOARDS = (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 50.0, 50.0), Board("plane3", 6, 9, 50.0, 50.0))
-CAMERAS: dict[str, Camera] = {
-    "regular": Brown(SIZE, np.array([534.0, 535.0, 323.5, 233.5, -0.15, 0.08, 2e-4, -1e-4, 0.0])),
-    "fisheye": KannalaBrandt(SIZE, np.array([235.0, 235.0, 322.7, 237.0, -0.021, 0.0012, 0.0, 0.0])),
-}
-PHOTOMETRY = Photometry(vignetting=0.3, gradient=(0.1, -0.06), noise_levels=1.5)
-SCENES: dict[str, tuple[str, str, tuple[float, float, float]]] = {
-    "same": ("regular", "regular", (90.0, 90.0, 90.0)),
-    "mixed": ("regular", "fisheye", (90.0, 90.0, 90.0)),
-    "leaning": ("regular", "regular", (90.0, 91.6, 90.0)),
-}
-"""Name of a pair: its two cameras and how its boards really stand."""
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, StereoScene]]:
-    """A folder with the images of all pairs, boards and calibrations; no manifest yet."""
-    root = tmp_path_factory.mktemp("capture")
-    rng = np.random.default_rng(11)
-    scenes = {}
-    for name, (first, second, angles) in SCENES.items():
-        scene = trihedral_pair(
-            BOARDS,
-            CAMERAS[first],
-            PoseType.GENERAL,
-            rng,
-            camera2=CAMERAS[second],
-            angles_deg=angles,
-            distance=(0.8, 1.1),
-            parallax_deg=(15.0, 40.0),
-        )
-        images = scene.images(optics=Optics(0.6, supersample=2), photometry=PHOTOMETRY, rng=rng)
-        for number, image in enumerate(images, start=1):
-            cv2.imwrite(str(root / f"{name}{number}.png"), image)
-        scenes[name] = scene
-    for board in BOARDS:
-        (root / f"{board.board_id}.toml").write_text(
-            f'schema = "rigkit.board/1"\nid = "{board.board_id}"\ncolumns = {board.columns}\nrows = {board.rows}\n'
-            "square_mm = 50.0\n"
-        )
-    for name, camera in CAMERAS.items():
-        save_camera(root / f"{name}.json", camera)
-    return root, scenes
-
-
-def pair_toml(scene: StereoScene, name: str, cameras: tuple[str, str], baseline_factor: float = 1.0) -> str:
-    ids = ", ".join(f'"{b.board_id}"' for b in BOARDS)
-    lines = ["[[pairs]]", f'id = "{name}"', 'pose_type = "general"', f"boards = [{ids}]"]
-    lines += [f'camera{k} = "{camera}"\nimage{k} = "{name}{k}.png"' for k, camera in enumerate(cameras, start=1)]
-    baseline = f'value_mm = {baseline_factor * scene.baseline_mm:.1f}, sigma_mm = 1.0, how = "rule"'
-    lines += ["[pairs.truth]", f"baseline = {{ {baseline} }}", "angles = ["]
-    for a, b in ((1, 2), (1, 3), (2, 3)):
-        lines += [f'  {{ a = "plane{a}", b = "plane{b}", value_deg = 90.0, sigma_deg = 0.3, how = "set square" }},']
-    return "\n".join([*lines, "]", ""])
-
-
-def write_manifest(root: Path, *pairs: str, cameras: Iterable[str] = tuple(CAMERAS)) -> None:
-    lines = ['schema = "rigkit.dataset/1"', 'name = "made"']
-    for board in BOARDS:
-        lines += ["[[boards]]", f'id = "{board.board_id}"', f'file = "{board.board_id}.toml"']
-    for name in cameras:
-        lines += ["[[cameras]]", f'id = "{name}"', f'calibration = "{name}.json"']
-    (root / "dataset.toml").write_text("\n".join([*lines, *pairs]))
+Trihedral = tuple[Path, dict[str, StereoScene]]
 
 
 @pytest.fixture
-def folder(capture: tuple[Path, dict[str, StereoScene]], tmp_path: Path) -> Path:
-    return Path(shutil.copytree(capture[0], tmp_path / "capture"))
+def folder(trihedral: Trihedral, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(trihedral[0], tmp_path / "capture"))
 
 
 def validate(folder: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, str, set[str]]:
@@ -104,10 +31,8 @@ def validate(folder: Path, capsys: pytest.CaptureFixture[str], *options: str) ->
     return code, text, failed
 
 
-def test_a_right_capture_passes(
-    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scenes = capture[1]
+def test_a_right_capture_passes(trihedral: Trihedral, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenes = trihedral[1]
     write_manifest(
         folder,
         pair_toml(scenes["same"], "same", ("regular", "regular")),
@@ -119,10 +44,8 @@ def test_a_right_capture_passes(
     assert json.loads((folder / "out" / "tables.json").read_text())
 
 
-def test_other_methods_alone_agree(
-    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scenes = capture[1]
+def test_other_methods_alone_agree(trihedral: Trihedral, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenes = trihedral[1]
     mixed = pair_toml(scenes["mixed"], "mixed", ("regular", "fisheye"))
     write_manifest(folder, pair_toml(scenes["same"], "same", ("regular", "regular")), mixed)
     command = ["crosscheck", str(folder), "-p", "same", "-j", "1", "-o"]
@@ -134,37 +57,35 @@ def test_other_methods_alone_agree(
 
 
 def test_boards_that_lean_fail_their_angle_and_nothing_else(
-    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+    trihedral: Trihedral, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_manifest(folder, pair_toml(capture[1]["leaning"], "leaning", ("regular", "regular")))
+    write_manifest(folder, pair_toml(trihedral[1]["leaning"], "leaning", ("regular", "regular")))
     code, text, failed = validate(folder, capsys)
     assert (code, failed) == (1, {"angle plane1-plane3"})
     assert "probable cause: pair 'leaning': plane1-plane3" in text
 
 
 def test_a_misread_rule_fails_the_baseline_and_nothing_else(
-    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+    trihedral: Trihedral, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_manifest(
         folder,
-        pair_toml(capture[1]["same"], "same", ("regular", "regular"), 1.03),
-        pair_toml(capture[1]["mixed"], "mixed", ("regular", "fisheye")),
+        pair_toml(trihedral[1]["same"], "same", ("regular", "regular"), 1.03),
+        pair_toml(trihedral[1]["mixed"], "mixed", ("regular", "fisheye")),
     )
     code, text, failed = validate(folder, capsys, "--no-crosscheck")
     assert (code, failed) == (1, {"baseline"})
     assert "pair 'same': baseline is off by -2.9 % while other lengths agree: it was probably misread" in text
 
 
-def test_wrong_squares_are_named(
-    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_squares_are_named(trihedral: Trihedral, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for board in BOARDS:
         path = folder / f"{board.board_id}.toml"
         path.write_text(path.read_text().replace("50.0", "51.5"))
     write_manifest(
         folder,
-        pair_toml(capture[1]["same"], "same", ("regular", "regular")),
-        pair_toml(capture[1]["mixed"], "mixed", ("regular", "fisheye")),
+        pair_toml(trihedral[1]["same"], "same", ("regular", "regular")),
+        pair_toml(trihedral[1]["mixed"], "mixed", ("regular", "fisheye")),
     )
     code, text, failed = validate(folder, capsys, "--no-crosscheck")
     assert (code, failed) == (1, {"baseline"})
@@ -172,17 +93,17 @@ def test_wrong_squares_are_named(
     assert "50.0" in text
 
 
-def declare_squares(folder: Path, capture: tuple[Path, dict[str, StereoScene]], square_mm: str) -> None:
+def declare_squares(folder: Path, trihedral: Trihedral, square_mm: str) -> None:
     """Write a manifest of one pair whose second board is declared with squares of another size."""
     path = folder / "plane2.toml"
     path.write_text(path.read_text().replace("50.0", square_mm))
-    write_manifest(folder, pair_toml(capture[1]["same"], "same", ("regular", "regular")))
+    write_manifest(folder, pair_toml(trihedral[1]["same"], "same", ("regular", "regular")))
 
 
 def test_one_board_with_wrong_squares_is_named(
-    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+    trihedral: Trihedral, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    declare_squares(folder, capture, "51.5")
+    declare_squares(folder, trihedral, "51.5")
     code, text, failed = validate(folder, capsys, "--no-crosscheck")
     assert code == 1
     assert "size plane2" in failed and failed <= {"baseline", "size plane2"}
@@ -190,9 +111,9 @@ def test_one_board_with_wrong_squares_is_named(
 
 
 def test_one_board_with_squares_so_wrong_that_it_fits_nowhere_is_named(
-    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+    trihedral: Trihedral, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    declare_squares(folder, capture, "43.0")
+    declare_squares(folder, trihedral, "43.0")
     code, text, _ = validate(folder, capsys, "--no-crosscheck")
     assert code == 1
     printed = (
@@ -203,9 +124,9 @@ def test_one_board_with_squares_so_wrong_that_it_fits_nowhere_is_named(
 
 
 def test_reconstruct_names_the_board_that_fits_nowhere_too(
-    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+    trihedral: Trihedral, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    declare_squares(folder, capture, "43.0")
+    declare_squares(folder, trihedral, "43.0")
     assert main(["reconstruct", str(folder), "-j", "1", "--no-pictures", "-o", str(folder / "clouds")]) == 0
     printed = (
         "same: board 'plane2' would be consistent with the others with squares of 50.0 mm (43 is declared); "
@@ -216,7 +137,7 @@ def test_reconstruct_names_the_board_that_fits_nowhere_too(
 
 @pytest.mark.parametrize("what", ["images", "cameras"])
 def test_swapped_images_and_cameras_are_named(
-    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str], what: str
+    trihedral: Trihedral, folder: Path, capsys: pytest.CaptureFixture[str], what: str
 ) -> None:
     order = ("regular", "fisheye")
     if what == "images":
@@ -226,16 +147,16 @@ def test_swapped_images_and_cameras_are_named(
         spare.rename(second)
     else:
         order = ("fisheye", "regular")
-    write_manifest(folder, pair_toml(capture[1]["mixed"], "mixed", order))
+    write_manifest(folder, pair_toml(trihedral[1]["mixed"], "mixed", order))
     code, text, _ = validate(folder, capsys, "--no-crosscheck")
     assert code in (1, 2, 3)
     assert "the two images, or camera1 and camera2, are swapped" in text
 
 
 def test_the_other_lens_s_calibration_is_named(
-    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+    trihedral: Trihedral, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_manifest(folder, pair_toml(capture[1]["mixed"], "mixed", ("regular", "regular")))
+    write_manifest(folder, pair_toml(trihedral[1]["mixed"], "mixed", ("regular", "regular")))
     code, text, _ = validate(folder, capsys, "--no-crosscheck")
     assert code in (1, 2, 3)
     assert "pair 'mixed': image 2 fits camera 'fisheye'" in text
@@ -243,9 +164,9 @@ def test_the_other_lens_s_calibration_is_named(
 
 
 def test_a_lens_that_is_in_no_calibration_is_named(
-    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+    trihedral: Trihedral, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_manifest(folder, pair_toml(capture[1]["mixed"], "mixed", ("regular", "regular")), cameras=["regular"])
+    write_manifest(folder, pair_toml(trihedral[1]["mixed"], "mixed", ("regular", "regular")), cameras=["regular"])
     code, text, _ = validate(folder, capsys, "--no-crosscheck")
     assert code in (1, 2, 3)
     assert "image 2 does not fit the calibration of 'regular'" in text
@@ -253,9 +174,9 @@ def test_a_lens_that_is_in_no_calibration_is_named(
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_a_pair_without_a_baseline_does_not_end_the_others(
-    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str], jobs: str
+    trihedral: Trihedral, folder: Path, capsys: pytest.CaptureFixture[str], jobs: str
 ) -> None:
-    scenes = capture[1]
+    scenes = trihedral[1]
     shutil.copy(folder / "leaning1.png", folder / "leaning2.png")
     write_manifest(
         folder,

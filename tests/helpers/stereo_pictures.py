@@ -50,9 +50,9 @@ def of_two_cameras(pictures: Path, folder: Path, count: int = FRAMES) -> list[Pa
     return [folder / "left", folder / "right"]
 
 
-def of_one_camera(pictures: Path, folder: Path) -> Path:
-    """Return a folder with the images of one camera, named as cameras do."""
+def of_one_camera(pictures: Path, folder: Path, count: int = FRAMES) -> Path:
+    """Return a folder with the first `count` images of one camera, named as cameras do."""
     folder.mkdir(parents=True)
-    for k, path in enumerate(sorted(pictures.glob("left*.jpg"))):
+    for k, path in enumerate(sorted(pictures.glob("left*.jpg"))[:count]):
         shutil.copy(path, folder / f"DSC_{k:04d}.JPG")
     return folder
