@@ -87,3 +87,16 @@ def calibration() -> Calibration:
 def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands start no worker processes unless a test asks for them (-j 2): each costs seconds of imports."""
     monkeypatch.setattr("os.cpu_count", lambda: 1)
+
+
+PLANNED_BESIDES = ("cli", "coach", "fuzz", "workflows")
+"""Folders of tests in which plans are made, but not what is tested."""
+
+
+@pytest.fixture(autouse=True)
+def fewer_poses(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plans choose among a third of the poses: how well they choose is for tests/planning and tests/validation."""
+    if request.path.is_relative_to(ROOT) and request.path.relative_to(ROOT).parts[1] in PLANNED_BESIDES:
+        monkeypatch.setattr("rigkit.planning.candidates.CANDIDATES_DRAWN", 800)
+        monkeypatch.setattr("rigkit.planning.candidates.CANDIDATES_KEPT", 300)
+        monkeypatch.setattr("rigkit.validation.sentinel.frames.CANDIDATES_KEPT", 300)

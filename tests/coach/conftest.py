@@ -36,11 +36,3 @@ def serve() -> Iterator[Callable[[Coach, tuple[str, ...]], int]]:
     for server, thread in running:
         server.should_exit = True
         thread.join(10.0)
-
-
-@pytest.fixture(autouse=True)
-def fewer_poses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A guide plans anew after every frame: here among a third of the poses. How well it chooses is for
-    tests/planning."""
-    monkeypatch.setattr("rigkit.planning.candidates.CANDIDATES_DRAWN", 800)
-    monkeypatch.setattr("rigkit.planning.candidates.CANDIDATES_KEPT", 300)
