@@ -184,7 +184,6 @@ typedef struct {
     SCRATCH(float, windows, edges_scratch(rules.last.contents));
 } tag_fit_t;
 
-EXPORT void map_tag_board(const tag_fit_t *fit);
 EXPORT double tag_sigma_factor(const tag_fit_t *fit, const factor_rules_t *rules);
 EXPORT double tag_scatter(const tag_fit_t *fit, double factor);
 EXPORT void tag_heights(

@@ -46,7 +46,7 @@ INLINE int gather(
                 const int64_t from = v * width + u + k, to = spots->count++;
                 spots->u[to] = (double)(u + k);
                 spots->v[to] = (double)v;
-                spots->value[to] = bytes ? (double)((const uint8_t *)grey)[from] : (double)((const float *)grey)[from];
+                spots->value[to] = level_at(grey, bytes, from);
                 const int inside = here.d[k] < 0.0;
                 total[inside] += spots->value[to];
                 parts[inside]++;

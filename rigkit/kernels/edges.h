@@ -33,12 +33,6 @@ typedef struct {
     double centre_u, centre_v, size;
 } window_t;
 
-/* An image as the camera gave it, a byte a pixel, or of floats: windows are copied anyway. */
-typedef struct {
-    const void *brightness;
-    int64_t width, height, bytes;
-} picture_t;
-
 typedef float block_row_t[BLOCK];
 
 /* The rows of the block of pixels that begins with `start`. */

@@ -1,5 +1,5 @@
 /* What the epipolar geometry of two cameras of any kind says of a pair of patches: where in image 2, and how turned. */
-#include "patches.h"
+#include "patch_samples.h"
 
 /* Return the ray of image 2 at a pixel, and its derivatives by the pixel (a row each of three); 0 outside the field. */
 INLINE int ray_at(const epipolar_t *g, double u, double v, double ray[3], double by_u[3], double by_v[3])
@@ -12,10 +12,7 @@ INLINE int ray_at(const epipolar_t *g, double u, double v, double ray[3], double
     for (int64_t way = 0; way < 2; way++) {
         const double t = way ? y - (double)top : x - (double)left;
         double (*w)[4] = way ? down : across;
-        w[0][0] = t * (-0.5 + t * (1.0 - 0.5 * t));
-        w[0][1] = 1.0 + t * t * (-2.5 + 1.5 * t);
-        w[0][2] = t * (0.5 + t * (2.0 - 1.5 * t));
-        w[0][3] = t * t * (-0.5 + 0.5 * t);
+        CUBIC(t, w[0][0], w[0][1], w[0][2], w[0][3]);
         w[1][0] = -0.5 + t * (2.0 - 1.5 * t);
         w[1][1] = t * (-5.0 + 4.5 * t);
         w[1][2] = 0.5 + t * (4.0 - 4.5 * t);

@@ -1,5 +1,5 @@
 /* Conventions of the kernels: C-contiguous arrays, sizes as int64_t, images row by row as float (0..255), pixel (0, 0) the
- * centre of the top-left pixel. Kernels check nothing: their Python callers own types, shapes and sizes. */
+ * centre of the top-left pixel. Kernels do not check their arguments: the Python callers guarantee types, shapes and sizes. */
 #ifndef RIGKIT_KERNELS_H
 #define RIGKIT_KERNELS_H
 
@@ -11,8 +11,8 @@
 
 #include "api.h"
 
-/* On a hot function: also compiled for newer processors, chosen when the library is loaded. By what they can do:
- * "arch=haswell" would be chosen on a Haswell alone. */
+/* For hot functions: compile them for these instruction sets as well; one is chosen when the library is loaded. Levels of
+ * instruction sets, as "arch=haswell" would be chosen on Haswell processors alone. */
 #if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12 && defined(__x86_64__) && defined(__GLIBC__)
 #define PROCESSORS 1
 #define FOR_EACH_PROCESSOR __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
@@ -25,10 +25,22 @@
 #error "needs vector extensions: compile with gcc or clang (on Windows clang-cl, or the clang of the package ziglang)"
 #endif
 
-/* What a small function that hot loops call needs to be vectorised with them. */
+/* For small functions called in hot loops: these are vectorised only if the functions are inlined. */
 #define INLINE static inline __attribute__((always_inline, unused))
 
-/* Return `image` at (u, v), bilinear, the border repeated (detection.saddles.response.sample). */
+/* Return the grey level at pixel `at` (row * width + column) of an image of bytes, or of float. */
+INLINE double level_at(const void *grey, int64_t bytes, int64_t at)
+{
+    return bytes ? (double)((const uint8_t *)grey)[at] : (double)((const float *)grey)[at];
+}
+
+/* An image of bytes, or of float, as `level_at` reads it. */
+typedef struct {
+    const void *brightness;
+    int64_t width, height, bytes;
+} picture_t;
+
+/* Return `image` at (u, v), interpolated bilinearly, the border repeated (detection.saddles.response.sample). */
 INLINE float brightness_at(const image_t image, float u, float v)
 {
     const int32_t width = (int32_t)image.width;
@@ -47,7 +59,7 @@ INLINE float brightness_at(const image_t image, float u, float v)
     return upper + below * (lower - upper);
 }
 
-/* Return the grey level at (u, v), bilinear, the border repeated; 0 where that is no place. */
+/* Return the grey level at (u, v), interpolated bilinearly, the border repeated; 0 if u or v is not finite. */
 INLINE double grey_level_at(const void *grey, int64_t bytes, int64_t width, int64_t height, double u, double v)
 {
     if (!(isfinite(u) && isfinite(v)))
@@ -75,9 +87,9 @@ INLINE double grey_level_at(const void *grey, int64_t bytes, int64_t width, int6
 
 #define PI 3.14159265358979323846
 
-/* Return whether at `most` or more of the `places` `along` the edge from (u, v) to (end_u, end_v) the side that should be
- * brighter (sign +1: where angles grow from u to v, seen from the start) is so by more than `weakest`
- * (reference.links.edge_contrast). */
+/* Return whether the image has an edge from (u, v) to (end_u, end_v): at `min_places` or more of `places` fractions `along` it,
+ * the bright side is brighter than the dark side by more than `weakest`, `offset` px from the edge. The bright side is at +90
+ * degrees (from u to v) of the direction from start to end if `sign` is +1 (reference.links.edge_contrast). */
 INLINE int edge_seen(
     const image_t image, const double *along, int64_t places, int64_t min_places, double u, double v, double end_u, double end_v,
     double sign, double offset, double weakest)
@@ -85,32 +97,34 @@ INLINE int edge_seen(
     const double chord_u = end_u - u, chord_v = end_v - v;
     double length = sqrt(chord_u * chord_u + chord_v * chord_v);
     length = length > 1e-9 ? length : 1e-9;
-    const double aside_u = -sign * offset * chord_v / length, aside_v = sign * offset * chord_u / length;
-    /* Clutter is told from an edge by the first places. */
+    const double normal_u = -sign * offset * chord_v / length, normal_v = sign * offset * chord_u / length;
+    /* Most candidates that are no edge fail at the first places. */
     int64_t unseen = 0;
     for (int64_t k = 0; k < places && unseen <= places - min_places; k++) {
         const double at_u = u + along[k] * chord_u, at_v = v + along[k] * chord_v;
-        const float bright = brightness_at(image, (float)(at_u + aside_u), (float)(at_v + aside_v));
-        const float dark = brightness_at(image, (float)(at_u - aside_u), (float)(at_v - aside_v));
+        const float bright = brightness_at(image, (float)(at_u + normal_u), (float)(at_v + normal_v));
+        const float dark = brightness_at(image, (float)(at_u - normal_u), (float)(at_v - normal_v));
         unseen += !((double)(bright - dark) > weakest);
     }
     return unseen <= places - min_places;
 }
 
-/* At most so many squares for so many points: smaller ones leave more of them to look into, larger ones more points that
- * are too far. */
+/* Largest number of squares for `count` points: a search visits more squares if they are smaller, and more distant points if
+ * they are larger. */
 #define MAX_SQUARES(count) ((count) / 2 + 8)
 
-/* int32_t that `fill_squares` needs. */
+/* Number of int32_t that `fill_squares` needs. */
 #define SQUARES_MEMORY(count) (MAX_SQUARES(count) + 1 + 2 * (count))
 
+/* Return the row or column of squares, of `count`, that `position` is in; the first or last for positions outside. */
 INLINE int64_t square_at(double position, double least, double side, int64_t count)
 {
     const double place = (position - least) / side;
     return place > 0.0 ? (place < (double)count ? (int64_t)place : count - 1) : 0;
 }
 
-/* Sort `count` > 0 points into squares of at least `side`, in `memory` (SQUARES_MEMORY), which must outlive `out`. */
+/* Sort `count` > 0 finite points into a grid of squares with sides of `side` > 0 or more, in `memory` (SQUARES_MEMORY), which
+ * must outlive `out`. */
 INLINE void fill_squares(const double *points, int64_t count, double side, int32_t *memory, squares_t *out)
 {
     double left = points[0], right = left, top = points[1], bottom = top;
@@ -134,58 +148,55 @@ INLINE void fill_squares(const double *points, int64_t count, double side, int32
             (int32_t)(square_at(points[2 * i + 1], top, side, rows) * columns + square_at(points[2 * i], left, side, columns));
         first[square[i]]++;
     }
-    /* The end of each square; filling it from there moves that to its start. */
+    /* `first` holds the end of each square's points; filling them in from the end moves it to their start. */
     for (int64_t b = 1; b <= size; b++)
         first[b] += first[b - 1];
     for (int64_t i = count - 1; i >= 0; i--)
         order[--first[square[i]]] = (int32_t)i;
 }
 
-/* Return what `at` of the `values` are not above and the others not below; the values change places (Hoare's FIND). */
-INLINE double ranked(double *values, int64_t count, int64_t at)
-{
-    int64_t low = 0, high = count - 1;
-    while (low < high) {
-        const double pivot = values[at];
-        int64_t i = low, j = high;
-        while (i <= j) {
-            while (values[i] < pivot)
-                i++;
-            while (pivot < values[j])
-                j--;
-            if (i <= j) {
-                const double swap = values[i];
-                values[i++] = values[j];
-                values[j--] = swap;
-            }
-        }
-        low = j < at ? i : low;
-        high = at < i ? j : high;
+/* Define a function that returns the value of rank `at`, from 0, of `count` > 0 values, which it reorders (quickselect: Hoare,
+ * "Algorithm 65: Find", CACM 4, 1961). */
+#define DEFINE_RANKED(name, number) \
+    INLINE number name(number *values, int64_t count, int64_t at) \
+    { \
+        int64_t low = 0, high = count - 1; \
+        while (low < high) { \
+            const number pivot = values[at]; \
+            int64_t i = low, j = high; \
+            while (i <= j) { \
+                while (values[i] < pivot) \
+                    i++; \
+                while (pivot < values[j]) \
+                    j--; \
+                if (i <= j) { \
+                    const number swap = values[i]; \
+                    values[i++] = values[j]; \
+                    values[j--] = swap; \
+                } \
+            } \
+            low = j < at ? i : low; \
+            high = at < i ? j : high; \
+        } \
+        return values[at]; \
     }
-    return values[at];
-}
 
+DEFINE_RANKED(ranked, double)
+DEFINE_RANKED(ranked_float, float)
+
+/* Return the median of `count` > 0 values, which are reordered: the mean of the middle two of an even number. */
 INLINE double quick_median(double *values, int64_t count)
 {
     return 0.5 * (ranked(values, count, (count - 1) / 2) + ranked(values, count, count / 2));
 }
 
+/* Return x clipped to -most ... most; NaN stays NaN. */
 INLINE double limited(double x, double most)
 {
     return x > most ? most : x < -most ? -most : x;
 }
 
-/* Add a residual `off` with its derivatives `row` to the lower triangle of `N` (n x n) and to `right`. */
-INLINE void add_residual(double *N, double *right, const double *row, int n, double off)
-{
-    for (int i = 0; i < n; i++) {
-        right[i] += row[i] * off;
-        for (int j = 0; j <= i; j++)
-            N[i * n + j] += row[i] * row[j];
-    }
-}
-
-/* Return whether the lower triangle of the symmetric `N` (n x n) could be made its Cholesky factor. */
+/* Replace the lower triangle of the symmetric `N` (n x n) by its Cholesky factor; return whether N is positive definite. */
 INLINE int cholesky(double *N, int n)
 {
     for (int j = 0; j < n; j++) {
@@ -205,7 +216,7 @@ INLINE int cholesky(double *N, int n)
     return 1;
 }
 
-/* Set `x` to the solution of N x = `x`, `L` being what `cholesky` made of N. */
+/* Replace `x` by the solution of N y = x, from the factor `L` of N (`cholesky`). */
 INLINE void cholesky_solve(const double *L, int n, double *x)
 {
     for (int i = 0; i < n; i++) {
@@ -220,7 +231,7 @@ INLINE void cholesky_solve(const double *L, int n, double *x)
     }
 }
 
-/* Return exp(y) for -80 <= y <= 0: 2^n times Taylor's series of the rest, relative error below 2e-7. */
+/* Return exp(y) for -80 <= y <= 0: 2^n times the Taylor series of the remainder, relative error below 2e-7. */
 INLINE float decay(float y)
 {
     const int32_t n = (int32_t)(y * 1.44269504f - 0.5f);
@@ -233,9 +244,10 @@ INLINE float decay(float y)
     return series * power;
 }
 
-/* reference.edge_model._blurred_edge, with the error function of Abramowitz and Stegun 7.1.26, right to 1.5e-7; `round` where
- * the fourth cumulant is 0. */
-INLINE void any_edge(float x, const int round, float kurtosis, float out[5])
+/* Set `out` to a blurred edge at the distance x over the blur s: the step S from -1 to 1, its first to third derivatives by x,
+ * and -s dS/ds (reference.edge_model._blurred_edge). `kurtosis` is the fourth cumulant of the blur over s^4, not used if `normal`.
+ * The error function is Abramowitz and Stegun's 7.1.26, with an absolute error below 1.5e-7. */
+INLINE void any_edge(float x, const int normal, float kurtosis, float out[5])
 {
     const float square = x * x, gauss = decay(-0.5f * square);
     const float t = 1.0f / (1.0f + (0.3275911f * 0.70710678f) * fabsf(x));
@@ -244,7 +256,7 @@ INLINE void any_edge(float x, const int round, float kurtosis, float out[5])
     const float error = copysignf(1.0f - tail, x);
     const float density = 0.79788456f * gauss;
     out[3] = density * (square - 1.0f);
-    if (round) {
+    if (normal) {
         out[0] = error;
         out[1] = density;
         out[2] = -density * x;
@@ -264,16 +276,17 @@ INLINE void blurred_edge(float x, float kurtosis, float out[5])
     any_edge(x, 0, kurtosis, out);
 }
 
-/* Rows of corners are made so many at a time: they stay in the first cache. Of their products four rows by eight stay in
- * registers, so that rows are padded to a multiple of eight. */
+/* Rows are made for CORNERS corners at a time, which fit the first-level cache. DOWN x ACROSS sums of their products are kept
+ * in registers, so that rows are padded to a multiple of ACROSS. */
 enum { CORNERS = 32, ACROSS = 8, DOWN = 4 };
 
+/* Return the length of rows of `across` numbers with their padding. */
 INLINE int64_t padded(int64_t across)
 {
     return (across + ACROSS - 1) / ACROSS * ACROSS;
 }
 
-/* Add to the upper triangle of `sums` (across, across), by blocks, the products of `count` rows. */
+/* Add J^T J to `sums` (across, across), upper triangle by blocks; J are the `rows` (count, across), `across` padded. */
 INLINE void add_products(const double *rows, int64_t count, int64_t across, double *sums)
 {
     for (int64_t i = 0; i < across; i += DOWN)

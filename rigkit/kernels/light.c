@@ -72,7 +72,7 @@ INLINE void gather(
             const int64_t at = v * width + u, n = out->count++;
             out->u[n] = (double)du;
             out->v[n] = (double)dv;
-            out->value[n] = bytes ? (double)((const uint8_t *)grey)[at] : (double)((const float *)grey)[at];
+            out->value[n] = level_at(grey, bytes, at);
             out->pattern[n] = edge_at(one / blur) * edge_at(two / blur);
         }
     for (int64_t n = out->count; n < out->count + BLOCK; n++)

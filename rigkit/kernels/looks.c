@@ -2,11 +2,6 @@
  * numpy are in tests/kernels/reference/looks.py. */
 #include "kernels.h"
 
-INLINE double level_at(const void *grey, int64_t bytes, int64_t at)
-{
-    return bytes ? (double)((const uint8_t *)grey)[at] : (double)((const float *)grey)[at];
-}
-
 /* Return whether at least one of the four pixels of 2 x 2 squares is brighter or darker than the mean of its square by `share` of it,
  * in the upper median over the squares whose mean is above the upper median of all and above `least`; every `step`-th square
  * in both directions. */

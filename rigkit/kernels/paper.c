@@ -9,11 +9,6 @@ typedef struct {
     const int64_t *owner;
 } outer_t;
 
-typedef struct {
-    const void *brightness;
-    int64_t width, height, bytes;
-} picture_t;
-
 /* The ends of lines beyond the outermost corners (which line of which corner), and their measured values. */
 typedef struct {
     double end, bright, cell;
@@ -25,8 +20,7 @@ static float grey_at(const picture_t *image, int64_t u, int64_t v)
 {
     u = u < 0 ? 0 : u >= image->width ? image->width - 1 : u;
     v = v < 0 ? 0 : v >= image->height ? image->height - 1 : v;
-    const int64_t at = v * image->width + u;
-    return image->bytes ? (float)((const uint8_t *)image->brightness)[at] : ((const float *)image->brightness)[at];
+    return (float)level_at(image->brightness, image->bytes, v * image->width + u);
 }
 
 /* Return the brightness at (u, v) as detection.saddles.response.sample does. */

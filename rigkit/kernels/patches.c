@@ -131,20 +131,6 @@ INLINE int factor(double M[UNKNOWNS][UNKNOWNS])
     return 1;
 }
 
-INLINE void solve(double L[UNKNOWNS][UNKNOWNS], double x[UNKNOWNS])
-{
-    for (int64_t i = 0; i < UNKNOWNS; i++) {
-        for (int64_t k = 0; k < i; k++)
-            x[i] -= L[i][k] * x[k];
-        x[i] /= L[i][i];
-    }
-    for (int64_t i = UNKNOWNS - 1; i >= 0; i--) {
-        for (int64_t k = i + 1; k < UNKNOWNS; k++)
-            x[i] -= L[k][i] * x[k];
-        x[i] /= L[i][i];
-    }
-}
-
 /* Say how the patch read from image 2 (`there`) agrees with that of image 1: its products with `steep` and with the patch,
  * and its own energy, free of offset. `steep` and the weighted patch sum up to nothing: an offset is no part of theirs. */
 INLINE void compare(patch_t *p, double sums[UNKNOWNS], double *common, double *energy)
@@ -257,7 +243,7 @@ INLINE int align_patch(
                 return 0;
             fixed = 1;
         }
-        solve(matrix, step);
+        cholesky_solve(matrix[0], UNKNOWNS, step);
         if (!move_place(place, step, scale1))
             return 0;
         const double away_u = (place->u2 - u0) / scale2, away_v = (place->v2 - v0) / scale2;
@@ -284,7 +270,7 @@ INLINE double covariance_of(const place_t *place, double scale1, const agreement
     for (int64_t n = 0; n < UNKNOWNS; n++) {
         double unit[UNKNOWNS] = {0};
         unit[n] = 1.0;
-        solve(L, unit);
+        cholesky_solve(L[0], UNKNOWNS, unit);
         for (int64_t m = 0; m < UNKNOWNS; m++)
             spread[m][n] = unit[m];
     }

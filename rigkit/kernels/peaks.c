@@ -63,26 +63,7 @@ INLINE float value_at_rank(
             if (bin_of(values[k], bins) == bin)
                 room[few++] = values[k];
     }
-    /* Hoare's FIND. */
-    int64_t low = 0, high = few - 1;
-    while (low < high) {
-        const float pivot = room[at];
-        int64_t i = low, j = high;
-        while (i <= j) {
-            while (room[i] < pivot)
-                i++;
-            while (pivot < room[j])
-                j--;
-            if (i <= j) {
-                const float swap = room[i];
-                room[i++] = room[j];
-                room[j--] = swap;
-            }
-        }
-        low = j < at ? i : low;
-        high = at < i ? j : high;
-    }
-    return room[at];
+    return ranked_float(room, few, at);
 }
 
 /* Of every step-th inner pixel of every step-th inner row: set out to the upper median of |response|, and the brightness

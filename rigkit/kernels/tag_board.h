@@ -17,7 +17,9 @@ typedef struct {
 
 tag_room_t room_of(const tag_fit_t *fit);
 
-/* Mark the corners that are known; return how many. */
+void map_tag_board(const tag_fit_t *fit);
+
+/* Mark the known corners; return their number. */
 int64_t take_known(const tag_fit_t *fit, tag_room_t *room);
 
 /* Keep of the marked corners those that `keep` says, with their places, surface and start. */

@@ -181,8 +181,7 @@ INLINE int64_t block_pixels(
         pixels->counts[i] = column < width && row < height ? 1.0f : 0.0f;
         column = column < width ? column : width - 1;
         row = row < height ? row : height - 1;
-        const int64_t k = row * width + column;
-        pixels->value[i] = bytes ? (float)((const uint8_t *)grey)[k] : ((const float *)grey)[k];
+        pixels->value[i] = (float)level_at(grey, bytes, row * width + column);
         pixels->u[i] = (float)((double)(u + i % SIDE) - tag->centre[0]);
         pixels->v[i] = (float)((double)(v + i / SIDE) - tag->centre[1]);
     }
