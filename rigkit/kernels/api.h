@@ -1,12 +1,12 @@
-/* What Python calls: every function, structure and constant that both sides know is declared here and in the headers that
- * this one includes, and nowhere else. The compiler checks the kernels against them, and rigkit.kernels.declarations reads
- * them to make the calls, so they are plain: no conditions, and of the preprocessor only the macros below.
+/* The interface to Python: every function, structure and constant that C and Python share is declared here and in the headers
+ * that this one includes, and nowhere else. The compiler checks the kernels against these declarations, and
+ * rigkit.kernels.declarations parses them to make the calls. They must stay simple: no conditions, no macros but those below.
  *
- * ARRAY(type, name, sizes...) is a pointer to the first value of a C-contiguous array; its sizes are what the caller's
- * array must have, in terms of the other arguments or members. A number that is a size of such an array by itself, as
- * `count` is of ARRAY(const double, pixels, count, 2), is read from it: Python passes no sizes.
- * RESULT(...) is an array that the call makes and returns, SCRATCH(...) one that it makes and forgets.
- * IMAGE(name) is a grey image, of bytes or else of float. */
+ * ARRAY(type, name, sizes...) is a pointer to the first value of a C-contiguous array. Its sizes, in terms of the other
+ * arguments or members, are those that the caller's array must have. An argument that is itself such a size, as `count` in
+ * ARRAY(const double, pixels, count, 2), is taken from the array: Python does not pass it.
+ * RESULT(...) is an array that the call allocates and returns, SCRATCH(...) one that it allocates as working memory.
+ * IMAGE(name) is a grey image of bytes or of float. */
 #ifndef RIGKIT_KERNELS_API_H
 #define RIGKIT_KERNELS_API_H
 
@@ -17,7 +17,7 @@
 #define SCRATCH(type, name, ...) type *name
 #define IMAGE(name) const void *name, int64_t bytes, int64_t width, int64_t height
 
-/* Of results that are zero or one. */
+/* Type of results that are zero or one. */
 typedef uint8_t truth_t;
 
 #if defined(_WIN32)
@@ -28,7 +28,7 @@ typedef uint8_t truth_t;
 
 /* library.c */
 
-/* The instruction set that hot functions are run with on this processor. */
+/* Return the instruction set that hot functions use on this processor. */
 EXPORT const char *instruction_set(void);
 
 #include "api_lattice.h"

@@ -4,13 +4,13 @@
 
 /* departures.c */
 
-/* Displacements of an image that models leave out: so many powers of the radius, and of those that are not radial eight
- * (calibration.departures). A pose has six numbers. */
+/* Displacements of an image that lens models leave out: RADIAL_POWERS powers of the radius, and eight that are not radial
+ * (calibration.departures). A pose has POSE parameters. */
 enum { RADIAL_POWERS = 5, DISPLACEMENTS = RADIAL_POWERS + 8, POSE = 6 };
 
-/* Corners of boards, view after view so many: their derivatives, what turns with the pose (board corner less the board's
- * origin, in the camera frame), where they project, the residuals, and which of them tell anything. The derivatives by the
- * parameters count in units of `sigmas`. */
+/* Corners of boards, `counts` in each view: derivatives of their pixels, lever arms (board corner minus the board's origin, in
+ * the camera frame), projections, residuals, and which corners are used. Derivatives by the parameters are multiplied by
+ * `sigmas`. */
 typedef struct {
     ARRAY(const double, d_pixels_d_point, 2, 3, count);
     ARRAY(const double, d_pixels_d_parameters, 2, parameters, count);
@@ -41,13 +41,13 @@ EXPORT void average_amounts(
 
 /* board_pose.c */
 
-/* One set of rays for all poses, or one for each. */
+/* Set the residuals of the poses and their derivatives; `sets` is 1 (the same rays for all poses) or `poses`. */
 EXPORT void ray_residuals(
     ARRAY(const double, rays, sets, count, 3), ARRAY(const double, bases, sets, count, 2, 3), int64_t sets,
     ARRAY(const double, points, count, 3), int64_t count, ARRAY(const double, rotation, poses, 3, 3),
     ARRAY(const double, translation, poses, 3), int64_t poses, RESULT(double, residuals, poses, count, 2),
     RESULT(double, jacobian, poses, count, 2, POSE));
-/* Moves the poses to the minima near them. */
+/* Replace the poses by the minima that the descent from them reaches. */
 EXPORT void refine_board_poses(
     ARRAY(const double, rays, sets, count, 3), ARRAY(const double, bases, sets, count, 2, 3), int64_t sets,
     ARRAY(const double, points, count, 3), int64_t count, ARRAY(double, rotation, poses, 3, 3),
@@ -55,10 +55,10 @@ EXPORT void refine_board_poses(
 
 /* linearise.c */
 
-/* Views of boards, padded to so many corners each, and what their residuals weigh (calibration.linearise): poses, the boards'
- * points and by how much a warp moves them, which point each corner is, and where each point stands among those released (-1
- * where it does not). Corners that do not project are `lost_px` off, along both axes; the loss is least squares where
- * `loss_px` is zero. */
+/* Views of boards, padded to `corners` corners each, and the weights of their residuals (calibration.linearise): poses, the
+ * boards' points (`table`) with their derivatives by the warp parameters, the point of each corner, and the index of each point
+ * among the released ones (-1 if it is fixed). Corners that do not project have residuals of `lost_px` along both axes. The loss
+ * is Cauchy's of scale `loss_px`, or least squares if that is zero. */
 typedef struct {
     ARRAY(const double, rotation, views, 3, 3);
     ARRAY(const double, translation, views, 3);
@@ -72,8 +72,8 @@ typedef struct {
     double loss_px, lost_px;
 } board_views_t;
 
-/* What they come to: residuals, which corners project, the cost of each view, and the sums of products of its `across` rows;
- * of the released points those with all rows of their corners and their own three, and with the poses. */
+/* The linearised views: residuals, which corners project, the cost of each view, and J^T J of its `across` columns; for each
+ * released point the products of its three columns with all columns and with themselves, and with those of each view's pose. */
 typedef struct {
     ARRAY(double, residuals, 2, views, corners);
     ARRAY(uint8_t, valid, views, corners);
@@ -84,7 +84,7 @@ typedef struct {
     int64_t views, corners, across, released;
 } view_sums_t;
 
-/* Where the corners of the views from `first` on stand in the camera frame, and those without the translation. */
+/* Return the corners of the views from `first` on in the camera frame (`points`), and without the translation (`lever`). */
 EXPORT void place_corners(
     const board_views_t *seen, int64_t first, int64_t count, RESULT(double, lever, 3, count),
     RESULT(double, points, 3, count));
@@ -97,7 +97,7 @@ EXPORT void add_views(
 
 /* schur.c */
 
-/* Blocks of normal equations over globals and the poses of views (calibration.normal_equations). */
+/* Blocks of the normal equations of global parameters and of the poses of views (calibration.normal_equations). */
 typedef struct {
     ARRAY(const double, gg, globals, globals);
     ARRAY(const double, gp, views, globals, POSE);
@@ -134,8 +134,9 @@ EXPORT void cover_pixels(
 
 /* brown.c */
 
-/* Points in the camera frame and a camera: fx, fy, cx, cy, k1, k2, p1, p2, k3 ... k6, zero where it has less of them.
- * Derivatives are written by so many `axes` of the point and so many `rows` of parameters, none or all; zeros are not. */
+/* Points in the camera frame and the parameters of a camera: fx, fy, cx, cy, k1, k2, p1, p2, k3 ... k6, zero for those that it
+ * lacks. Derivatives are written by `axes` coordinates of the point and by `rows` parameters, each all or 0; derivatives that
+ * are always zero are not written. */
 typedef struct {
     ARRAY(const double, x, count);
     ARRAY(const double, y, count);
@@ -155,8 +156,8 @@ EXPORT void undistort_brown(
 
 /* radial.c */
 
-/* Points in the camera frame and a camera that looks the same all around: pixel = L s (x, y) + centre with L = ((l00, l01),
- * (0, l11)), and the numbers of its shape: k1 ... k4, or f(rho) of the power zero first. Derivatives as above. */
+/* Points in the camera frame and a camera with rotational symmetry: pixel = L s (x, y) + centre with L = ((l00, l01), (0, l11)),
+ * and the coefficients of s: k1 ... k4, or those of f(rho) from the power zero on. Derivatives as above. */
 typedef struct {
     ARRAY(const double, x, count);
     ARRAY(const double, y, count);
@@ -177,8 +178,8 @@ EXPORT void differentiate_scaramuzza(
 
 /* monotone.c */
 
-/* Functions linear x + factor P(x) - offset that increase from `low` to `high`, and a table of their roots, even in a target
- * from `first` to `last`. */
+/* Functions linear x + factor P(x) - offset, which increase from `low` to `high`, and a table of approximate roots at equal steps
+ * of `target` from `first` to `last`. */
 typedef struct {
     ARRAY(const double, polynomial, terms);
     ARRAY(const double, linear, count);

@@ -4,9 +4,9 @@
 
 /* edges.c, with edges_window.c, edges_model.c and edges_noise.c */
 
-/* How far two pixels lie apart, both ways, whose noise is compared: LAGS pairs, of which the opposite ones are the same.
- * What comes out of a corner: u, v, sigma, s, 2 b, RMS residual, RMS noise, whether it is valid, its pixels, for each of
- * the LAGS the sum of products of the noise, and of how many. */
+/* The autocovariance of the noise is estimated up to a lag of LAG pixels along both axes: LAGS lags, as opposite lags have the
+ * same. The results of a corner: u, v, sigma, s, 2 b, RMS residual, RMS noise, whether it is valid, its number of pixels, and
+ * for each lag the sum of products of the noise and the number of products. */
 enum { LAG = 2, ACROSS_LAGS = 2 * LAG + 1, LAGS = LAG * ACROSS_LAGS + LAG + 1, OUTCOMES = 9 + 2 * LAGS };
 
 /* The constants of detection.subpixel.edge_model and detection.subpixel.edge_fit, under their names there. */
@@ -28,8 +28,8 @@ EXPORT void fit_edges(
     ARRAY(const uint8_t, ends, count, 2, 2), const edge_rules_t *rules, SCRATCH(float, scratch, edges_scratch(rules)),
     RESULT(double, out, count, OUTCOMES));
 
-/* What windows of the corners of tags go by: how wide a border is, in sides of a tag, how many s it is left by, and the distance
- * of neighbouring lines where none are near, px. */
+/* Constants of the windows of corners of tags: the width of a tag's border, in sides of a tag, the distance in s that a window
+ * keeps from the code within it, and the distance of neighbouring lines, px, where there are none. */
 typedef struct {
     double border, blurs, nothing_near;
 } tag_window_t;
@@ -86,15 +86,15 @@ EXPORT void find_paper(
 
 /* surface.c */
 
-/* Degree of the polynomial that a lens adds to a perspective, at most, and how many terms x^i y^j that has. */
+/* Highest degree of the polynomial that models the distortion of a perspective map, and its number of terms x^i y^j. */
 enum { SURFACE_DEGREE = 8, SURFACE_TERMS = (SURFACE_DEGREE + 1) * (SURFACE_DEGREE + 2) / 2 };
 
-/* What is known of a place on a board: where it is seen, first derivatives along x and along y, second ones likewise, the standard
- * deviation of the first for points of standard deviation 1, the curvatures of the lines along x and along y, and how far a unit of
- * the board lies from these. */
+/* The columns of the map at a place on a board: the pixel, its first derivatives by x and by y, its second derivatives by x and
+ * by y, the standard deviation of the pixel for points of standard deviation 1, the curvatures of the lines along x and along
+ * y, and the distances from them, px, of the lines one unit of the board further. */
 enum { SEEN = 0, SIDES = 2, SECOND = 6, GAIN = 10, CURVATURE = 11, HEIGHTS = 13, SURFACE_COLUMNS = 15 };
 
-/* Numbers of scratch for each point of `fit_polynomials`: five, and the powers of x and y. */
+/* Scratch of `fit_polynomials` for each point: five numbers, and the powers of x and y. */
 enum { FIT_SCRATCH = 5 + 2 * (SURFACE_DEGREE + 1) };
 
 EXPORT void project_places(
@@ -121,10 +121,11 @@ EXPORT void add_polynomial(
 
 /* tag_board.c and tag_rounds.c */
 
-/* What is known of a corner of a board (detection.guided.board_guide.FITTED): u, v, contrast, RMS residual, RMS noise, sigma, s; NaN
- * where it is missing. Marks of corners: not there, sought in vain until others near it are found, those of the last fit of all, those
- * that something is done with. Numbers of a board: whether the map is that of its corners, whether it begins with a camera's map or a
- * perspective, terms and plain degree of its polynomial, its scatter, that when all corners were fitted, and how many these were. */
+/* Columns of a corner (detection.guided.board_guide.FITTED): u, v, contrast, RMS residual, RMS noise, sigma, s; NaN if missing.
+ * Marks of corners: does not exist; not found, and not searched again until a corner near it is found; part of the last fit of
+ * all corners; selected for the current operation. Numbers of a board: whether the map is that of the current corners, whether
+ * it is a polynomial added to a camera's map or to a perspective, the terms of that polynomial and the lowest degree that fits,
+ * its scatter, the scatter at the last fit of all corners, and the number of corners of that fit. */
 enum {
     CORNER_CONTRAST = 2, CORNER_RESIDUAL = 3, CORNER_NOISE = 4, CORNER_SIGMA = 5, CORNER_BLUR = 6, CORNER_COLUMNS = 7,
     MARK_VAIN = 0, MARK_WAITING = 1, MARK_FITTED = 2, MARK_CELLS = 3, TAG_MARKS = 4,
@@ -132,14 +133,14 @@ enum {
     FITTED_SCATTER = 6, FITTED_COUNT = 7, TAG_NUMBERS = 8
 };
 
-/* Doubles of room for each corner of a board of tags, with those of the codes' modules beside them, and for its map. */
+/* Doubles of scratch for each corner of a board of tags, and for its map. */
 enum {
     ROOM_OF_CORNER = SURFACE_TERMS + SURFACE_COLUMNS + OUTCOMES + FIT_SCRATCH + 15,
     ROOM_OF_MAP = SURFACE_TERMS * SURFACE_TERMS + 2 * SURFACE_TERMS + SURFACE_DEGREE + 1 + 13
 };
 
-/* The constants of detection.tags.corners and of what it takes from others, under their names there; `first` and `last` are the rules
- * of a quick fit and of the last, `rough` of the last without noise told from other residuals. */
+/* The constants of detection.tags.corners and of the modules that it imports, under their names there. `first` are the rules of
+ * a quick fit, `last` of the final one, `rough` of the final one without an estimate of the noise. */
 typedef struct {
     const edge_rules_t *first, *last, *rough;
     const tag_window_t *window;
@@ -150,7 +151,7 @@ typedef struct {
     int64_t min_predicting, min_guiding;
 } tag_corner_rules_t;
 
-/* detection.tags.placing.TagBoard, its corners row by row; whether squares join its tags; the border in sides of a tag. */
+/* detection.tags.placing.TagBoard: its corners row by row, whether black squares join its tags, its border in sides of a tag. */
 typedef struct {
     ARRAY(const double, places, count, 2);
     ARRAY(const double, steps, count, 2, 2);
@@ -163,8 +164,9 @@ typedef struct {
     double spacing, border;
 } tag_board_t;
 
-/* The fit of a board of tags in an image. `base` is a camera's map of its corners, `fitted` (outcomes) and `sides` are of the corners
- * marked FITTED, `curvature` is what lines were fitted with last; `windows`, `map` and `room` are scratch. */
+/* The fit of a board of tags in an image. `base` is a camera's map of its corners; `fitted` (results) and `sides` belong to the
+ * corners marked FITTED; `curvature` is that of the lines in the last fit of each corner. `windows`, `map` and `room` are
+ * scratch. */
 typedef struct {
     const tag_board_t *board;
     const tag_corner_rules_t *rules;
@@ -216,9 +218,9 @@ EXPORT void read_codes(
 
 /* tags.c */
 
-/* What comes out of a tag: moves of the four corners (8), their standard deviations (4), blur, contrast, RMS residual,
- * whether it settled. Terms of a cubic polynomial of two variables. Pixels on a side of the squares that are
- * taken at once, and the doubles of one. */
+/* The results of a tag: moves of the four corners (8), their standard deviations (4), blur, contrast, RMS residual, whether the
+ * fit converged. The number of terms of a cubic polynomial of two variables. The side, px, of the squares that are processed at
+ * once, and the doubles that hold one. */
 enum { TAG_OUTCOMES = 16, TAG_TERMS = 10, TAG_SIDE = 4, TAG_BLOCK = 80 };
 
 /* The constants of detection.tags.whole, under their names there. */
@@ -240,9 +242,9 @@ EXPORT void fit_tags(
 EXPORT void board_places(
     ARRAY(const double, coefficients, rows + 2, columns + 2, 2), int64_t rows, int64_t columns, int64_t left, int64_t top,
     int64_t width, int64_t height, double around, RESULT(double, places, height, width, 2));
-/* Columns and rows of places on a sheet of `each` samples a square that begins at `first`, before all where there is no
- * place; and which places are nearest to one of the corners of the first kind, or of the second, and within the reach of
- * these. */
+/* Return the columns and rows of the places in a raster with `each` samples per square that begins at the place `first`, outside
+ * of it for pixels without a place; and for both kinds of corners whether a place is nearest to one of them and within its
+ * `reach`, squares. */
 EXPORT void sheet_places(
     ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, ARRAY(const uint8_t, corners, 2, rows, columns),
     int64_t rows, int64_t columns, ARRAY(const double, first, 2), double each, ARRAY(const double, reach, 2),
@@ -250,8 +252,8 @@ EXPORT void sheet_places(
 
 /* boards.c */
 
-/* Planes of the picture of a board: the pattern, its slopes along u and v, what lies beyond each of the four sides, how the
- * pattern changes as they go further out. `board_picture` draws all of them, or the first. */
+/* Planes of the rendered board: the pattern, its derivatives by u and v, the share of the paper beyond each of the four sides, and
+ * the derivatives of the pattern by the positions of these sides. `board_picture` draws all of them, or the first. */
 enum { BOARD_PLANES = 11 };
 
 EXPORT void board_picture(
@@ -288,9 +290,10 @@ EXPORT void block_products(
 
 /* circles.c */
 
-/* What comes out of a circle: u, v, the map (4), covariance of (u, v) at noise of variance 1 (uu, uv, vv), blur, brightness
- * outside, brightness inside less that, RMS residual, pixels, whether it settled, harmonics 3 to 6 of the edge (8), what residuals say of
- * a blur that differs with the direction (2) and the normal equations of that (uu, uv, vv). */
+/* The results of a circle: u, v, the map (4), covariance of (u, v) at noise of variance 1 (uu, uv, vv), blur, brightness outside,
+ * brightness inside less outside, RMS residual, number of pixels, whether the fit converged, variances of e1 to e3 at noise of
+ * variance 1 (3), harmonics 3 to 6 of the edge (8), and the gradient (2) and normal equations (uu, uv, vv) of an anisotropic
+ * blur. */
 enum { CIRCLE_OUTCOMES = 31, SPOT = 3, BESIDE = 6 };
 
 /* The constants of detection.circles.fit, under their names there. */
@@ -308,9 +311,9 @@ EXPORT void fit_circles(
 
 /* light.c */
 
-/* What comes out of a step of the light: u, v of the corner, its standard deviation, direction, place and width of the step,
- * the light left, whether there is one. What is unknown of both, how far from a corner a step is sought, px,
- * and how many pixels are taken at once: so much room there must be beyond the last. */
+/* The results of a step of the light: u, v of the corner, its standard deviation, direction, position and width of the step, the
+ * light beyond it relative to that before it, whether there is a step. The number of parameters of corner and step; how far from
+ * a corner a step is searched, px; the number of pixels processed at once: arrays have room for so many beyond their last. */
 enum { LIGHT_OUTCOMES = 8, LIGHT_UNKNOWNS = 11, LIGHT_LATERAL = 11, LIGHT_BLOCK = 32 };
 
 /* The constants of detection.subpixel.shadows, under their names there. */

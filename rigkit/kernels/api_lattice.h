@@ -25,18 +25,17 @@ EXPORT void shrink_floats(
 EXPORT void shrink_bytes(
     ARRAY(const uint8_t, image, height, width), int64_t height, int64_t width, int64_t factor,
     SCRATCH(uint16_t, sums, 2 * width), RESULT(float, out, height / factor, width / factor));
-/* What levels are smoothed with, a kernel of multiples of 1 / whole, and what their thresholds follow from
- * (detection.saddles.response). */
+/* The kernel that smooths levels, multiples of 1 / whole, and the constants of their thresholds (detection.saddles.response). */
 typedef struct {
     ARRAY(const float, kernel, 5);
     double whole, extreme, min_span, noise_factor, floor, ceiling;
 } level_rules_t;
 
-/* Pixels that the tests of a row are made for at a time: the results stay in registers and the first cache. Each such
- * strip of STRIP_ROWS rows has a threshold of its own: strip (u - STRIPS_FROM) / STRIP of band v / STRIP_ROWS. */
+/* Rows are tested STRIP pixels at a time, so that the results stay in registers and the first-level cache. Every strip of
+ * STRIP_ROWS rows has its own threshold: strip (u - STRIPS_FROM) / STRIP of band v / STRIP_ROWS. */
 enum { STRIP = 64, STRIP_ROWS = 32, STRIPS_FROM = 3 };
 
-/* Rows in which peaks are sought at a time, and those that are kept for them. */
+/* Number of rows searched for peaks at a time, and of rows of the response that are kept in a ring buffer. */
 enum { TRIPLE = 3, RING = 3 * TRIPLE };
 
 EXPORT void make_level(
@@ -60,11 +59,12 @@ EXPORT int64_t keep_strongest(
 
 /* corners.c; rings also in growth.c */
 
-/* Samples of a ring in half a turn (detection.saddles.ring): known here, the loops over them need no counting. */
+/* Samples of a ring in half a turn (detection.saddles.ring), a constant so that the compiler unrolls the loops over them. */
 enum { HALF = 16, TURN = 2 * HALF };
 
-/* How rings are read (detection.saddles.ring): `circle` holds the (u, v) of HALF samples in half a turn and of their
- * opposites; `gains` R_2 / R_4 over the ratio of harmonic 2 at half the radius to that on the ring, from 1/4 to 1. */
+/* The constants of detection.saddles.ring. `circle` holds the unit vectors (u, v) to the HALF samples of half a turn and to the
+ * opposite ones; `gains` R_2 / R_4, tabulated over the ratio of harmonic 2 at half the radius to harmonic 2 on the ring, from
+ * 1/4 to 1. */
 typedef struct {
     ARRAY(const float, circle, TURN, 2);
     ARRAY(const double, gains, gain_count);
@@ -92,7 +92,8 @@ typedef struct {
     double arm_cosine, contrast_ratio, length_ratio, lateral, min_lateral;
 } link_rules_t;
 
-/* The corners and the level that their edges are read from. */
+/* Corners to be linked: positions, unit vectors along both lines, contrast, the range of the contrast of possible neighbours,
+ * and the largest distance from an edge, px of the level, at which its brightness is read. */
 typedef struct {
     ARRAY(const double, pixels, count, 2);
     ARRAY(const double, lines, count, 2, 2);
@@ -117,7 +118,7 @@ typedef struct {
     double width, ridge[2];
 } fit_rules_t;
 
-/* See the constants of detection.lattice.grow, detection.lattice.links and detection.saddles.ring. */
+/* The constants of detection.lattice.grow, detection.lattice.links and detection.saddles.ring. */
 typedef struct {
     fit_rules_t predictions[2];
     const ring_rules_t *ring;
@@ -126,14 +127,14 @@ typedef struct {
     double reach, ring_part, min_ring, max_ring, line_sine, contrast_ratio, lateral, min_lateral, max_lateral, min_area;
 } growth_rules_t;
 
-/* The brightness of a level: full-resolution pixel = scale * level pixel + offset. */
+/* A level of the image pyramid: full-resolution pixel = scale * level pixel + offset. */
 typedef struct {
     image_t image;
     double scale, offset;
 } pyramid_level_t;
 
-/* A lattice within empty cells; `sign` of the cell (0, 0) is +1 where brightness grows with the angle across its +column
- * edge. `due` marks the cells to be tried with each of the two predictions. */
+/* A lattice surrounded by empty cells (NaN). `sign` is +1 if the brightness at cell (0, 0) grows with the angle across its
+ * +column edge. `due` marks the cells to be tried with each of the two predictions. */
 typedef struct {
     ARRAY(double, pixels, rows, columns, 2);
     ARRAY(double, contrast, rows, columns);
@@ -142,7 +143,7 @@ typedef struct {
     double sign;
 } sheet_t;
 
-/* Points in squares: those of square b are order[first[b]] to order[first[b + 1] - 1]; filled by `sort_points`. */
+/* Points sorted into a grid of squares: those of square b are order[first[b]] to order[first[b + 1] - 1] (`sort_points`). */
 typedef struct {
     const double *points;
     int32_t *first, *order;

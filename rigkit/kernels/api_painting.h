@@ -1,14 +1,15 @@
-/* A part of api.h: what rendering of boards calls. */
+/* Declarations of api.h: rendering of boards. */
 #ifndef RIGKIT_API_PAINTING_H
 #define RIGKIT_API_PAINTING_H
 
 /* painting.c */
 
-/* Nodes a side on which a tile's rays are fitted; how much of a tile a rectangle covers. */
+/* Interpolation nodes of a tile's rays along each axis; how much of a tile a rectangle covers. */
 enum { TILE_NODES = 9, NOT_COVERED = 0, COVERED_PARTLY = 1, COVERED_WHOLLY = 2 };
 
-/* The sub-samples of a tile, so many `per_pixel` a side: the weights of the nodes in each row and column, and the rays at the
- * nodes; at the lens's rim the ray of every sub-sample (`ray_rows` is `rows`, else 0). */
+/* The sub-samples of a tile, `per_pixel` along each axis of a pixel: the interpolation weights of the nodes in each row and
+ * column, and the rays at the nodes. At the rim of the lens the ray of every sub-sample is given (`ray_rows` is `rows`, else
+ * 0). */
 typedef struct {
     ARRAY(const double, weights_v, rows, TILE_NODES);
     ARRAY(const double, weights_u, TILE_NODES, columns);
@@ -17,8 +18,8 @@ typedef struct {
     int64_t rows, columns, per_pixel, ray_rows;
 } tile_t;
 
-/* A rectangle in space, see rigkit.synthetic.raycast.Surface: its lower and upper end in squares, inner corners (0: none),
- * black rectangles in squares, discs in mm, and lower and upper end of their ground where they are white. */
+/* A rectangle in space (rigkit.synthetic.raycast.Surface): its lower and upper ends in squares, the numbers of inner corners
+ * (0 without squares), black rectangles in squares, discs in mm, and the lower and upper ends of the ground of white discs. */
 typedef struct {
     ARRAY(const double, plane_from_ray, 3, 3);
     ARRAY(const double, ends, 2, 2);

@@ -32,8 +32,8 @@ EXPORT void improve(
 
 enum { NO_MEMORY = -1000 };
 
-/* What the maximum likelihood pose is sought from (pose_problem.PoseProblem). `affine` are 25 rows of `chosen` numbers
- * (residuals.whitened_affinities). */
+/* The measurements and options of the maximum likelihood pose (pose_problem.PoseProblem). `affine` are 25 rows of `chosen`
+ * numbers (residuals.whitened_affinities). */
 typedef struct {
     ARRAY(const double, packed, 18, count);
     ARRAY(const double, affine, 25, chosen);
@@ -51,12 +51,12 @@ EXPORT int64_t minimise(
 
 /* patches.c, with epipolar_lines.c */
 
-/* Levels of a pyramid; the largest half side of a patch in samples; what is said of a patch: place in image 2, affinity row
- * by row, correlation, variance of its brightness, how many levels coarser it was aligned than the images' sharpness asks
- * for, and the upper triangle of the covariance of place and affinity, row by row. */
+/* Largest number of levels of a pyramid; largest half side of a patch in samples; the columns of a patch: position in image 2,
+ * affinity row by row, correlation, variance of the brightness residuals, number of levels that the alignment is coarser than
+ * the sharpness of the images permits, and the upper triangle of the covariance of position and affinity, row by row. */
 enum { MAX_LEVELS = 8, MAX_HALF = 16, PATCH_COLUMNS = 9 + 21 };
 
-/* An image and its halvings: pixel of level l = pixel of the image / 2^l. */
+/* An image and its reductions: pixel of level l = pixel of the image / 2^l. */
 typedef struct {
     image_t levels[MAX_LEVELS];
     int64_t count;
@@ -69,14 +69,15 @@ typedef struct {
     double width, settled, max_move, min_contrast, min_correlation, max_sigma, min_noise, excess_noise;
 } patch_rules_t;
 
-/* The rays of image 2 every `spacing` pixels, and how well the pairs agree with E21: an infinite sigma is no knowledge. */
+/* The rays of image 2 every `spacing` pixels, the essential matrix, and the standard deviations of a pair's distance from its
+ * epipolar line, px, and of its affinity's deviation from it; an infinite sigma leaves the geometry out. */
 typedef struct {
     ARRAY(const double, rays2, rows, columns, 3);
     int64_t rows, columns;
     double spacing, E21[9], sigma, sigma_A, max_distance;
 } epipolar_t;
 
-/* The nodes that patches grow over: node (r, c) is the pixel `step` * (c, r) of image 1. */
+/* The grid over which patches are grown: node (r, c) is the pixel `step` * (c, r) of image 1. */
 typedef struct {
     ARRAY(const double, rays1, rows, columns, 3);
     ARRAY(const double, jacobians1, rows, columns, 3, 2);
@@ -98,8 +99,8 @@ EXPORT int64_t grow_patches(
 
 /* planes.c */
 
-/* What nodes of a grid say of the surface (reconstruction.growing.surface): values, NaN where nothing, their information
- * (the inverse of their covariance), and the rows that predict them from a plane. */
+/* Measurements of a surface at the nodes of a grid (reconstruction.growing.surface): values, NaN where missing, their information
+ * matrices (inverse covariances), and the matrices that map a plane to the predicted values. */
 typedef struct {
     ARRAY(const double, values, rows, columns, 3);
     ARRAY(const double, information, rows, columns, 3, 3);
@@ -115,21 +116,21 @@ EXPORT int64_t fit_planes(
 
 /* sweep.c */
 
-/* Samples of image 1 (rows x columns), and at every `spacing`-th of them where image 2 shows a surface at each of the ranges
- * of a sweep (reconstruction.growing.sweep); NaN where nowhere. In between places are interpolated. */
+/* Samples of image 1 (rows x columns), and at every `spacing`-th of them the pixel of image 2 at each range of a sweep
+ * (reconstruction.growing.sweep), NaN outside its field of view; in between these pixels are interpolated. */
 typedef struct {
     ARRAY(const float, table, levels, table_rows, table_columns, 2);
     int64_t levels, table_rows, table_columns, spacing, rows, columns;
 } sweep_t;
 
-/* Costs of a step to the next level, and of any larger one: `jump` where the brightness is even, half of what that is more
- * where it changes by `even`. */
+/* Costs of a step to the next level (`bend`), and of any larger one: `jump` where the brightness is constant, halfway from `bend`
+ * to `jump` where it changes by `even`. */
 typedef struct {
     int64_t rows, columns, levels, bend, jump;
     double even;
 } surface_rules_t;
 
-/* Whether each of the neighbours in 5 x 5 samples is darker. */
+/* Bits of the census transform over 5 x 5 samples: whether each of the neighbours is darker. */
 enum { CENSUS_BITS = 24 };
 
 EXPORT int64_t sweep_levels(int64_t levels);
@@ -148,9 +149,9 @@ EXPORT void sweep_winners(
     const surface_rules_t *rules, ARRAY(const uint16_t, total, rules.rows, rules.columns, sweep_levels(rules.levels)),
     RESULT(int32_t, best, rules.rows, rules.columns), RESULT(int32_t, around, rules.rows, rules.columns, 4));
 
-/* Surfaces at some samples (row, column): the level there, its change from row to row and from column to column, and how
- * many levels away another surface begins. Samples count less the further they are, in units of `radius` samples, and the
- * more their brightness differs, in units of `alike`. */
+/* Surfaces at some samples (row, column): the level, its change per row and per column, and the number of levels from it at which
+ * another surface begins. The weight of a neighbouring sample falls with its distance, in units of `radius` samples, and with the
+ * difference of its brightness, in units of `alike`. */
 typedef struct {
     ARRAY(const int32_t, samples, count, 2);
     ARRAY(const float, surfaces, count, 4);

@@ -1,4 +1,4 @@
-/* What the library says of itself. */
+/* Properties of the library. */
 #include "kernels.h"
 
 const char *instruction_set(void)
