@@ -1,20 +1,20 @@
-/* How the lines of a lattice bend at its corners: Taylor series along each line. The definition in numpy is in
+/* The curvatures of the lines of a lattice at its corners, from Taylor series along each line. The definition in numpy is in
  * tests/kernels/reference/edges.py, the numbers in rigkit.detection.subpixel.edge_curvature. */
 #include "kernels.h"
 
 enum { TERMS = 6 };
 
-/* The normal equations of a line's Taylor coefficients, in sides of the cell, without their prior: row i, column j of the
- * matrix is moment i + j. */
+/* The normal equations of a line's Taylor coefficients, in sides of the cell, without their prior: element (i, j) of the matrix is
+ * moment i + j. */
 typedef struct {
     double moment[2 * TERMS - 1], right[TERMS][2];
 } taylor_t;
 
-/* Set `out` to the most probable coefficients along both axes, if they are known beforehand to be of size `sigma`, and
- * return the standard deviation of the second. */
+/* Set `out` to the most probable coefficients along both axes, with priors of standard deviation `sigma`, and return the standard
+ * deviation of the coefficient of degree 2. */
 INLINE double most_probable(const taylor_t *line, const double sigma[TERMS], double free, double out[TERMS][2])
 {
-    /* Beside the two axes, a column of the inverse; one over the diagonal on the diagonal. */
+    /* Right-hand sides: both axes, and the unit vector for a column of the inverse. `lower` has the reciprocals of its diagonal. */
     double lower[TERMS][TERMS], right[TERMS][3] = {{0.0}};
     right[2][2] = 1.0;
     for (int j = 0; j < TERMS; j++) {
@@ -44,8 +44,9 @@ INLINE double most_probable(const taylor_t *line, const double sigma[TERMS], dou
     return sqrt(right[2][2]) * sigma[2];
 }
 
-/* Set `out` to the curvature at place `at` of a line of `count` corners, `stride` cells apart, and its sigma. */
-INLINE void line_bend(
+/* Set `out` to the curvature, 1/px, at index `at` of a line of `count` corners, `stride` cells apart, and its standard
+ * deviation. */
+INLINE void line_curvature(
     const double *pixels, const double *sigma, int64_t stride, int64_t at, int64_t count, double side,
     const curvature_rules_t *rules, double *out, double *out_sigma)
 {
@@ -91,7 +92,7 @@ INLINE void line_bend(
     *out_sigma = 2.0 * wide / (square * side);
 }
 
-/* Set `out` (M, 2) to the curvature of row and column at the M wanted cells and `out_sigma` to its standard deviation
+/* Set `out` (M, 2) to the curvatures of row and column at the M wanted cells and `out_sigma` to their standard deviations
  * (reference.edges.line_curvatures). */
 FOR_EACH_PROCESSOR
 void line_curvatures(
@@ -104,7 +105,7 @@ void line_curvatures(
             const int64_t cell = row * columns + column;
             if (!wanted[cell])
                 continue;
-            line_bend(pixels + 2 * cell, sigma + cell, 1, column, columns, *sides++, rules, out++, out_sigma++);
-            line_bend(pixels + 2 * cell, sigma + cell, columns, row, rows, *sides++, rules, out++, out_sigma++);
+            line_curvature(pixels + 2 * cell, sigma + cell, 1, column, columns, *sides++, rules, out++, out_sigma++);
+            line_curvature(pixels + 2 * cell, sigma + cell, columns, row, rows, *sides++, rules, out++, out_sigma++);
         }
 }

@@ -2,13 +2,14 @@
  * tests/kernels/reference/edges.py, the numbers in rigkit.detection.subpixel.
  *
  * The pixels of a corner are gathered once (edges_window.c). Every Gauss-Newton step evaluates the model and its derivatives
- * (edges_model.c); products are summed in float32 lanes, and the normal equations are solved in double: eleven, or the FEWER
- * of a corner whose lines bend as given. What is left of the pixels says how large the noise is (edges_noise.c). */
+ * (edges_model.c). Products are summed in float32 lanes, and the normal equations solved in double: for PARAMETERS unknowns, or
+ * for FEWER if the curvatures of the lines are given. The noise is estimated from the residuals (edges_noise.c). */
 #include "edges.h"
 
 enum { CACHE_LINE = 64 };
 
-/* Start from the contrast 2 b and a mean brightness: the first step finds the latter, in which the model is linear. */
+/* Set the initial brightness: half the contrast is given, the mean is that of the pixels. The model is linear in the mean, which
+ * the first step corrects. */
 static void level(double *values, const window_t *window, double half)
 {
     lanes_t sums = {0.0f};
@@ -36,7 +37,7 @@ INLINE int factor(double *matrix, const int n)
         double column[PARAMETERS];
         for (int i = j + 1; i < n; i++)
             column[i] = matrix[i * ROWS + j] *= scale;
-        /* What later columns have left: sums that do not wait for each other. */
+        /* Updates of the remaining columns, which are independent of each other. */
         for (int i = j + 1; i < n; i++)
             for (int k = j + 1; k <= i; k++)
                 matrix[i * ROWS + k] -= column[i] * column[k];
@@ -44,6 +45,7 @@ INLINE int factor(double *matrix, const int n)
     return 1;
 }
 
+/* Replace `right` by L^-1 `right`, and by L^-T `right`, with the factor `lower` of `factor`. */
 INLINE void forward(const double *lower, double *right, const int n)
 {
     for (int i = 0; i < n; i++) {
@@ -64,8 +66,8 @@ INLINE void backward(const double *lower, double *right, const int n)
     }
 }
 
-/* Set `step` to what the normal equations `matrix` of `n` unknowns make of it, and `matrix` to its factor; return whether it is
- * positive definite. */
+/* Replace `step`, the right-hand side, by the solution of the normal equations `matrix` of `n` unknowns, and `matrix` by its
+ * factor; return whether it is positive definite. */
 INLINE int solved_step(double *matrix, double *step, const int n)
 {
     if (!factor(matrix, n))
@@ -75,7 +77,7 @@ INLINE int solved_step(double *matrix, double *step, const int n)
     return 1;
 }
 
-/* Return element (k, k) of the inverse of what `lower` is the factor of. */
+/* Return element (k, k) of the inverse of the matrix with the factor `lower`. */
 static double inverse_at(const double *lower, int k, int n)
 {
     double unit[PARAMETERS] = {0.0}, total = 0.0;
@@ -91,7 +93,7 @@ static double clipped(double value, double low, double high)
     return value < low ? low : value > high ? high : value;
 }
 
-/* Move `values` by `step`, cut where it would leave the region in which the model is nearly linear (reference.edges._limited). */
+/* Move `values` by `step`, clipped to the range in which the model is nearly linear (reference.edges._limited). */
 static void move(double *values, const double *step, int n, const edge_rules_t *rules)
 {
     const double limits[PARAMETERS] = {
@@ -111,7 +113,8 @@ static void move(double *values, const double *step, int n, const edge_rules_t *
     values[S] = clipped(values[S], rules->min_blur, rules->max_blur);
 }
 
-/* What is known of a corner's parameters before its pixels are looked at: one over the variances of the first `count`. */
+/* The prior of a corner's parameters: means and inverse variances (0: none), the number of parameters that are fitted, whether the
+ * model includes paper or single squares, and whether the contrast is given. */
 typedef struct {
     double mean[PARAMETERS], information[PARAMETERS];
     int count, papered, levelled;
@@ -136,13 +139,14 @@ static prior_t prior_of(const window_t *window, const geometry_t at, double blur
     return prior;
 }
 
-/* Where Gauss-Newton steps ended: the last one, the normal equations' factor, if there is one, and what the model leaves. */
+/* The end of the Gauss-Newton iteration: the factor of the normal equations, if `solved`, the last step, and the variance of the
+ * residuals. */
 typedef struct {
     double products[ROWS * ROWS], last[PARAMETERS], variance;
     int solved;
 } minimum_t;
 
-/* Move `values` to the most probable ones. */
+/* Move `values` to the maximum of the posterior by Gauss-Newton steps. */
 FOR_EACH_PROCESSOR static void descend(
     double *values, const window_t *window, const geometry_t at, const prior_t *prior, const edge_rules_t *rules, minimum_t *out)
 {
@@ -165,7 +169,7 @@ FOR_EACH_PROCESSOR static void descend(
             products[k * ROWS + k] += prior->information[k] * variance + rules->ridge;
             step[k] = products[n * ROWS + k] + prior->information[k] * variance * (prior->mean[k] - values[k]);
         }
-        /* Twice, so that the compiler knows how many unknowns there are. */
+        /* Written twice, so that the number of unknowns is a constant. */
         out->solved = n == FEWER ? solved_step(products, step, FEWER) : solved_step(products, step, PARAMETERS);
         if (!out->solved)
             return;
@@ -174,15 +178,15 @@ FOR_EACH_PROCESSOR static void descend(
         move(values, step, n, rules);
         for (int k = 0; k < n; k++)
             out->last[k] += values[k];
-        /* What was left before a first step that found the brightness is no residual. */
+        /* The residuals before a first step that corrects the brightness are not those of the model. */
         if ((turns > 0 || !prior->levelled) && fabs(step[X]) <= rules->converged_px && fabs(step[Y]) <= rules->converged_px
             && fabs(step[S]) <= rules->blur_lag * rules->converged_px * values[S])
             return;
     }
 }
 
-/* Fit one corner, of a `contrast` that may be unknown (NaN); `out` is u, v, sigma, s, 2 b, RMS residual, RMS noise, valid,
- * pixels, sums and numbers of `lag_products`, none where the noise is not known or is that of rounding. */
+/* Fit one corner, whose `contrast` may be unknown (NaN), and set `out` to its OUTCOMES. The sums and numbers of `lag_products` are
+ * 0 where the noise is unknown or as small as that of rounding. */
 FOR_EACH_PROCESSOR static void fit_corner(
     window_t *window, const double pixel[2], const geometry_t at, double sign, double blur, double contrast,
     const edge_rules_t *rules, double *out)
@@ -232,33 +236,34 @@ FOR_EACH_PROCESSOR static void fit_corner(
     memcpy(out, outcome, sizeof outcome);
 }
 
-/* Side of the square that holds the window and, around it, nothing where mirror images may fall. */
+/* Return the side of the square that holds the window and the empty margin in which mirrored pixels may lie. */
 static int64_t across_square(const edge_rules_t *rules)
 {
     return 2 * ((int64_t)floor(rules->radius_px) + (int64_t)ceil(2.0 * rules->max_mirrored) + LANES) + 1;
 }
 
+/* Return the largest number of pixels of a window, padded to blocks. */
 static int64_t room_of_window(double radius_px)
 {
     const int64_t side = 2 * (int64_t)floor(radius_px) + 1;
     return (side * side / BLOCK + 2) * BLOCK;
 }
 
-/* Return how many floats of scratch fit_edges needs. */
+/* Return the number of floats of scratch that fit_edges needs. */
 int64_t edges_scratch(const edge_rules_t *rules)
 {
     const int64_t across = across_square(rules);
     return (3 + ROWS) * room_of_window(rules->radius_px) + 4 * across * across + CACHE_LINE / (int64_t)sizeof(float);
 }
 
-/* Return the window in `scratch`, as large as `edges_scratch` says. */
+/* Return an empty window whose arrays are in `scratch` (edges_scratch). */
 static window_t window_in(float *scratch, const edge_rules_t *rules)
 {
     const int64_t room = room_of_window(rules->radius_px), across = across_square(rules);
-    /* Vectors that lie across two lines of the cache take twice the time. */
+    /* Reading a vector across the boundary of two cache lines takes twice the time. */
     scratch += (CACHE_LINE - (uintptr_t)scratch % CACHE_LINE) % CACHE_LINE / sizeof(float);
     float *pictures = scratch + (3 + ROWS) * room;
-    /* Around what mirroring changes there is nothing. */
+    /* The margin around the mirrored differences is 0. */
     if (rules->mirrored)
         memset(pictures + 2 * across * across, 0, 2 * (size_t)(across * across) * sizeof(float));
     return (window_t){
@@ -274,9 +279,8 @@ static window_t window_in(float *scratch, const edge_rules_t *rules)
         .radius = (int64_t)floor(rules->radius_px)};
 }
 
-/* Fit the edge model around `count` corners (reference.edges.fit_corners). pixels (N, 2), sides (N, 2, 2), curvature and its sigma
- * and single (N, 2), gaps, tilts, reach, paper and ends (N, 2, 2), sign, blur, that of its window and contrast (N), out (N, OUTCOMES);
- * `grey` is of uint8_t if `bytes`, else of float. */
+/* Fit the edge model around `count` corners (reference.edges.fit_corners). `window_blur` is the blur by which the windows are
+ * chosen; the geometry is that of `geometry_t`. */
 void fit_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
     const double *curvature, const double *curvature_sigma, const double *gaps, const double *tilts, const double *reach,
@@ -293,8 +297,8 @@ void fit_edges(
     }
 }
 
-/* Fit the corner of a tag from `pixel`, where the board lies as `seen` says (a row of a surface) and neighbours are `step` sides
- * of a tag away. Its window reaches half way to these, and is so narrow that it ends before the code, beyond the tag's border. */
+/* Fit the corner of a tag from `pixel`. `seen` is the row of the board's map (SURFACE_COLUMNS), `step` the distances of the
+ * neighbouring lines in sides of a tag. The window reaches halfway to these, and ends in the tag's border before the code. */
 static void fit_tag_corner(
     window_t *window, const picture_t image, const double pixel[2], const double *seen, const double step[4],
     const double single[2], double sign, double blur, double contrast, const tag_window_t *tag, const edge_rules_t *rules,
@@ -315,7 +319,7 @@ static void fit_tag_corner(
     fit_corner(window, pixel, at, sign, expected, contrast, rules, out);
 }
 
-/* Fit the corners of tags (reference.edges.fit_tag_corners): those of the board's `places` that `cells` marks, `count` of them. */
+/* Fit the corners of tags (reference.edges.fit_tag_corners): the `count` of the board's `places` corners that `cells` marks. */
 void fit_tag_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t places, const uint8_t *cells, const double *steps,
     const double *signs, int64_t count, const double *pixels, const double *surface, const double *single, const double *contrast,
@@ -332,11 +336,12 @@ void fit_tag_edges(
         }
 }
 
-/* Return the median of s of every `apart`-th of these corners, fitted from `blur`; NaN where none could be. `found` is scratch. */
+/* Return the median blur s of every `stride`-th of these corners, fitted from `blur`; NaN if no fit succeeds. `found` is
+ * scratch. */
 double blur_of_tags(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t places, const uint8_t *cells, const double *steps,
     const double *signs, int64_t count, const double *pixels, const double *surface, const double *single, const double *contrast,
-    int64_t apart, double blur, const tag_window_t *tag, const edge_rules_t *rules, float *scratch, double *found)
+    int64_t stride, double blur, const tag_window_t *tag, const edge_rules_t *rules, float *scratch, double *found)
 {
     const picture_t image = {grey, width, height, bytes};
     window_t window = window_in(scratch, rules);
@@ -344,7 +349,7 @@ double blur_of_tags(
     for (int64_t place = 0, n = 0; place < places && n < count; place++) {
         if (!cells[place])
             continue;
-        if (n % apart == 0) {
+        if (n % stride == 0) {
             double fitted[OUTCOMES];
             fit_tag_corner(
                 &window, image, pixels + 2 * n, surface + SURFACE_COLUMNS * n, steps + 4 * place, single + 2 * n, signs[place],

@@ -1,32 +1,35 @@
-/* What the files of the edge model's fit share: the pixels around a corner, and what is done with them in which file.
- * The definitions in numpy are in tests/kernels/reference/edges.py, the numbers in rigkit.detection.subpixel. */
+/* Shared by the files of the edge model's fit: the window of pixels around a corner, and the functions of each file. The
+ * definitions in numpy are in tests/kernels/reference/edges.py and edge_model.py, the numbers in rigkit.detection.subpixel. */
 #ifndef RIGKIT_EDGES_H
 #define RIGKIT_EDGES_H
 
 #include "kernels.h"
 
-/* Of what comes out of a corner. */
+/* Columns of the results of a corner (OUTCOMES in api_fits.h). */
 enum { SIGMA = 2, BLUR, CONTRAST, RESIDUAL, NOISE, VALID, PIXELS };
 
+/* Parameters: corner, angles of both lines, blur, mean brightness and half the contrast, relative gradient of the light, curvatures
+ * of both lines. FEWER leaves the curvatures out. Pixels are processed in blocks of GROUPS vectors of LANES. */
 enum { X, Y, T1, T2, S, A, B, GX, GY, K1, K2, PARAMETERS };
 enum { FEWER = K1, ROWS = PARAMETERS + 1, LANES = 8, GROUPS = 8, BLOCK = LANES * GROUPS };
 
-/* Eight numbers at once, wherever they lie. */
+/* Vectors of LANES numbers at any address. */
 typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
 typedef int32_t mask_t __attribute__((vector_size(4 * LANES)));
 
-/* What the lattice says of a corner: its cell's sides, the curvature of its lines and how uncertain it is, where their
- * neighbours are and by how much these are turned, how far its window goes towards these, in sides of the cell, where that is
- * not by rule, which of these have no corner of the lattice, and how bright it is beyond these, NaN where that is not known.
- * Of a corner of one square alone, on which side of its lines that lies, +1 or -1; of others 0. */
+/* The lattice at a corner: the cell's sides; the curvatures of its two lines and their standard deviations; for the neighbouring
+ * lines before and after both, their distances (`gaps`), their angles to the corner's line (`tilts`), the reach of the window
+ * towards them, in sides of the cell (NaN: by rule), whether the lattice has no corner there (`ends`), and the brightness of the
+ * paper beyond (NaN: unknown). `single`: on which side of each line the square is, +1 or -1, for corners of one square alone;
+ * 0 for others. */
 typedef struct {
     const double *sides, *curvature, *curvature_sigma, *gaps, *tilts, *reach, *paper, *single;
     const uint8_t *ends;
 } geometry_t;
 
-/* The pixels of a corner, relative to (centre_u, centre_v), at most `radius` from it both ways. `rows` has room for the
- * rows of reference.edges.linearise, a block of pixels after the other, `square`, `turned`, `change` and `paired` for `across`
- * x `across` pixels around the centre. */
+/* The pixels of a corner, relative to (centre_u, centre_v), at most `radius` from it along both axes. `rows` has room for the
+ * rows of reference.edge_model.linearise, block by block; `square`, `turned`, `change` and `paired` for `across` x `across`
+ * pixels around the centre. */
 typedef struct {
     float *u, *v, *value, *rows, *square, *turned, *change, *paired;
     int64_t count, across, radius;
@@ -35,7 +38,7 @@ typedef struct {
 
 typedef float block_row_t[BLOCK];
 
-/* The rows of the block of pixels that begins with `start`. */
+/* Return the rows of the block of pixels that begins at `start`. */
 INLINE block_row_t *rows_of(const window_t *window, int64_t start)
 {
     return (block_row_t *)(window->rows + start * ROWS);
@@ -72,6 +75,6 @@ void fit_tag_edges(
 double blur_of_tags(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t places, const uint8_t *cells, const double *steps,
     const double *signs, int64_t count, const double *pixels, const double *surface, const double *single, const double *contrast,
-    int64_t apart, double blur, const tag_window_t *tag, const edge_rules_t *rules, float *scratch, double *found);
+    int64_t stride, double blur, const tag_window_t *tag, const edge_rules_t *rules, float *scratch, double *found);
 
 #endif

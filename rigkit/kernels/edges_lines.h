@@ -1,11 +1,12 @@
-/* The edge model along one line of a corner, and what lies beyond its ends, over a block of pixels: for edges_model.c. */
+/* The edge model of one line of a corner, and of the paper beyond the ends of the board, over a block of pixels; for
+ * edges_model.c. */
 #ifndef RIGKIT_EDGES_LINES_H
 #define RIGKIT_EDGES_LINES_H
 
 #include "edges.h"
 
-/* A line through the corner as float32 arithmetic wants it. A sharp edge is two of less `width`, `apart` to either side;
- * `stretch` is s / width (reference.edges._edge). */
+/* A line through the corner in float32. A sharp edge is modelled by two edges of the smaller blur `width`, `apart` to either side
+ * of it; `stretch` is s / width (reference.edge_model._edge). */
 typedef struct {
     float cosine, sine, curvature, before, after, tilt_before, tilt_after;
     float blur, width, stretch, apart, kurtosis;
@@ -13,22 +14,23 @@ typedef struct {
     int tight, sharp, ends_before, ends_after;
 } line_t;
 
-/* The model along one line over a block of pixels: the step, its derivatives, -s dS/ds, and the pixel's place. */
+/* The model of one line over a block of pixels: the step, its first to third derivatives by the distance over s (`slope`, `bow`,
+ * `curl`), -s dS/ds (`grown`), and the pixel's coordinates along the line and across it. */
 typedef struct {
     float value[BLOCK], slope[BLOCK], bow[BLOCK], curl[BLOCK], grown[BLOCK], along[BLOCK], lateral[BLOCK];
 } edge_t;
 
-/* What lies beyond the outer squares of one line over a block of pixels: how much of it a pixel sees, and that times how
- * bright it is; the derivatives of both, and -s d/ds. */
+/* The paper beyond the outer squares of one line over a block of pixels: its share of a pixel (`seen`), that share times its
+ * brightness (`paper`), the derivatives of both by the distance over s, and -s d/ds of both. */
 typedef struct {
     float seen[BLOCK], seen_slope[BLOCK], seen_grown[BLOCK], paper[BLOCK], slope[BLOCK], grown[BLOCK];
 } beyond_t;
 
-/* Beyond so many s an edge is flat to float32; the exponential below needs a limit. */
+/* Distances in s are clipped to this, beyond which an edge is constant in float32: `decay` has a limited range. */
 #define FLAT_SIGMAS 12.0f
 
-/* Beyond so many s the step lacks a part in 10^8, which float32 does not hold, and its slopes are less than that: blocks of such
- * pixels, as rows above and below a line have, are not evaluated. */
+/* Beyond this distance in s the step is constant to 1e-8, below the precision of float32, and its derivatives are smaller: blocks
+ * whose pixels are all further from a line are not evaluated. */
 #define FLAT_BLOCK 6.0f
 
 INLINE int all_beyond(const int size, const float *x)
@@ -76,7 +78,7 @@ INLINE float cut(float at)
     return most > -FLAT_SIGMAS ? most : -FLAT_SIGMAS;
 }
 
-/* Add an edge of which all `size` pixels are far on one or the other side. */
+/* Add an edge that is further than FLAT_BLOCK from all `size` pixels. */
 INLINE void add_flat(const int size, const float *x, float part, const int first, edge_t *out)
 {
     for (int i = 0; i < size; i++)
@@ -85,9 +87,9 @@ INLINE void add_flat(const int size, const float *x, float part, const int first
         out->slope[i] = out->bow[i] = out->curl[i] = out->grown[i] = 0.0f;
 }
 
-/* reference.edges._edge, `shift` back from the line and turned by `tilt`, with weight `part`: set `out` to it if it is the
- * `first`, else add it. Distances have a loop of their own: mixed with what follows, their limits become branches that keep the
- * compiler from vectorising. */
+/* Set `out` to an edge (reference.edge_model._edge) with weight `part`, `shift` px before the line and turned by `tilt`, if it is
+ * the `first`, else add it. The distances are computed in a loop of their own: otherwise their clipping becomes branches, which
+ * prevent vectorisation. */
 INLINE void add_edge(const int size, const line_t line, float shift, float tilt, float part, const int first, edge_t *out)
 {
     float x[BLOCK], y[BLOCK];
@@ -128,7 +130,7 @@ INLINE void add_edge(const int size, const line_t line, float shift, float tilt,
         }
 }
 
-/* Evaluate one line over a block of pixels at (u, v) from the window's centre (reference.edges._step). */
+/* Evaluate one line over a block of pixels at (u, v) from the window's centre (reference.edge_model._step). */
 INLINE void along_line(const int size, const line_t line, const float *u, const float *v, float x, float y, edge_t *out)
 {
     for (int i = 0; i < size; i++) {
@@ -137,7 +139,7 @@ INLINE void along_line(const int size, const line_t line, const float *u, const 
     }
     add_edge(size, line, 0.0f, 0.0f, 1.0f, 1, out);
     if (line.tight) {
-        /* Squares go on beyond the next line the other way round; of paper the pattern is nothing. */
+        /* Beyond the neighbouring lines the squares change their colour; the pattern of paper is 0. */
         const float before = line.ends_before ? 0.5f : 1.0f, after = line.ends_after ? 0.5f : 1.0f;
         add_edge(size, line, line.before, line.tilt_before, -before, 0, out);
         add_edge(size, line, -line.after, line.tilt_after, -after, 0, out);
@@ -148,7 +150,8 @@ INLINE void along_line(const int size, const line_t line, const float *u, const 
         out->grown[i] += line.curvature * line.blur * out->slope[i];
 }
 
-/* Add what lies beyond the line `shift` back from `line`, turned by `tilt`, on the side where `way` times the distance grows. */
+/* Add the paper beyond the line that is `shift` px before `line` and turned by `tilt`; `way` is +1 or -1, the sign of the distance
+ * of the paper's side. */
 INLINE void add_paper(
     const int size, const line_t line, float shift, float tilt, float way, float paper, const edge_t *at, beyond_t *out)
 {
@@ -171,7 +174,7 @@ INLINE void add_paper(
     }
 }
 
-/* Evaluate what lies beyond the ends of one line whose `at` is known (reference.edges._beyond). */
+/* Evaluate the paper beyond the ends of the board at the coordinates `at` (reference.edge_model._beyond). */
 INLINE void beyond_line(const int size, const line_t line, const edge_t *at, beyond_t *out)
 {
     memset(out, 0, sizeof *out);

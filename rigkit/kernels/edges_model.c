@@ -1,8 +1,9 @@
-/* The edge model along the two lines of a corner, with what lies beyond the outer squares: a block of pixels at a time, in
- * float32, which the compiler vectorises; and the normal equations of a Gauss-Newton step. */
+/* The edge model of a corner: the product of its two lines and the paper beyond the outer squares, for a block of pixels at a time
+ * in float32, which the compiler vectorises; and the normal equations of a Gauss-Newton step. */
 #include "edges_lines.h"
 
-/* reference.edges._mixed. */
+/* Return the pattern: minus the mean of the product of both steps, whose blurs along oblique normals have the correlation rho
+ * (Mehler's series to the third order; reference.edge_model._mixed). */
 INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
 {
     return -(
@@ -12,7 +13,7 @@ INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
                + rho * (0.5f * one->bow[i] * two->bow[i] + (1.0f / 6.0f) * rho * one->curl[i] * two->curl[i])));
 }
 
-/* What the rows of every block need of the parameters. */
+/* The parameters in float32, as the rows of a block need them. */
 typedef struct {
     float x, y, blur, base, half, per_size, light_u, light_v, rho, single1, single2;
     line_t line1, line2;
@@ -37,7 +38,7 @@ INLINE model_t model_of(const double *values, const window_t *window, const geom
         .line2 = line_of(values[T2], values[K2], at.gaps + 2, at.tilts + 2, at.paper + 2, values[S], rules)};
 }
 
-/* The pattern at pixel i with what is beyond its outer squares, and what that adds to its derivatives. */
+/* Return the pattern at pixel i with the paper beyond the outer squares; add the paper's part of the derivatives. */
 INLINE float papered_pattern(
     const model_t *m, const edge_t *one, const edge_t *two, const beyond_t *past1, const beyond_t *past2, int i)
 {
@@ -61,8 +62,8 @@ INLINE void add_papered(
     *grown -= past2->grown[i] * rest1 - half1 * past2->seen_grown[i];
 }
 
-/* Set `rows` of the block of pixels that begins with `start` to the first `parameters` of reference.edges.linearise, and the
- * last to the residuals. */
+/* Set `rows` of the block of pixels that begins at `start`: derivatives by the first `parameters`
+ * (reference.edge_model.linearise), and last the residuals. */
 INLINE void fill_rows(
     const int parameters, const int papered, const int size, const model_t *m, const window_t *window, int64_t start,
     block_row_t *restrict rows)
@@ -109,8 +110,8 @@ INLINE void fill_rows(
     }
 }
 
-/* Add the products of the first `parameters` rows of `size` pixels, a block or half of it, and the last to `sum`, the lower half
- * row by row. */
+/* Add the products of the first `parameters` rows and the residuals of `size` pixels, a block or half of it, to `sum`: the lower
+ * triangle row by row. */
 INLINE void add_block(const int parameters, const int size, block_row_t *restrict rows, lanes_t *sum)
 {
     for (int i = 0; i <= parameters; i++) {
@@ -119,7 +120,7 @@ INLINE void add_block(const int parameters, const int size, block_row_t *restric
         const lanes_t l4 = left[4], l5 = left[5], l6 = left[6], l7 = left[7];
         for (int j = 0; j <= i; j++, sum++) {
             const lanes_t *right = (const lanes_t *)rows[j];
-            /* Two chains of fused products. */
+            /* Two independent chains of fused multiply-adds. */
             lanes_t even = *sum + l0 * right[0], odd = l1 * right[1];
             even += l2 * right[2];
             odd += l3 * right[3];
@@ -134,7 +135,7 @@ INLINE void add_block(const int parameters, const int size, block_row_t *restric
     }
 }
 
-/* Clear a block of the first `parameters` rows and the last from pixel `used` on. */
+/* Set the first `parameters` rows of a block and the residuals to 0 from pixel `used` on. */
 INLINE void clear_behind(const int parameters, int64_t used, block_row_t *restrict rows)
 {
     const int group = (int)(used / LANES), left = (int)(used % LANES);
@@ -148,8 +149,8 @@ INLINE void clear_behind(const int parameters, int64_t used, block_row_t *restri
     }
 }
 
-/* Set the rows of the block of pixels that begins with `start` (fill_rows), nothing behind the last of `used`, and add their
- * products to `sums`. */
+/* Set the rows of the block of pixels that begins at `start` (fill_rows), 0 from pixel `used` on, and add their products to
+ * `sums`. */
 INLINE void multiply_block(
     const int parameters, const int papered, const int size, const model_t *model, const window_t *window, int64_t start,
     int64_t used, block_row_t *restrict rows, lanes_t *sums)
@@ -160,7 +161,8 @@ INLINE void multiply_block(
     add_block(parameters, size, rows, sums);
 }
 
-/* Set the window's rows (fill_rows), and `products` (rows of ROWS, lower half) to those of these rows over all pixels. */
+/* Set the window's rows (fill_rows), and `products` (rows of ROWS, lower triangle) to the sums of their products over all
+ * pixels. */
 INLINE void multiply_rows(
     const int parameters, const int papered, const double *values, const window_t *window, const geometry_t at,
     const edge_rules_t *rules, double *products)
@@ -169,7 +171,7 @@ INLINE void multiply_rows(
     lanes_t sums[ROWS * (ROWS + 1) / 2];
     memset(sums, 0, sizeof sums);
     for (int64_t start = 0; start < window->count; start += BLOCK) {
-        /* Where they are not asked for afterwards, in one place, which stays in the cache. */
+        /* If they are not used afterwards, all blocks share the same memory, which stays in the cache. */
         block_row_t *restrict rows = rows_of(window, rules->mirrored ? start : 0);
         const int64_t used = window->count - start;
         if (used > BLOCK / 2) {
@@ -201,7 +203,7 @@ void all_normal_equations(
     multiply_rows(PARAMETERS, 0, values, window, at, rules, products);
 }
 
-/* Beside paper of known brightness, and at corners of single squares. */
+/* The same for corners near paper of known brightness, and for those of single squares. */
 FOR_EACH_PROCESSOR
 void papered_equations(
     const int n, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double *products)
@@ -209,8 +211,8 @@ void papered_equations(
     multiply_rows(n == FEWER ? FEWER : PARAMETERS, 1, values, window, at, rules, products);
 }
 
-/* Set a and b by linear least squares with everything else as it stands (reference.edges._brightness); every second block says
- * enough. */
+/* Set a and b by linear least squares with the other parameters fixed (reference.edges._brightness), from every second block of
+ * pixels. */
 FOR_EACH_PROCESSOR
 void set_brightness(double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double sign)
 {

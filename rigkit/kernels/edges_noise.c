@@ -1,9 +1,9 @@
-/* What the fitted edge model leaves of a corner's pixels, and how much of it is noise: what mirroring at the corner
- * changes, which a model that is wrong hardly does. */
+/* The residuals of the fitted edge model, and the part of them that is noise: their differences under a point reflection at the
+ * corner, since errors of the model are nearly symmetric. */
 #include "edges.h"
 
-/* Set the residuals, the last of the window's rows, to what they are after the last `step` of `parameters`, small enough
- * for them to be linear; return the sum of their squares. */
+/* Update the residuals, the last of the window's rows, for the last `step` of `parameters`, small enough for the linear model;
+ * return the sum of their squares. */
 FOR_EACH_PROCESSOR
 double leave_residuals(window_t *window, const double *step, int parameters)
 {
@@ -26,21 +26,21 @@ double leave_residuals(window_t *window, const double *step, int parameters)
     return sum;
 }
 
-/* Return the mean square of what the model leaves and mirroring at the corner changes, as that of independent noise, or
- * -1 where few pixels have a mirror image (reference.edges._noise). */
+/* Return the variance of the noise, from the differences between residuals and their point reflection at the corner, or -1 if few
+ * pixels have a mirror image (reference.edges._noise). */
 FOR_EACH_PROCESSOR
 double unmirrored(const double *values, window_t *window, int parameters, const edge_rules_t *rules)
 {
-    /* NaN, of a picture that has no numbers there, is nowhere. */
+    /* NaN, from images with pixels that are not finite, fails too. */
     if (!(fabs(values[X]) <= rules->max_mirrored && fabs(values[Y]) <= rules->max_mirrored))
         return -1.0;
-    /* What is left as a picture, and turned by half a turn: then mirror images are read in the order of the pixels. */
+    /* The residuals as an image, and that image rotated by 180 degrees, so that mirrored pixels are read in the same order. */
     const int32_t across = (int32_t)window->across, middle = across / 2, radius = (int32_t)window->radius;
     float *square = window->square + middle * across + middle, *turned = window->turned + middle * across + middle;
     float *changes = window->change + middle * across + middle, *shown = window->paired + middle * across + middle;
     const double left = floor(2.0 * values[X]), top = floor(2.0 * values[Y]);
     const int32_t first = (int32_t)window->v[0], last = (int32_t)window->v[window->count - 1];
-    /* Rows that are written to or read from. */
+    /* The rows of `turned` that are written or read. */
     const int32_t low = -last < first - (int32_t)top - 1 ? -last : first - (int32_t)top - 1;
     const int32_t high = -first > last - (int32_t)top ? -first : last - (int32_t)top;
     memset(window->square + (middle + first) * across, 0xff, (size_t)((last - first + 1) * across) * sizeof(float)); /* NaN */
@@ -63,7 +63,7 @@ double unmirrored(const double *values, window_t *window, int parameters, const 
         const float *restrict here = square + v * across - radius;
         const float *restrict there = turned + (v - (int32_t)top) * across - (int32_t)left - radius;
         const float *restrict above = there - across;
-        /* Beyond the radius there is nothing. */
+        /* There are no pixels beyond the radius. */
         for (int32_t u = 0; u <= 2 * radius; u += LANES) {
             const lanes_t near = w00 * *(const lanes_t *)(there + u) + w10 * *(const lanes_t *)(there + u - 1);
             const lanes_t far = w01 * *(const lanes_t *)(above + u) + w11 * *(const lanes_t *)(above + u - 1);
@@ -86,8 +86,9 @@ double unmirrored(const double *values, window_t *window, int parameters, const 
     return count >= rules->min_mirrored ? sum / (double)count / spread : -1.0;
 }
 
-/* Set `out` to the sums of the products of what mirroring changes at two pixels that are one of LAGS apart, and behind them
- * to the numbers of such pairs, in the half of the window above `y`: the other half mirrors it (reference.edges._lag_products). */
+/* Set `out` to the sums over pairs of pixels, for each of LAGS lags, of the products of their mirrored differences, followed by the
+ * numbers of pairs. Only the half of the window above `y` is used; the other half is its reflection
+ * (reference.edges._lag_products). */
 FOR_EACH_PROCESSOR
 void lag_products(const window_t *window, double y, double *out)
 {
@@ -115,7 +116,7 @@ void lag_products(const window_t *window, double y, double *out)
             }
         }
         const lanes_t sums[ACROSS_LAGS] = {s0, s1, s2, s3, s4}, pairs[ACROSS_LAGS] = {n0, n1, n2, n3, n4};
-        /* In the row itself, lags to the left are those to the right. */
+        /* Within a row, lags to the left equal those to the right. */
         for (int k = up ? 0 : LAG; k < ACROSS_LAGS; k++, out++) {
             out[0] = out[LAGS] = 0.0;
             for (int lane = 0; lane < LANES; lane++) {

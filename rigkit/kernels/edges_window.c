@@ -1,9 +1,9 @@
-/* The pixels around a corner, gathered once: of every row what lies near the corner's two lines. */
+/* The window of a corner: the pixels of every row near the corner's two lines. */
 #include "edges.h"
 
 enum { STRETCH = 16 };
 
-/* Pixels that are taken from the image together, wider and wider. */
+/* Vectors of STRETCH pixels, for the conversion from bytes to float. */
 typedef uint8_t bytes_t __attribute__((vector_size(STRETCH)));
 typedef uint16_t halves_t __attribute__((vector_size(2 * STRETCH)));
 typedef int32_t words_t __attribute__((vector_size(4 * STRETCH)));
@@ -13,8 +13,7 @@ typedef struct {
     double lo, hi;
 } range_t;
 
-/* Return where low <= x / inverse + offset <= high: of a line along the row, with an infinite inverse, everywhere or
- * nowhere. */
+/* Return the range of x with low <= x / inverse + offset <= high; for an infinite inverse (a line along the row) all or none. */
 INLINE range_t between(double inverse, double offset, double low, double high)
 {
     const double lo = (low - offset) * inverse, hi = (high - offset) * inverse;
@@ -31,7 +30,7 @@ INLINE range_t both(range_t a, range_t b)
     return (range_t){a.lo > b.lo ? a.lo : b.lo, a.hi < b.hi ? a.hi : b.hi};
 }
 
-/* Append `count` pixels of row `v` from column `first` on, both from the centre. */
+/* Append `count` pixels of row `v` from column `first` on, both relative to the centre. */
 INLINE void take(window_t *window, const picture_t image, int64_t v, int32_t first, int32_t count)
 {
     const int64_t start = ((int64_t)window->centre_v + v) * image.width + (int64_t)window->centre_u + first;
@@ -39,7 +38,7 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, int32_t fir
     const float *restrict floats = (const float *)image.brightness + start;
     float *restrict us = window->u + window->count, *restrict vs = window->v + window->count;
     float *restrict values = window->value + window->count;
-    /* In steps of known length: what is too much is written over, or not looked at. */
+    /* In steps of constant length: excess values are overwritten later or not used. */
     const bright_t steps = {0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f, 8.0f, 9.0f, 10.0f, 11.0f, 12.0f, 13.0f, 14.0f, 15.0f};
     for (int32_t k = 0; k < count; k += STRETCH) {
         *(bright_t *)(us + k) = steps + (float)(first + k);
@@ -49,7 +48,7 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, int32_t fir
         memcpy(values, floats, (size_t)count * sizeof(float));
     else if (start + count + STRETCH <= image.width * image.height)
         for (int32_t k = 0; k < count; k += STRETCH) {
-            /* Twice as wide at a time, which is what processors can do: GCC 12 takes one pixel after the other elsewise. */
+            /* Each conversion doubles the width, as instructions do; otherwise GCC 12 converts pixel by pixel. */
             bytes_t stretch;
             memcpy(&stretch, bytes + k, sizeof stretch);
             const words_t words = __builtin_convertvector(__builtin_convertvector(stretch, halves_t), words_t);
@@ -61,8 +60,8 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, int32_t fir
     window->count += count;
 }
 
-/* Repeat the last pixel to the end of its block: what a block may leave out is decided by all of its pixels (all_beyond), and
- * would else depend on what the memory held before. */
+/* Repeat the last pixel to the end of its block: whether a block is evaluated depends on all of its pixels (all_beyond), and would
+ * otherwise depend on uninitialised memory. */
 INLINE void fill_up(window_t *window)
 {
     for (int64_t i = window->count; i % BLOCK != 0; i++) {
@@ -71,8 +70,8 @@ INLINE void fill_up(window_t *window)
     }
 }
 
-/* Return how far the window reaches towards neighbouring line `k` of cells that are `across` px wide that way
- * (reference.edges._reach). */
+/* Return the reach of the window towards the neighbouring line `k`, in sides of the cell, which is `across` px wide in that
+ * direction (reference.edge_model._reach). */
 INLINE double reach_to(const geometry_t at, int k, double blur, double across, const edge_rules_t *rules)
 {
     if (isfinite(at.reach[k]))
@@ -85,8 +84,8 @@ INLINE double reach_to(const geometry_t at, int k, double blur, double across, c
     return left < rules->reach ? left : rules->reach;
 }
 
-/* Gather the pixels inside the cell, the radius and the image (reference.edges.collect): of every row one or two stretches
- * near the two lines. */
+/* Gather the pixels inside the cell, the radius and the image (reference.edge_model.collect): in every row one or two intervals
+ * near the two lines. There are none for a pixel whose coordinates may exceed int64_t. */
 FOR_EACH_PROCESSOR
 void collect_window(
     window_t *window, const picture_t image, const double pixel[2], const geometry_t at, double blur, const edge_rules_t *rules)
@@ -97,7 +96,6 @@ void collect_window(
     window->size = 2.0;
     window->centre_u = rint(pixel[0]);
     window->centre_v = rint(pixel[1]);
-    /* A pixel this far from any image has no window, and its coordinates may exceed int64_t. */
     if (!isfinite(a[0] + a[1] + b[0] + b[1]) || !(fabs(pixel[0]) + fabs(pixel[1]) < 1e9))
         return;
     const double off_u = pixel[0] - window->centre_u, off_v = pixel[1] - window->centre_v;
@@ -118,13 +116,13 @@ void collect_window(
     const int64_t top = -window->centre_v > -(double)most ? -(int64_t)window->centre_v : -most;
     const int64_t bottom = rest < (double)most ? (int64_t)rest : most;
     for (int64_t start = top; start <= bottom; start += BLOCK) {
-        /* Where the one or two stretches of each row lie: without branches, many rows at once. */
+        /* The one or two intervals of each row, without branches, many rows at once. */
         const int32_t rows = bottom - start < BLOCK ? (int32_t)(bottom - start) + 1 : BLOCK;
         int32_t first[2][BLOCK], count[2][BLOCK];
         for (int32_t k = 0; k < rows; k++) {
             const double v = (double)((int32_t)start + k), half = sqrt(square - v * v);
-            /* Position in cells along side a and along side b, in the column of the centre; it grows by one in so many
-             * columns. */
+            /* Position in cells along side a and along side b in the column of the centre; it grows by one every `columns_a`
+             * and `columns_b` columns. */
             const double cells_a = (-b[0] * (v - off_v) - b[1] * off_u) * per_area;
             const double cells_b = (a[0] * (v - off_v) + a[1] * off_u) * per_area;
             range_t whole = both(between(columns_a, cells_a, -left, right), between(columns_b, cells_b, -above, below));
@@ -150,7 +148,7 @@ void collect_window(
     fill_up(window);
 }
 
-/* Return whether there are pixels on all sides of (x, y) (reference.edges._surrounded). */
+/* Return whether there are two or more pixels on each side of (x, y) (reference.edges._surrounded). */
 FOR_EACH_PROCESSOR
 int is_surrounded(const window_t *window, float x, float y)
 {
