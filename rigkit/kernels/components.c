@@ -1,15 +1,15 @@
-/* Linked corners as lattices: a column and a row for each. The definitions in numpy are in
- * tests/kernels/reference/growth.py and front.py. */
+/* Connected components of linked corners as lattices, with a column and a row for each corner. The definitions in numpy are in
+ * tests/kernels/reference/growth.py and links.py. */
 #include "kernels.h"
 
-/* Links as states: state 4 * corner + arm leads to the state 4 * its neighbour + the arm that points back, or to -1. */
+/* Links are states: state 4 * corner + arm leads to state 4 * neighbour + the neighbour's arm that points back, or to -1. */
 static int compare(const void *one, const void *two)
 {
     const int64_t a = *(const int64_t *)one, b = *(const int64_t *)two;
     return (a > b) - (a < b);
 }
 
-/* Keep the links that bound a closed square on either side (reference.links.quads). */
+/* Keep the links that are a side of a closed square (reference.links.quads). */
 static void keep_quads(int64_t count, int64_t *to, uint8_t *bound)
 {
     memset(bound, 0, (size_t)(4 * count));
@@ -27,14 +27,14 @@ static void keep_quads(int64_t count, int64_t *to, uint8_t *bound)
 
 enum { UNSEEN = -2, ALONE = -1 };
 
-/* Lattices while they are found: of every corner its lattice, its column and row, and the arm that points to +column;
- * `members` lists the corners of one lattice after the other. */
+/* The lattices found so far: for every corner the index of its lattice, its column and row, and its arm that points to +column;
+ * `members` lists the corners lattice by lattice. */
 typedef struct {
     const int64_t *to;
     int64_t *label, *grid, *turn, *members, listed;
 } lattices_t;
 
-/* List all corners that are linked with `start`; return the best linked one of them. */
+/* List all corners that are connected with `start`; return the one with the most links, of several the first. */
 static int64_t list_linked(lattices_t *at, int64_t start, int64_t lattice)
 {
     const int64_t first = at->listed;
@@ -62,7 +62,8 @@ static int64_t list_linked(lattices_t *at, int64_t start, int64_t lattice)
     return root;
 }
 
-/* Give their places to the corners around `root`, ring by ring; the label is `lattice` when a corner has its place. */
+/* Set column and row of the corners connected with `root` by breadth-first search; corners that have them are labelled
+ * `lattice`. */
 static void place_linked(lattices_t *at, int64_t root, int64_t lattice, int64_t *frontier, int64_t *next)
 {
     static const int64_t step_c[4] = {1, 0, -1, 0}, step_r[4] = {0, 1, 0, -1};
@@ -89,9 +90,9 @@ static void place_linked(lattices_t *at, int64_t root, int64_t lattice, int64_t 
     }
 }
 
-/* Give a column and a row to every linked corner, and the arm that points to +column (reference.growth._walk). `label` is
- * -1 for corners without links; `members` lists the corners of the lattices one lattice after the other. Returns the
- * number of lattices. `queue` (2 * count) is scratch. */
+/* Set column and row of every linked corner, and its arm that points to +column (reference.growth._walk); return the number of
+ * lattices. `label` is -1 for corners without links; `members` lists the corners lattice by lattice. `queue` (2 * count) is
+ * scratch. */
 static int64_t walk(
     int64_t count, const int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue)
 {
@@ -110,14 +111,14 @@ static int64_t walk(
         place_linked(&at, root, lattices, queue, queue + count);
         for (int64_t k = first; k < at.listed; k++)
             if (label[members[k]] == UNSEEN)
-                label[members[k]] = ALONE; /* Links are mutual, so there are none; but nothing is listed twice. */
+                label[members[k]] = ALONE; /* Cannot happen, as links are mutual; then the corner would be listed twice. */
         lattices++;
     }
     return lattices;
 }
 
-/* reference.growth.components_of: the lattices of the links `to` (count, 4), which are changed. Returns how many; label, grid (count, 2),
- * turn and members as in `walk`. `queue` (2 * count) and `bound` (4 * count) are scratch. */
+/* Find the lattices of the links `to` (count, 4), of which those of no square are removed (reference.growth.components_of); return
+ * their number. label, grid (count, 2), turn and members as in `walk`; `queue` (2 * count) and `bound` (4 * count) are scratch. */
 int64_t find_components(
     int64_t count, int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue, uint8_t *bound)
 {

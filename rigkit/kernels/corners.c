@@ -1,8 +1,9 @@
-/* Which peaks of the saddle response are corners of a chessboard: their saddle points, the rings around them. 
- * The definitions in numpy are in tests/kernels/reference/front.py, the numbers in rigkit.detection.saddles. */
+/* Chessboard corners among the peaks of the saddle response, by their saddle points and the rings around them. The definitions in
+ * numpy are in tests/kernels/reference/front.py, the numbers in rigkit.detection.saddles. */
 #include "rings.h"
 
-/* reference.front.saddle_step for one pixel; whether it is a saddle and near. */
+/* Set `pixel` to the stationary point of the quadratic at pixel (u, v) (reference.front.saddle_step); return whether it is a saddle
+ * and within `max_step`. */
 INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v, double max_step, double pixel[2])
 {
     const float *at = smooth + v * width + u;
@@ -19,8 +20,7 @@ INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v,
     return fabs(step_u) <= max_step && fabs(step_v) <= max_step;
 }
 
-/* Return whether every fourth sample of the ring around (u, v) leaves it possible that there is a corner
- * (reference.front.may_be_corners). */
+/* Return whether (u, v) may be a corner, by every fourth sample of its ring (reference.front.may_be_corners). */
 INLINE int may_be_corner(const image_t image, const ring_rules_t *rules, float u, float v, float radius, float response)
 {
     enum { EVERY = 4, PAIRS = HALF / EVERY, SAMPLES = 2 * PAIRS };
@@ -40,7 +40,7 @@ INLINE int may_be_corner(const image_t image, const ring_rules_t *rules, float u
         && response < (float)rules->quick_sharp * variance;
 }
 
-/* Ask for what the ring around pixel (u, v) is read from: peaks lie all over an image that no near cache holds. */
+/* Prefetch the pixels of the ring around (u, v): the image does not fit the near caches. */
 INLINE void fetch_ring(const image_t image, int64_t u, int64_t v, int64_t reach)
 {
     const int64_t left = u > reach ? u - reach : 0, top = v > reach ? v - reach : 0;
@@ -49,10 +49,10 @@ INLINE void fetch_ring(const image_t image, int64_t u, int64_t v, int64_t reach)
         __builtin_prefetch(image.brightness + row * image.width + left);
 }
 
-/* Which of the `count` peaks of a level, of that response, are corners (reference.front.corners): `saddles` gets the saddles next to
- * them, in pixels of the full image (`scale`, `offset`), `pixels`, `angles` and `contrast` those that are corners: their ring is valid
- * and they are no sharper than `max_sharp`; `smeared` says which of these only motion explains. Sets `found` to how many saddles
- * and corners there are. */
+/* Find the corners among the `count` peaks of a level (reference.front.corners). Set `saddles` to the saddles near the peaks, in
+ * pixels of the full image (`scale`, `offset`), `pixels`, `angles` and `contrast` to those that are corners, whose ring is valid
+ * and which are no sharper than `max_sharp`, `smeared` to the corners that need motion blur, and `found` to the numbers of
+ * saddles and corners. */
 static FOR_EACH_PROCESSOR void read_peaks(
     const image_t image, const int32_t *peaks, const float *response, int64_t count, double radius, double max_step,
     double max_sharp, const ring_rules_t *rules, double scale, double offset, double *saddles, double *pixels, double *angles,
@@ -84,7 +84,7 @@ static FOR_EACH_PROCESSOR void read_peaks(
     found[1] = corners;
 }
 
-/* The same; `repeated` says which corners lie within `reach` of one of `known`. Returns 0 without memory. */
+/* The same; set `repeated` for corners within `reach` of one of `known`. Return 0 if there is no memory. */
 int64_t find_corners(
     const float *smooth, int64_t width, int64_t height, const int32_t *peaks, const float *response, int64_t count, double radius,
     double max_step, double max_sharp, const ring_rules_t *rules, double scale, double offset, const double *known,
@@ -99,7 +99,7 @@ int64_t find_corners(
     return known_count == 0 || mark_known(pixels, found[1], known, known_count, reach, repeated);
 }
 
-/* Mark those of `fresh` (count, 2) that lie within `reach` of one of `known`. Returns 0 without memory. */
+/* Mark those of `fresh` (count, 2) that are within `reach` of one of `known`. Return 0 if there is no memory. */
 int64_t mark_known(const double *fresh, int64_t count, const double *known, int64_t known_count, double reach, uint8_t *mark)
 {
     squares_t squares;

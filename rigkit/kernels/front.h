@@ -1,4 +1,4 @@
-/* What smoothing.c needs of peaks.c. */
+/* Functions of peaks.c that smoothing.c calls. */
 #ifndef RIGKIT_FRONT_H
 #define RIGKIT_FRONT_H
 

@@ -9,7 +9,7 @@ enum { MAX_TERMS = 10, MAX_DEGREE = 3, MAX_RADIUS = 3, MAX_TRIED = 16 };
 static const double MIN_PULL = 1e-12;
 static const double LINEAR_PULL = 1e-9;
 
-/* A cell's polynomial: see LocalFit. */
+/* The polynomial at a cell (detection.lattice.local_fit.LocalFit). */
 typedef struct {
     double pixel[2], along_column[2], along_row[2], curvature_column[2], curvature_row[2], support, gain;
 } fit_t;
@@ -42,8 +42,8 @@ INLINE void solve(double matrix[MAX_TERMS][MAX_TERMS], double right[MAX_TERMS][3
 static const int POWER_C[MAX_TERMS] = {0, 1, 0, 2, 1, 0, 3, 2, 1, 0};
 static const int POWER_R[MAX_TERMS] = {0, 0, 1, 0, 1, 2, 0, 1, 2, 3};
 
-/* What a fit takes from the cells around one: which cells, their weights, sums of weight * column^i * row^j, and those with
- * the positions (from a corner `near`by, against cancellation). */
+/* The sums of a fit over the cells around one: the range of cells, their weights, the moments, sums of weight * column^i * row^j,
+ * and the same with the positions, which are relative to a corner `near`by to avoid cancellation. */
 typedef struct {
     int64_t row, column, low_r, low_c, high_r, high_c, support;
     double moment[2 * MAX_DEGREE + 1][2 * MAX_DEGREE + 1], position[MAX_TERMS][2], near[2];
@@ -250,7 +250,7 @@ INLINE int runs_along(double angle, const double *vector, double line_sine)
     return fabs(cross) < line_sine * sqrt(vector[0] * vector[0] + vector[1] * vector[1]);
 }
 
-/* Return whether the saddle at (u, v) can be the corner of the cell, and its contrast (reference.growth._fits). */
+/* Return whether the saddle at `pixel` can be the corner of the cell, and set its contrast (reference.growth._fits). */
 INLINE int fits(
     const sheet_t *sheet, const pyramid_level_t *level, const growth_rules_t *rules, const fit_t *fit, int64_t row, int64_t column,
     double height, const double *pixel, double *contrast)
@@ -311,7 +311,7 @@ INLINE int try_cell(
         const double du = at[0] - fit.pixel[0], dv = at[1] - fit.pixel[1];
         off[k] = hypot(du * b[1] - dv * b[0], a[0] * dv - a[1] * du) / area;
     }
-    /* The nearest in cells that fits: so try them in that order. */
+    /* Try them in the order of their distances in cells. */
     for (int64_t k = 0; k < count; k++) {
         int64_t best = -1;
         for (int64_t j = 0; j < count; j++)
@@ -348,8 +348,7 @@ static int touches_border(const sheet_t *sheet)
 }
 
 /* Grow one lattice in place by at most `rings` rings (reference.growth.grown). `fresh` (rows * columns, 3) and `where`
- * (rows * columns) are scratch. Returns the rings that are left, 0 or more, if it needs a wider sheet to grow on; -1 if
- * it has grown all it can. */
+ * (rows * columns) are scratch. Return the number of rings left if it needs a larger sheet to continue, -1 if it is complete. */
 FOR_EACH_PROCESSOR int64_t grow_lattice(
     sheet_t *sheet, const pyramid_level_t *level, const squares_t *saddles, const growth_rules_t *rules, int64_t rings,
     double *fresh, int64_t *where)

@@ -329,7 +329,7 @@ void edge_shifts(
             for (int64_t column = 0; column + 1 < columns; column++) {
                 if (!square_of(pixels, columns, row, column, scale, offset, corner) || next++ % every)
                     continue;
-                /* The edge that the square starts with, and how the square goes on from there. */
+                /* The first edge of the square along this axis, and the opposite one. */
                 const double *start = corner[0], *end = corner[1 + down], *lateral = corner[2 - down], *last = corner[3];
                 const double side = 0.5 * reach * ((row + column) % 2 ? -sign : sign);
                 const double across_u = side * (lateral[0] + last[0] - start[0] - end[0]);
@@ -345,7 +345,7 @@ void edge_shifts(
                 }
             }
     for (int64_t k = 0; k < parts; k++) {
-        /* The mean of a step from dark to bright says where it is, however sharp it is. */
+        /* The mean of a step from dark to bright determines its position, independently of its blur. */
         const double *sum = sums + k * (steps + 1), dark = sum[0], bright = sum[steps];
         const double middle = 0.5 * (dark + bright), contrast = bright - dark > 1e-9 ? bright - dark : 1e-9;
         double mean = -middle;

@@ -1,39 +1,39 @@
-/* Which corners are neighbours along the edges between squares. The definitions in numpy are in tests/kernels/reference/links.py,
- * the numbers in rigkit.detection.lattice.links. */
+/* Links between corners that are neighbours along an edge of a square. The definitions in numpy are in
+ * tests/kernels/reference/links.py, the numbers in rigkit.detection.lattice.links. */
 #include "kernels.h"
 
-/* A corner that may be the neighbour along an arm. */
+/* A possible neighbour along an arm: squared distance, the arm, the neighbour, and its arm that points back. */
 typedef struct {
     float square;
     int64_t arm, end, back;
 } candidate_t;
 
-/* Corners that are looked at together; memory behind all lists is long enough for so many more. */
+/* Corners that are processed together; all lists have memory for so many more. */
 enum { TOGETHER = 8 };
 
-/* The corners in the order of the squares, so that those of a row of squares lie side by side: position, the unit
- * vectors of both lines, contrast. */
+/* The corners in the order of the grid of squares, so that those of a row of squares are contiguous: position, the unit vectors of
+ * both lines, contrast. */
 enum { A_U, A_V, B_U, B_V, CONTRAST, COLUMNS };
 typedef struct {
     double *u, *v;
     float *columns[COLUMNS];
 } places_t;
 
-/* What is found around a corner: square of the distance, infinite where the contrast is not like its own; the place;
- * whether they point an arm of the other kind at each other. */
+/* The corners near a corner: squared distance, infinite if the contrast is out of bounds; index in `places_t`; whether both point
+ * arms at each other, of different lines. */
 typedef struct {
     float *square;
     int32_t *place, *meets;
 } near_t;
 
-/* The corner whose neighbours are looked for, and the bounds of their contrast. */
+/* The corner whose neighbours are searched, and the bounds of their contrast. */
 typedef struct {
     double u, v;
     float lines[4], contrast, min_contrast, max_contrast, ratio, square_of_cosine;
 } home_t;
 
-/* Look at the places `from` to `to` - 1 and append them to the `count` near ones; return how many there are then. */
-INLINE int64_t look_at(const places_t *places, int64_t from, int64_t to, const home_t *home, const near_t *near, int64_t count)
+/* Append the places `from` to `to` - 1 to the `count` near corners; return the new number. */
+INLINE int64_t append_near(const places_t *places, int64_t from, int64_t to, const home_t *home, const near_t *near, int64_t count)
 {
     const float mine_a_u = home->lines[0], mine_a_v = home->lines[1];
     const float mine_b_u = home->lines[2], mine_b_v = home->lines[3];
@@ -63,7 +63,7 @@ INLINE int64_t look_at(const places_t *places, int64_t from, int64_t to, const h
     return count + to - from;
 }
 
-/* How many of the `count` near corners are alike and nearer than the square root of `most`. */
+/* Return the number of the `count` near corners whose squared distance is below `most`. */
 INLINE int32_t count_nearer(const near_t *near, int64_t count, float most)
 {
     const float *restrict square = near->square;
@@ -73,10 +73,11 @@ INLINE int32_t count_nearer(const near_t *near, int64_t count, float most)
     return nearer;
 }
 
-/* Look at the corners around `home`, square by square: at least the `wanted` nearest alike. Returns how many. */
+/* Set `near` to corners around `home`, square by square, among them the `wanted` nearest with a contrast in bounds; return their
+ * number. */
 INLINE int64_t gather(const squares_t *squares, const places_t *places, const home_t *home, int64_t wanted, const near_t *near)
 {
-    /* Squares to each side that mostly have enough. */
+    /* Squares to each side that usually contain enough. */
     enum { AT_ONCE = 3 };
     const double u = home->u, v = home->v, side = squares->side;
     const int64_t column = square_at(u, squares->left, side, squares->columns);
@@ -98,25 +99,25 @@ INLINE int64_t gather(const squares_t *squares, const places_t *places, const ho
                     continue;
                 from = from > 0 ? from : 0;
                 to = to < squares->columns ? to : squares->columns - 1;
-                count = look_at(places, first[from], first[to + 1], home, near, count);
+                count = append_near(places, first[from], first[to + 1], home, near, count);
             }
         }
         if (left <= 0 && top <= 0 && right >= squares->columns - 1 && bottom >= squares->rows - 1)
             return count;
-        /* All corners within the root of `safe` are among them by now. */
+        /* All corners within this squared distance have been appended. */
         const float safe = (float)((inner + (double)ring * side) * (inner + (double)ring * side));
         if (count >= wanted && count_nearer(near, count, safe) >= wanted)
             return count;
     }
 }
 
-/* The arm (A, B, -A, -B) that points most along the chord. */
+/* Return the arm (A, B, -A, -B) nearest to the direction of the chord. */
 INLINE int64_t arm_along(double a, double b)
 {
     return fabs(b) > fabs(a) ? (b < 0.0 ? 3 : 1) : (a < 0.0 ? 2 : 0);
 }
 
-/* Whether the edge from corner i is there (reference.links._edge_seen). */
+/* Return whether the image has the edge from corner i (reference.links._edge_seen). */
 INLINE int link_seen(
     const corners_t *corners, const image_t image, double scale, double offset, const link_rules_t *rules, int64_t i,
     const candidate_t *link)
@@ -135,8 +136,8 @@ INLINE int link_seen(
         image, rules->along, rules->places, rules->min_places, u, v, end_u, end_v, link->arm % 2 ? -1.0 : 1.0, lateral, weakest);
 }
 
-/* The nearest corner along each of the four arms of the corner at `place` whose edge is seen: to[arm] = 4 * corner +
- * arm, or -1. */
+/* Set to[arm] to 4 * corner + its arm for the nearest corner along each arm of the corner at `place` to which there is an edge; -1
+ * if there is none. */
 INLINE void link_arms(
     const corners_t *corners, const squares_t *squares, const places_t *places, int64_t place, const image_t image, double scale,
     double offset, const link_rules_t *rules, const near_t *near, int64_t *to)
@@ -192,9 +193,8 @@ static double link_length(const double *pixels, int64_t i, int64_t to)
     return sqrt(du * du + dv * dv);
 }
 
-/* reference.links.links: both[4 * i + arm] = 4 * neighbour + its arm, -1 for none. Of the corners, `lines` (count, 4)
- * are the unit vectors of A and B, `least` and `most` bound the contrast of those looked at, `reach` is the most `lateral`.
- * `nearest` (count, 4) is scratch. Returns 0 without memory. */
+/* Set both[4 * i + arm] to 4 * neighbour + its arm for mutual links, -1 for none (reference.links.links). `nearest` (count, 4) is
+ * scratch. Return 0 if there is no memory. */
 FOR_EACH_PROCESSOR int64_t find_links(
     const corners_t *corners, image_t image, double scale, double offset, const link_rules_t *rules, int64_t *nearest,
     int64_t *both)
@@ -225,7 +225,7 @@ FOR_EACH_PROCESSOR int64_t find_links(
     }
     for (int64_t k = 0; k < 4 * count; k++)
         nearest[k] = both[k] = -1;
-    /* In the order of the squares: neighbours look at the same corners and pixels. */
+    /* In the order of the grid: neighbours read the same corners and pixels. */
     for (int64_t k = 0; k < count; k++)
         link_arms(corners, &squares, &places, k, image, scale, offset, rules, &near, nearest + 4 * (int64_t)squares.order[k]);
     free(memory);
@@ -233,7 +233,7 @@ FOR_EACH_PROCESSOR int64_t find_links(
     for (int64_t k = 0; k < 4 * count; k++)
         if (nearest[k] >= 0 && nearest[nearest[k]] == k)
             both[k] = nearest[k];
-    /* Both halves of a link go, so what is dropped is marked before it is. */
+    /* Both directions of a link are removed, so all links are tested before any is removed. */
     for (int64_t k = 0; k < 4 * count; k++) {
         const int64_t opposite = k / 4 * 4 + (k + 2) % 4;
         nearest[k] = both[k] >= 0 && both[opposite] >= 0

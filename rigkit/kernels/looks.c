@@ -2,9 +2,9 @@
  * numpy are in tests/kernels/reference/looks.py. */
 #include "kernels.h"
 
-/* Return whether at least one of the four pixels of 2 x 2 squares is brighter or darker than the mean of its square by `share` of it,
- * in the upper median over the squares whose mean is above the upper median of all and above `least`; every `step`-th square
- * in both directions. */
+/* Return whether one of the four positions in cells of 2 x 2 pixels is brighter or darker than the mean of its cell by `share` of
+ * it, in the upper median over the cells whose mean is above the upper median of all and above `least`; every `step`-th cell in
+ * both directions. */
 int64_t has_mosaic(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t step, double least, double share, double *scratch)
 {
@@ -39,8 +39,8 @@ int64_t has_mosaic(
     return bright > 0 && uneven;
 }
 
-/* Return the number of inner pixels of every `apart`-th row, from `first` on, that are brighter than all eight neighbours, or darker,
- * by more than `step`, or by `share` of the range of these rows if that is larger; the range goes into `span`. */
+/* Return the number of inner pixels of every `apart`-th row, from `first` on, that are brighter than all eight neighbours, or
+ * darker, by more than `step`, or by `share` of the range of these rows if that is larger; the range goes into `span`. */
 int64_t count_bad_pixels(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t first, int64_t apart, double step, double share,
     double *span)

@@ -2,10 +2,10 @@
  * the numbers in rigkit.detection.saddles. */
 #include "front.h"
 
-/* Numbers are counted in so many bins to rank them, those of so many bits. */
+/* Number of bins, and of their bits, of the histogram by which values are ranked. */
 enum { RANK_BITS = 11, RANKS = 1 << RANK_BITS };
 
-/* Minus the determinant of the Hessian at one pixel of a row, between the row above and that below. */
+/* Return the saddle response at a pixel, minus the determinant of the Hessian, from its row and the rows above and below. */
 INLINE float saddle_between(const float *above, const float *row, const float *below)
 {
     const float here = 2.0f * row[0];
@@ -19,8 +19,8 @@ INLINE float saddle_response(const float *at, int64_t width)
     return saddle_between(at - width, at, at + width);
 }
 
-/* How values are counted, the smaller ones first: by their highest bits where they span magnitudes and are not negative, else
- * by where they lie between `low` and the highest one, `per_bin` apart. */
+/* The bins of a histogram in increasing order: the highest bits of values that span orders of magnitude and are not negative, or
+ * equal intervals from `low` on, with `per_bin` the reciprocal of their width. */
 typedef struct {
     float low, per_bin;
     int by_bits;
@@ -36,6 +36,7 @@ INLINE int32_t bin_of(float value, const bins_t bins)
     return place < (float)(RANKS - 1) ? (int32_t)place : RANKS - 1;
 }
 
+/* Set `often` to the histogram of the values. */
 INLINE void count_bins(const float *values, int64_t count, const bins_t bins, int32_t often[RANKS])
 {
     memset(often, 0, RANKS * sizeof(int32_t));
@@ -43,8 +44,8 @@ INLINE void count_bins(const float *values, int64_t count, const bins_t bins, in
         often[bin_of(values[k], bins)]++;
 }
 
-/* Return what `at` of `count` values are smaller than or equal to, `often` being what `count_bins` says of them: those of its
- * bin, gathered in `room` (count), are few. */
+/* Return the value of rank `at`, from 0, of `count` values with the histogram `often`: the few values of its bin are gathered in
+ * `room` (count) and ranked. */
 INLINE float value_at_rank(
     const float *values, int64_t count, const bins_t bins, const int32_t often[RANKS], int64_t at, float *room)
 {
@@ -54,7 +55,7 @@ INLINE float value_at_rank(
         at -= often[bin];
     int64_t few = 0;
     for (int64_t first = 0; first < count; first += BLOCK) {
-        /* Most blocks have none of them, and are looked at as a whole. */
+        /* Most blocks contain none of them, which is tested for the whole block. */
         const int64_t here = count - first < BLOCK ? count - first : BLOCK;
         int32_t any = here < BLOCK;
         for (int64_t k = 0; k < BLOCK && here == BLOCK; k++)
@@ -66,8 +67,8 @@ INLINE float value_at_rank(
     return ranked_float(room, few, at);
 }
 
-/* Of every step-th inner pixel of every step-th inner row: set out to the upper median of |response|, and the brightness
- * that `few` of them are darker and brighter than. `room` has a place for each of them. */
+/* Set `out` to the upper median of |response|, and to the brightness of rank `few` from below and from above, over every `step`-th
+ * inner pixel of every `step`-th inner row. `room` has room for one number for each of them. */
 FOR_EACH_PROCESSOR void typical_values(
     const float *smooth, int64_t height, int64_t width, int64_t step, int64_t few, float *response, float *brightness, float *room,
     float *out)
@@ -91,9 +92,9 @@ FOR_EACH_PROCESSOR void typical_values(
     out[2] = value_at_rank(brightness, count, levels, often, count - 1 - few, room);
 }
 
-/* reference.front.thresholds: for each strip of each band `floor` times the square of how bright its brightest pixel is
- * between `darkest` and `brightest`, but not below `least`. Every fourth pixel is looked at: the edges of boards are wider
- * than the squares that could hide between them. */
+/* Set the thresholds of all strips of all bands (reference.front.thresholds): `floor` times the squared relative brightness of the
+ * brightest pixel, 0 at `darkest` and 1 at `brightest`, at least `least`. Every fourth pixel is read, which misses no square that
+ * is large enough to be found. */
 FOR_EACH_PROCESSOR void fill_thresholds(
     const float *smooth, int64_t height, int64_t width, float floor, float least, float darkest, float brightest, float *out)
 {
@@ -109,7 +110,7 @@ FOR_EACH_PROCESSOR void fill_thresholds(
                 brightest_of[k] = darkest;
             for (int64_t v = top; v < bottom; v += APART) {
                 const float *row = smooth + v * width + left;
-                /* Of all pixels, and twice, so that the compiler knows how many there are: it is done many at once. */
+                /* Written twice, so that the number of pixels is a constant and the loop is vectorised. */
                 if (across == STRIP)
                     for (int64_t k = 0; k < STRIP; k++)
                         brightest_of[k] = row[k] > brightest_of[k] ? row[k] : brightest_of[k];
@@ -124,19 +125,19 @@ FOR_EACH_PROCESSOR void fill_thresholds(
         }
 }
 
-/* Peaks are sought in three rows at a time, a triple: a peak is the highest pixel of its column there, and not lower than the
- * highest ones of the two columns to either side. Few pixels are left to be compared with all of their neighbours. */
+/* Peaks are searched in three rows at a time, a triple. A peak is the highest pixel of its column in the triple, and not lower than
+ * the highest ones of the two columns on each side: few pixels remain to be compared with all neighbours within two pixels. */
 
 #define LOWEST (-1e30f)
 
-/* What is no number, beside what float32 does not hold, is higher than nothing. */
+/* Return the larger value; `least` if `one` is NaN, as responses beyond the range of float32 are. */
 INLINE float higher_of(float one, float least)
 {
     return one > least ? one : least;
 }
 
 /* Return as bits, the lowest first, which of the columns u to u + STRIP - 1 may have a peak: their highest pixel, in `most`, is
- * above the threshold, and not below those of the columns beside. */
+ * above the threshold and not below those of the two columns on each side. */
 INLINE uint64_t columns_among(const float *most, int64_t u, float threshold)
 {
     uint8_t highest[STRIP];
@@ -155,8 +156,8 @@ INLINE uint64_t columns_among(const float *most, int64_t u, float threshold)
     return bits;
 }
 
-/* Return whether pixel u of the middle row is not lower than the neighbours that follow within two pixels, and higher than those
- * before: a corner between pixels makes two equal ones. */
+/* Return whether pixel u of the middle row is higher than the previous neighbours within two pixels, and not lower than the
+ * following ones: a corner halfway between two pixels makes them equal, and one of them is the peak. */
 INLINE int is_peak(float *const rows[5], int64_t u)
 {
     float before = higher_of(rows[2][u - 1], higher_of(rows[2][u - 2], LOWEST));
@@ -168,9 +169,9 @@ INLINE int is_peak(float *const rows[5], int64_t u)
     return (rows[2][u] > before) & !(after > rows[2][u]);
 }
 
-/* What is known of the rows that are looked at.
- * rows : the responses, row v the v % RING-th, `stride` apart.
- * most, high : the highest of each column, and whether any of a strip is above its threshold, of two triples in turns. */
+/* The state of the search.
+ * rows : ring buffer of the responses, row v at v % RING, `stride` apart.
+ * most, high : for two triples in turn, the maximum of each column, and whether any pixel of a strip is above its threshold. */
 typedef struct {
     const float *smooth, *thresholds;
     int64_t height, width, stride, strips;
@@ -188,20 +189,20 @@ INLINE float threshold_at(const search_t s, int64_t v, int64_t strip)
     return s.thresholds[v / STRIP_ROWS * s.strips + strip];
 }
 
-/* The lower one of those of the triple from row v on, which may lie in two bands. */
+/* Return the lower threshold of the triple from row v on, which may extend over two bands. */
 INLINE float lowest_threshold(const search_t s, int64_t v, int64_t strip)
 {
     const float above = threshold_at(s, v, strip), below = threshold_at(s, v + TRIPLE - 1, strip);
     return above < below ? above : below;
 }
 
-/* The saddle response at `count` pixels of a row and of the two below, and the highest of each column; whether any is above the
- * threshold. */
+/* Set the saddle response at `count` pixels of a row and of the two below, and the maximum of each column; return whether any is
+ * above the threshold. */
 INLINE uint8_t fill_strip(
     const float *restrict from, int64_t width, int64_t count, float threshold, float *restrict first, float *restrict second,
     float *restrict third, float *restrict most)
 {
-    /* Rows by pointers of their own: a register for each, and none for each of their pixels. */
+    /* A pointer to each row, so that the compiler keeps one register per row. */
     const float *above = from - width, *middle = from + width, *last = middle + width, *below = last + width;
     int32_t high = 0;
     for (int64_t k = 0; k < count; k++) {
@@ -218,7 +219,7 @@ INLINE uint8_t fill_strip(
     return (uint8_t)high;
 }
 
-/* The same of the first or last rows of the image, of which some have no neighbours. */
+/* The same for the first or last triple of the image, with rows that have no response. */
 INLINE void fill_border(const search_t s, int64_t v)
 {
     float *most = s.most + v / TRIPLE % 2 * s.stride;
@@ -249,7 +250,7 @@ INLINE void fill_triple(const search_t s, int64_t v)
     fill_strip(from + 1, s.width, STRIPS_FROM - 1, 0.0f, one + 1, two + 1, three + 1, most + 1);
     for (int64_t u = STRIPS_FROM, strip = 0; u < s.width - 1; u += STRIP, strip++) {
         const float least = lowest_threshold(s, v, strip);
-        /* The last strip begins in the one before, so that the compiler knows how many pixels there are. */
+        /* The last strip overlaps the previous one, so that the number of pixels is a constant. */
         const int64_t at = u + STRIP < s.width ? u : s.width - 1 - STRIP;
         high[strip] = at >= STRIPS_FROM
             ? fill_strip(from + at, s.width, STRIP, least, one + at, two + at, three + at, most + at)
@@ -257,7 +258,8 @@ INLINE void fill_triple(const search_t s, int64_t v)
     }
 }
 
-/* Which columns of each row of the triple from v on have peaks: into `columns` (TRIPLE, width / 3 + 1), and how many. */
+/* Set `columns` (TRIPLE, width / 3 + 1) to the columns of the peaks in each row of the triple from v on, and `found` to their
+ * numbers. */
 INLINE void search_triple(const search_t s, int64_t v, int32_t *columns, int64_t found[TRIPLE])
 {
     const float *most = s.most + v / TRIPLE % 2 * s.stride;
@@ -272,7 +274,7 @@ INLINE void search_triple(const search_t s, int64_t v, int32_t *columns, int64_t
             const int64_t at = u + __builtin_ctzll(left);
             if (at >= s.width - 3)
                 break;
-            /* The highest, of equal ones the first; without branches, whose ways are chance. */
+            /* The row of the column's maximum, the first of several; without branches, which are unpredictable here. */
             const int64_t above = rows[2][at] != most[at], row = above + (above & (rows[3][at] != most[at]));
             int32_t *next = columns + row * (s.width / 3 + 1) + found[row];
             *next = (int32_t)at;
@@ -281,9 +283,9 @@ INLINE void search_triple(const search_t s, int64_t v, int32_t *columns, int64_t
     }
 }
 
-/* reference.front.peaks: (u, v) and response of the peaks, row by row; returns how many. There is at most one peak in
- * 3x3 pixels. `scratch` holds RING + 2 rows of width + STRIP + 4 floats, `high` 2 * (width / STRIP + 1) bytes, `columns`
- * TRIPLE * (width / 3 + 1) numbers. */
+/* Set `at` and `response` to (u, v) and response of the peaks, row by row; return their number, at most one in 3 x 3 pixels
+ * (reference.front.peaks). `scratch` holds RING + 2 rows of width + STRIP + 4 floats, `high` 2 * (width / STRIP + 1) bytes,
+ * `columns` TRIPLE * (width / 3 + 1) numbers. */
 FOR_EACH_PROCESSOR int64_t find_peaks(
     const float *smooth, int64_t height, int64_t width, const float *thresholds, float *scratch, uint8_t *high, int32_t *columns,
     int32_t *at, float *response)
@@ -309,10 +311,10 @@ FOR_EACH_PROCESSOR int64_t find_peaks(
     return count;
 }
 
-/* Keep of `count` peaks, in place and in their order, about the `most` strongest beside the strongest one in their square
- * of `side` pixels (reference.front._strongest): as many bins of this share as are needed, the highest first. `squares`
- * ((height / side + 1) * (width / side + 1)), `bins` (`finest` + 1), both zeroed, and `share` (count) are scratch. Returns
- * how many are left. */
+/* Keep about the `most` strongest of `count` peaks, in place and in order, by their response relative to the strongest in their
+ * square of `side` pixels (reference.front._strongest): the highest bins of a histogram of this ratio that hold so many. `squares`
+ * ((height / side + 1) * (width / side + 1)) and `bins` (`finest` + 1), both zeroed, and `share` (count) are scratch. Return the
+ * number of peaks kept. */
 int64_t keep_strongest(
     int32_t *at, float *response, int64_t count, int64_t height, int64_t width, int64_t side, int64_t most, int64_t finest,
     float *squares, int32_t *bins, int32_t *share)
@@ -330,7 +332,7 @@ int64_t keep_strongest(
     }
     for (int64_t k = 0; k < count; k++) {
         const float part = response[k] / squares[share[k]];
-        /* Beyond what float32 holds one is as strong as the other. */
+        /* Infinite responses, whose ratio is NaN, count as equally strong. */
         share[k] = part < 1.0f ? (int32_t)((float)finest * part) : (int32_t)finest;
         bins[share[k]]++;
     }

@@ -1,4 +1,4 @@
-/* The ring of samples around a corner: what tells that it is one, its angles and its contrast. */
+/* The ring of samples around a point: whether the point is a chessboard corner, its angles and its contrast. */
 
 #ifndef RIGKIT_RINGS_H
 #define RIGKIT_RINGS_H
@@ -28,7 +28,7 @@ INLINE void ring_angles(
     double size = sqrt((double)second_u * second_u + (double)second_v * second_v);
     size = size > 1e-20 ? size : 1e-20;
     const double phase_u = second_u / size, phase_v = second_v / size;
-    /* Twice half of all samples of a whole turn, of which every second is taken. */
+    /* Both sums have HALF samples: half a turn of the ring, and every second sample of the whole inner ring. */
     const double ratio = (inner_u * phase_u + inner_v * phase_v) / size;
     double place = (ratio - 0.25) / 0.75 * (double)(rules->gain_count - 1);
     place = place > 0.0 ? place : 0.0;
@@ -45,25 +45,26 @@ INLINE void ring_angles(
     angles[1] = angles[0] + quadrant;
 }
 
-/* Sample every `apart`-th place of a ring. As brightness_at, but first all places, which vectorises, then all reads. */
-INLINE void sample_ring(const image_t image, const float *circle, int64_t apart, float u, float v, float radius, float *samples)
+/* Set `samples` to every `stride`-th sample of a ring. As brightness_at, but in two loops: positions, which are vectorised, then
+ * reads. */
+INLINE void sample_ring(const image_t image, const float *circle, int64_t stride, float u, float v, float radius, float *samples)
 {
     float right[TURN], below[TURN];
     int32_t at[TURN];
     const int32_t width = (int32_t)image.width, right_most = width - 2, low_most = (int32_t)image.height - 2;
     const float max_u = (float)(width - 1), max_v = (float)(image.height - 1);
-    /* A pixel more than the ring needs: circles of float32 are a little rounder or less. */
+    /* A pixel more than the ring needs, for the rounding of float32. */
     const float margin = radius + 1.0f;
     const int inside = u > margin && v > margin && u < max_u - margin && v < max_v - margin;
-    for (int64_t k = 0; inside && k < TURN / apart; k++) {
-        const float sample_u = u + radius * circle[2 * apart * k], sample_v = v + radius * circle[2 * apart * k + 1];
+    for (int64_t k = 0; inside && k < TURN / stride; k++) {
+        const float sample_u = u + radius * circle[2 * stride * k], sample_v = v + radius * circle[2 * stride * k + 1];
         const int32_t left = (int32_t)sample_u, top = (int32_t)sample_v;
         right[k] = sample_u - (float)left;
         below[k] = sample_v - (float)top;
         at[k] = top * width + left;
     }
-    for (int64_t k = 0; !inside && k < TURN / apart; k++) {
-        float sample_u = u + radius * circle[2 * apart * k], sample_v = v + radius * circle[2 * apart * k + 1];
+    for (int64_t k = 0; !inside && k < TURN / stride; k++) {
+        float sample_u = u + radius * circle[2 * stride * k], sample_v = v + radius * circle[2 * stride * k + 1];
         sample_u = sample_u > 0.0f ? sample_u : 0.0f;
         sample_v = sample_v > 0.0f ? sample_v : 0.0f;
         sample_u = sample_u < max_u ? sample_u : max_u;
@@ -75,15 +76,15 @@ INLINE void sample_ring(const image_t image, const float *circle, int64_t apart,
         below[k] = sample_v - (float)top;
         at[k] = top * width + left;
     }
-    for (int64_t k = 0; k < TURN / apart; k++) {
+    for (int64_t k = 0; k < TURN / stride; k++) {
         const float *upper = image.brightness + at[k], *lower = upper + width;
         const float above = upper[0] + right[k] * (upper[1] - upper[0]);
         samples[k] = above + below[k] * (lower[0] + right[k] * (lower[1] - lower[0]) - above);
     }
 }
 
-/* Return whether the ring around (u, v) is that of a chessboard corner of at least a contrast; if so, its two angles and
- * its contrast (reference.front.read_rings); 2 where only motion explains how bright its middle is. */
+/* Return 1 if the ring around (u, v) is that of a chessboard corner of contrast `least` or more, 2 if it is that of one with motion
+ * blur, by the brightness at its centre, else 0; set its two angles and its contrast (reference.front.read_rings). */
 INLINE int read_ring(
     const image_t image, const ring_rules_t rules, float u, float v, float radius, double least, double angles[2], double *contrast)
 {

@@ -1,8 +1,8 @@
-/* From an image as it was read to one that saddles are sought in: smaller, smoother. The definitions in numpy are in
+/* The levels of the image pyramid in which saddles are searched: reduction and smoothing. The definitions in numpy are in
  * tests/kernels/reference/front.py. */
 #include "front.h"
 
-/* The means of factor x factor pixels: out (height / factor, width / factor). `sums` (width) is scratch. */
+/* Set `out` (height / factor, width / factor) to the means of factor x factor pixels. `sums` (width) is scratch. */
 FOR_EACH_PROCESSOR void shrink_floats(
     const float *restrict image, int64_t height, int64_t width, int64_t factor, float *restrict sums, float *restrict out)
 {
@@ -24,7 +24,7 @@ FOR_EACH_PROCESSOR void shrink_floats(
     }
 }
 
-/* Two sums of 16 bits that lie beside each other, added: as halves of one number, which vectorises without moving lanes. */
+/* Return the sum of two adjacent numbers of 16 bits, read as one of 32 bits: vectorised without permutations of lanes. */
 INLINE uint32_t sum_of_two(const uint16_t *sums)
 {
     uint32_t both;
@@ -32,7 +32,8 @@ INLINE uint32_t sum_of_two(const uint16_t *sums)
     return (both & UINT16_MAX) + (both >> 16);
 }
 
-/* The same of bytes; sums of at most 256 rows, or of 16 rows and columns, fit 16 bits. `sums` (2 * width) is scratch. */
+/* The same for bytes. 16 bits hold sums of up to 257 rows, or of 16 x 16 pixels; so factor <= 257. `sums` (2 * width) is
+ * scratch. */
 FOR_EACH_PROCESSOR void shrink_bytes(
     const uint8_t *restrict image, int64_t height, int64_t width, int64_t factor, uint16_t *restrict sums, float *restrict out)
 {
@@ -70,7 +71,7 @@ FOR_EACH_PROCESSOR void shrink_bytes(
     }
 }
 
-/* The rows of an image two above to two below row v, the border repeated. */
+/* Offsets of the rows from two above to two below row v, the border repeated. */
 typedef struct {
     int64_t above2, above, here, below, below2;
 } rows_t;
@@ -82,8 +83,8 @@ INLINE rows_t rows_around(int64_t v, int64_t height, int64_t width)
         (v < height - 2 ? v + 2 : height - 1) * width};
 }
 
-/* Smooth with the kernel (outer, inner, centre, inner, outer) both ways, the border repeated; `half` gets every second
- * pixel of every second row. `column` (width + 4) is scratch. */
+/* Smooth with the kernel (outer, inner, centre, inner, outer) along both axes, the border repeated; `half` gets every second pixel
+ * of every second row. `column` (width + 4) is scratch. */
 static FOR_EACH_PROCESSOR void smooth_floats(
     const float *restrict image, int64_t height, int64_t width, const float *restrict kernel, float *restrict column,
     float *restrict out, float *restrict half)
@@ -109,7 +110,7 @@ static FOR_EACH_PROCESSOR void smooth_floats(
     }
 }
 
-/* The same of bytes with a kernel of small integers over `whole`: exact, as long as whole^2 * 255 fits 16 bits. */
+/* The same for bytes, with a kernel of small integers over `whole`: exact if whole^2 * 255 fits 16 bits. */
 static FOR_EACH_PROCESSOR void smooth_bytes(
     const uint8_t *restrict image, int64_t height, int64_t width, const float *restrict kernel, float whole,
     uint16_t *restrict column, float *restrict out, float *restrict half)
@@ -140,8 +141,8 @@ static FOR_EACH_PROCESSOR void smooth_bytes(
     }
 }
 
-/* One level of the pyramid from the `image` that the level before has left (reference.front.level): smoothed, every second of its
- * pixels both ways for the next one, and its thresholds, by every `step`-th pixel both ways. */
+/* Set a level of the pyramid from `image`, the `half` of the previous one (reference.front.level): `smooth`, `half` for the next
+ * level, and the thresholds, from every `step`-th pixel along both axes. */
 void make_level(
     const void *image, int64_t bytes, int64_t width, int64_t height, int64_t step, const level_rules_t *rules, float *scratch,
     float *smooth, float *half, float *thresholds)

@@ -105,7 +105,7 @@ static double fitted(const sums_t *sums, int terms, double ridge, double surface
     return left > 0.0 ? 0.5 * left : 0.0;
 }
 
-/* Return the number of terms of a quadratic surface that so many columns determine. */
+/* Return the number of terms of a quadratic surface that a number of columns determines. */
 INLINE double determined(double columns)
 {
     return columns < 1.0 ? 0.0 : columns < 2.0 ? 3.0 : columns < 3.0 ? 5.0 : 6.0;
