@@ -1,29 +1,33 @@
-/* The model of blurred circles, seen through any smooth map (circles.c): where pixels lie on a circle, how bright they are,
- * and what its parameters change. The definition in numpy is in tests/kernels/reference/circles.py. */
+/* The model of blurred circles under a smooth map (circles.c): the coordinates of pixels relative to a circle, their brightness,
+ * and its derivatives. The definition in numpy is in tests/kernels/reference/circles.py. */
 #ifndef CIRCLE_MODEL_H
 #define CIRCLE_MODEL_H
 
 #include "kernels.h"
 
+/* Parameters: centre, the symmetric matrix ((1 + e1 + e2, e3), (e3, 1 + e1 - e2)) that M is multiplied by, blur, brightness
+ * outside, difference of the brightness inside, relative gradient of the light. */
 enum { X, Y, E1, E2, E3, S, A, B, GX, GY, PARAMETERS };
 
-/* Steps of w = inverse(M) (x - c - H(w, w) / 2), at most: each gains the ratio of bend to size. */
+/* Largest number of fixed-point steps w = inverse(M) (x - c - H(w, w) / 2): each reduces the error by the ratio of the second-order
+ * term to the size. */
 enum { INVERSIONS = 4 };
-/* What the place of a pixel may be off for them, in radii. */
+/* Error of w, in radii, at which they stop. */
 static const double PLACE_ERROR = 1e-5;
 
-/* Pixels are dealt with so many at a time. */
+/* Pixels that are processed at a time. */
 enum { BLOCK = 32 };
-/* The normal equations and, as the last of their columns, the residuals. */
+/* Columns of the normal equations: the parameters, then the residuals. */
 enum { OFF = PARAMETERS, COLUMNS };
-/* Beside them, what the circle's own growth changes (that of the circles beside it is in E1 to S, too), and what a blur that
- * differs with the direction changes. */
+/* Further rows: the derivatives by the radius of this circle alone (E1 to S include those of its neighbours), and by the two
+ * parameters of an anisotropic blur. */
 enum { OWN = COLUMNS, Q1, Q2, ROWS };
-/* Further from an edge than this, in blurs, it is all one brightness: but for a part in 10^12. */
+/* Distance from an edge, in blurs, beyond which the brightness is constant to 1e-12. */
 static const float FAR = 7.0f;
-/* Nearer to the centre than this, in px, the way to the edge turns round with the centre, and fits do not settle. */
+/* Distance from the centre, px, within which pixels are not used: the direction to the nearest edge depends on the centre there,
+ * and fits do not converge. */
 static const double NO_DIRECTION = 1.0;
-/* Further than so many radii from a circle beside it pixels have none of its light: there its map may not be inverted. */
+/* Distance from a neighbouring circle, in radii, beyond which its light is 0: its map need not be invertible there. */
 static const double NO_LIGHT = 2.5;
 
 /* The pixels of a circle: arrays of their coordinates and brightness. */
@@ -32,24 +36,27 @@ typedef struct {
     int64_t count;
 } spots_t;
 
+/* A circle: position = c + M w + H(w, w) / 2 of the place w in radii, the inverse of M, blur s with its anisotropy q, brightness a
+ * outside and a + b inside, gradient g of the light, radius `size` in px, and the fixed-point steps that invert the map. */
 typedef struct {
     double c[2], M[4], inverse[4], H[6], s, q[2], a, b, g[2], size;
     int inversions;
 } circle_t;
 
-/* A circle and those beside it whose edges reach into its pixels: what is lighter by two discs is so by the sum of both. They
- * grow and blur as it does: circles of one board are alike. */
+/* A circle and the neighbours whose blurred edges overlap its pixels; their light adds up. The neighbours have the same changes of
+ * size and the same blur, as circles of one board. */
 typedef struct {
     circle_t own, beside[BESIDE];
     int count;
 } group_t;
 
-/* Pixels as the map places them: place (x, y) in radii and its distance r from the centre, distance d from the edge in px
- * (outwards), direction n of growing r, 1 / |grad r|, curvature of the edge. */
+/* Pixels relative to a circle: place (x, y) in radii and its distance r from the centre, distance d from the edge in px (positive
+ * outside), unit vector n along grad r in the image, 1 / |grad r|, curvature of the edge. */
 typedef struct {
     double x[BLOCK], y[BLOCK], r[BLOCK], d[BLOCK], nu[BLOCK], nv[BLOCK], per_radius[BLOCK], curvature[BLOCK];
 } places_t;
 
+/* Set `out` for the pixels at (du, dv) from the circle's centre. */
 INLINE void place(const circle_t *at, const double du[BLOCK], const double dv[BLOCK], places_t *out)
 {
     const double *H = at->H, *M = at->M, *inverse = at->inverse;
@@ -77,7 +84,7 @@ INLINE void place(const circle_t *at, const double du[BLOCK], const double dv[BL
         const double c = r > 1e-9 ? x / safe : 1.0, s = y / safe;
         const double gu = (j11 * c - j10 * s) * per_det, gv = (j00 * s - j01 * c) * per_det;
         const double per_slope = 1.0 / sqrt(gu * gu + gv * gv), nu = gu * per_slope, nv = gv * per_slope;
-        /* How r bends along n: then (r - 1) / slope, which is the distance to first order, is right to second. */
+        /* The distance (r - 1) / |grad r| is exact to first order; the second derivative of r along n makes it exact to second. */
         const double across = (c * (j00 * nv - j10 * nu) - s * (j11 * nu - j01 * nv)) * per_det;
         const double first = (r - 1.0) * per_slope, second = 0.5 * first * across * across * per_slope / safe;
         out->r[k] = r;
@@ -89,8 +96,8 @@ INLINE void place(const circle_t *at, const double du[BLOCK], const double dv[BL
     }
 }
 
-/* Set `share` to the part of the disc in pixels that are `z` blurs inside its edge, `slope` to its derivative. The limits
- * have a loop of their own: as branches they would keep the other from being vectorised. */
+/* Set `share` to the share of the disc in pixels `z` blurs inside its edge, and `slope` to its derivative. The clipping has a loop
+ * of its own: otherwise it becomes branches, which prevent vectorisation. */
 INLINE void shares(const double z[BLOCK], double share[BLOCK], double slope[BLOCK])
 {
     float x[BLOCK];
@@ -106,13 +113,13 @@ INLINE void shares(const double z[BLOCK], double share[BLOCK], double slope[BLOC
     }
 }
 
-/* The blur towards the edges of a block: its variance is s^2 + q . (cos, sin) of twice the angle of the edge's normal, as that
- * of motion is; and its derivatives by s and, where `all` are wanted, by q. */
+/* The blur normal to the edge at the pixels of a block. Its variance is s^2 + q . (cos, sin) of twice the angle of the normal, as
+ * that of motion blur; with its derivatives by s and, if `all` are wanted, by q. */
 typedef struct {
     double s[BLOCK], per_s[BLOCK], by_s[BLOCK], by_q[2][BLOCK];
 } blurs_t;
 
-INLINE void towards(const double q[2], double s, const places_t *places, const int all, blurs_t *out)
+INLINE void set_blurs(const double q[2], double s, const places_t *places, const int all, blurs_t *out)
 {
     const double least = 0.01 * s * s, per_even = 1.0 / s;
     const int even = q[0] == 0.0 && q[1] == 0.0;
@@ -135,8 +142,8 @@ INLINE void towards(const double q[2], double s, const places_t *places, const i
     }
 }
 
-/* Return how many pixels of a block there are from `first` on, and where they are from the circle's centre; what is beyond
- * the last pixel is at the centre. */
+/* Set (du, dv) to the pixels of a block from `first` on, relative to the circle's centre, 0 beyond the last pixel; return the
+ * number of pixels. */
 INLINE int64_t offsets(const circle_t *at, const spots_t *spots, int64_t first, double du[BLOCK], double dv[BLOCK])
 {
     const int64_t here = spots->count - first < BLOCK ? spots->count - first : BLOCK;
@@ -147,7 +154,7 @@ INLINE int64_t offsets(const circle_t *at, const spots_t *spots, int64_t first, 
     return here;
 }
 
-/* Set the inverse of the circle's map; return whether there is one. */
+/* Set the inverse of M; return whether M is invertible. */
 INLINE int inverted(circle_t *at)
 {
     const double *M = at->M, det = M[0] * M[3] - M[1] * M[2];
@@ -160,8 +167,8 @@ INLINE int inverted(circle_t *at)
     return 1;
 }
 
-/* Add the light of a circle beside it to the block's share of discs and, for growth and blur, to its rows: derivatives of the
- * share. Most blocks have none of it. */
+/* Add the light of the neighbour `at` of the circle `from` to the shares of the block, and its derivatives by size and blur to the
+ * rows. Most blocks have none of it. */
 INLINE void add_beside(
     const circle_t *at, const circle_t *from, const double du[BLOCK], const double dv[BLOCK], const int all, double total[BLOCK],
     double rows[ROWS][BLOCK])
@@ -182,7 +189,7 @@ INLINE void add_beside(
     if (!(nearest < NO_LIGHT * NO_LIGHT))
         return;
     place(at, u, v, &places);
-    towards(from->q, from->s, &places, all, &blur);
+    set_blurs(from->q, from->s, &places, all, &blur);
 #pragma omp simd reduction(max : deepest)
     for (int k = 0; k < BLOCK; k++) {
         const double inside = -places.d[k] * blur.per_s[k] - 0.5 * places.curvature[k] * blur.s[k];
@@ -210,8 +217,8 @@ INLINE void add_beside(
     }
 }
 
-/* Set the places of a block, and its rows: derivatives of the brightness by the parameters, and residuals; and what else there
- * is a row of, where `all` are wanted. */
+/* Set the places of a block and its rows: derivatives of the brightness by the parameters, residuals, and, if `all` are wanted, the
+ * further rows. */
 INLINE void differentiate(
     const group_t *group, const double du[BLOCK], const double dv[BLOCK], const double value[BLOCK], const int all,
     places_t *places, double rows[ROWS][BLOCK])
@@ -221,7 +228,7 @@ INLINE void differentiate(
     const double per_size = 1.0 / at->size;
     blurs_t blur;
     place(at, du, dv, places);
-    towards(at->q, at->s, places, all, &blur);
+    set_blurs(at->q, at->s, places, all, &blur);
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++)
         z[k] = -places->d[k] * blur.per_s[k] - 0.5 * places->curvature[k] * blur.s[k];
@@ -230,7 +237,8 @@ INLINE void differentiate(
     for (int k = 0; k < BLOCK; k++) {
         const double per_r = 1.0 / (places->r[k] > 1e-9 ? places->r[k] : 1e-9), c = places->x[k] * per_r, s = places->y[k] * per_r;
         const double edge = slope[k] * blur.per_s[k], grown = edge * places->per_radius[k];
-        /* A larger circle is less curved; a slanted one where it is longer is more so, three times as much. */
+        /* A larger circle has less curvature. The curvature of an ellipse changes with its axes three times as much, and with the
+         * other sign: more where the ellipse is longer. */
         const double bent = 0.5 * slope[k] * places->curvature[k] * blur.s[k];
         const double wider = slope[k] * (places->d[k] * blur.per_s[k] * blur.per_s[k] - 0.5 * places->curvature[k]);
         total[k] = share[k];

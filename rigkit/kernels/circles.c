@@ -1,16 +1,17 @@
-/* The fit of blurred circles, seen through any smooth map, one after the other. The definition in numpy is in
- * tests/kernels/reference/circles.py, the numbers are in rigkit.detection.circles.fit.
+/* The fit of blurred circles under a smooth map, one after the other. The definition in numpy is in
+ * tests/kernels/reference/circles.py, the numbers in rigkit.detection.circles.fit.
  *
- * Position x in the image is c + M w + H(w, w) / 2 of the place w in radii from the circle's centre: c is the image of the
- * centre, not the middle of the image. Free are c, M from the right by a symmetric matrix (which circle a turn of it would
- * be, nobody sees), the blur s, and the light (1 + g . x) (a + b S), S the share of the disc. */
+ * The position in the image is x = c + M w + H(w, w) / 2 with w in radii from the circle's centre: c is the image of the centre,
+ * not the centre of the image ellipse. The parameters are c, a symmetric matrix that M is multiplied by from the right (a
+ * rotation of the circle in itself cannot be observed), the blur s, and the brightness (1 + g . x) (a + b S) with S the share of
+ * the disc. */
 #include "circle_model.h"
 
-/* Steps are taken no shorter or longer than this: where two of them are nearly alike, or opposite, noise decides the ratio. */
+/* Range of the factor of relaxed steps, which noise dominates if two steps are nearly equal or opposite. */
 static const double MIN_TIMES = 0.3, MAX_TIMES = 4.0;
 
-/* Gather the pixels near the edge and within `reach` radii, at most `capacity`, and set the circle's brightness to their means
- * inside and outside; return whether there are pixels of both. */
+/* Gather at most `capacity` pixels within `band` px of the edge and `reach` radii of the centre, and set the circle's brightness to
+ * their means inside and outside; return whether there are pixels on both sides. */
 INLINE int gather(
     circle_t *at, const void *grey, int64_t bytes, int64_t width, int64_t height, double reach, double band, int64_t capacity,
     spots_t *spots)
@@ -59,8 +60,8 @@ INLINE int gather(
     return 1;
 }
 
-/* Add how the residuals of a block go on round the circle: weighted as a change of radius, times cosine and sine of 3 to 6
- * times the angle in the plane. */
+/* Add the harmonics 3 to 6 of the residuals of a block over the angle in the plane (cosine, sine), weighted with the derivative by
+ * the radius. */
 INLINE void add_harmonics(const places_t *places, const double grown[BLOCK], const double off[BLOCK], double out[8])
 {
     double c[BLOCK], s[BLOCK], cn[BLOCK], sn[BLOCK];
@@ -87,7 +88,7 @@ INLINE void add_harmonics(const places_t *places, const double grown[BLOCK], con
     }
 }
 
-/* Write the products of rows, the lower triangle of `sums`; where `all` of them are wanted, the harmonics of residuals, too. */
+/* Write the sums of the products of rows to the lower triangle of `sums`; if `all` rows are wanted, add up the harmonics, too. */
 INLINE void sum_products(const group_t *at, const spots_t *spots, const int all, double sums[ROWS][ROWS], double harmonics[8])
 {
     const int count = all ? ROWS : COLUMNS;
@@ -115,7 +116,7 @@ INLINE void sum_products(const group_t *at, const spots_t *spots, const int all,
     }
 }
 
-/* Fill the normal equations; return the sum of squared residuals. */
+/* Set the normal equations; return the sum of squared residuals. */
 INLINE double equations(double sums[ROWS][ROWS], double N[PARAMETERS * PARAMETERS], double right[PARAMETERS])
 {
     for (int i = 0; i < PARAMETERS; i++) {
@@ -125,8 +126,8 @@ INLINE double equations(double sums[ROWS][ROWS], double N[PARAMETERS * PARAMETER
     return sums[OFF][OFF];
 }
 
-/* Take an unknown that is at its limit out of the normal equations: the rest of the step is then what is best there. */
-INLINE void leave(double N[PARAMETERS * PARAMETERS], double right[PARAMETERS], int out)
+/* Remove an unknown that is at its limit from the normal equations: its step becomes 0, the others those of the reduced problem. */
+INLINE void fix_unknown(double N[PARAMETERS * PARAMETERS], double right[PARAMETERS], int out)
 {
     for (int i = 0; i < PARAMETERS; i++)
         N[i * PARAMETERS + out] = N[out * PARAMETERS + i] = 0.0;
@@ -134,10 +135,10 @@ INLINE void leave(double N[PARAMETERS * PARAMETERS], double right[PARAMETERS], i
     right[out] = 0.0;
 }
 
-/* Return by how much to take a step longer or shorter than it is, `times` having been that of the one before: where edges
- * are not the model's, steps go to and fro or creep. Aitken's relaxation for vectors, Irons and Tuck 1969, eq. 12, in the
- * metric of the normal equations: `moves` is a step's square, `along` its product with the one before, `before` the square of
- * that. */
+/* Return the factor of a step, from the factor `times` of the previous one: where the model does not describe the edges, steps
+ * oscillate or converge slowly. This is Aitken's relaxation for vectors (Irons and Tuck, "A version of the Aitken accelerator for
+ * computer iteration", 1969, equation 12) in the metric of the normal equations: `moves` is the squared norm of the step, `along`
+ * its product with the previous one, `before` the squared norm of that. */
 INLINE double relaxed(double times, double moves, double along, double before)
 {
     const double change = moves - 2.0 * along + before;
@@ -145,7 +146,7 @@ INLINE double relaxed(double times, double moves, double along, double before)
     return fresh < MIN_TIMES ? MIN_TIMES : fresh > MAX_TIMES ? MAX_TIMES : fresh;
 }
 
-/* Let the map grow by the symmetric matrix of `step`. */
+/* Multiply M from the right by 1 plus the symmetric matrix of `step`, clipped to the largest change. */
 INLINE void grow(circle_t *at, const double step[PARAMETERS], const circle_rules_t *rules)
 {
     const double e1 = limited(step[E1], rules->max_growth), e2 = limited(step[E2], rules->max_growth);
@@ -157,7 +158,7 @@ INLINE void grow(circle_t *at, const double step[PARAMETERS], const circle_rules
     at->M[3] = m2 * e3 + m3 * (1.0 + e1 - e2);
 }
 
-/* Take a step; return whether the maps can still be inverted. */
+/* Move the circle and its neighbours by a step; return whether their maps are still invertible. */
 static int moved(group_t *group, const double step[PARAMETERS], const circle_rules_t *rules)
 {
     circle_t *at = &group->own;
@@ -178,8 +179,8 @@ static int moved(group_t *group, const double step[PARAMETERS], const circle_rul
     return fine;
 }
 
-/* Write what residuals say of a blur that differs with the direction: their products with its two columns, and the normal
- * equations of these (3) once all else is solved for, from the factor `N` of those of the rest. */
+/* Write the gradient of the cost by the two parameters of an anisotropic blur, and the Schur complement of their normal equations
+ * (3) after the elimination of all others, whose normal equations have the factor `N`. */
 static void unevenness(double sums[ROWS][ROWS], const double *N, double out[5])
 {
     double solved[2][PARAMETERS];
@@ -199,7 +200,7 @@ static void unevenness(double sums[ROWS][ROWS], const double *N, double out[5])
     }
 }
 
-/* Return the circle as its guess has it, with as many inversions of its map as a pixel's place needs. */
+/* Return the circle of the initial values, with the number of fixed-point steps that PLACE_ERROR needs. */
 static circle_t guessed(const double *pixel, const double *map, const double *bend, double blur, const double q[2])
 {
     circle_t at = {.s = blur, .q = {q[0], q[1]}};
@@ -207,7 +208,7 @@ static circle_t guessed(const double *pixel, const double *map, const double *be
     memcpy(at.M, map, sizeof at.M);
     memcpy(at.H, bend, sizeof at.H);
     at.size = sqrt(fabs(at.M[0] * at.M[3] - at.M[1] * at.M[2]));
-    /* The narrower of its axes is at least area over the longer. */
+    /* The shorter axis is at least the area over the Frobenius norm. */
     const double longest = sqrt(at.M[0] * at.M[0] + at.M[1] * at.M[1] + at.M[2] * at.M[2] + at.M[3] * at.M[3]);
     double bent = 0.0, left_over = 1.0;
     for (int k = 0; k < 6; k++)
@@ -218,8 +219,8 @@ static circle_t guessed(const double *pixel, const double *map, const double *be
     return at;
 }
 
-/* Write the fitted circle with `N`, the normal equations' factor. Its `harmonics` are the means of the residuals, weighted as a
- * change of radius, times those of the angle, in radii: a disc has none, a square the fourth. */
+/* Write the results of a fitted circle; `N` is the factor of the normal equations. The harmonics of the edge are deviations of its
+ * radius, in radii: 0 for a disc, while a square has the fourth. */
 static void write_circle(
     const circle_t *at, const double *N, double sums[ROWS][ROWS], const double harmonics[8], int64_t seen, int settled,
     double *result)
@@ -250,7 +251,7 @@ static void write_circle(
     unevenness(sums, N, result + 26);
 }
 
-/* Return the circle and those `beside` it that reach into its pixels, as their guesses have them. */
+/* Return circle `n` with initial values, and those of its neighbours (`beside`) whose light reaches its pixels. */
 static group_t grouped(
     int64_t n, const double *pixels, const double *maps, const double *curvatures, const double *blur, const double *uneven,
     double reach, const int64_t *beside, const circle_rules_t *rules)
@@ -261,7 +262,7 @@ static group_t grouped(
         if (j < 0)
             continue;
         circle_t other = guessed(pixels + 2 * j, maps + 4 * j, curvatures + 6 * j, blur[n], uneven + 2 * n);
-        /* It is as wide as the larger of its sides on the way from one to the other, and so far the pixels go. */
+        /* The extents of the neighbour and of this circle's pixels along the line between the centres. */
         const double u = other.c[0] - group.own.c[0], v = other.c[1] - group.own.c[1], apart = hypot(u, v);
         const double *M = other.M, *own = group.own.M, wide = hypot(M[0] * u + M[2] * v, M[1] * u + M[3] * v) / apart;
         const double far = reach * hypot(own[0] * u + own[2] * v, own[1] * u + own[3] * v) / apart;
@@ -271,6 +272,7 @@ static group_t grouped(
     return group;
 }
 
+/* Fit `count` circles by relaxed Gauss-Newton steps (reference.circles). */
 FOR_EACH_PROCESSOR
 void fit_circles(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *maps,
@@ -298,13 +300,13 @@ void fit_circles(
             for (int i = 0; i < PARAMETERS; i++)
                 N[i * PARAMETERS + i] *= 1.0 + 1e-9;
             if (at->s <= rules->min_blur && right[S] < 0.0)
-                leave(N, right, S);
+                fix_unknown(N, right, S);
             solved = cholesky(N, PARAMETERS);
             if (!solved)
                 break;
             memcpy(step, right, sizeof step);
             cholesky_solve(N, PARAMETERS, step);
-            /* Nothing moves by more of its sigmas than the root of this over the variance. */
+            /* sqrt(moves / variance) bounds the move of every parameter in its standard deviations. */
             double moves = 0.0, along = 0.0;
             for (int i = 0; i < PARAMETERS; i++) {
                 moves += right[i] * step[i];
@@ -318,7 +320,7 @@ void fit_circles(
                 step[i] *= times;
             solved = moved(&group, step, rules);
             const int certain = moves < rules->converged_sigmas * rules->converged_sigmas * variance;
-            /* Size and slant tell how sure the centre is, and settle later. */
+            /* Size and slant determine the uncertainty of the centre, and converge later. */
             const double grown = fabs(step[E1]) + fabs(step[E2]) + fabs(step[E3]);
             still = certain || fabs(step[X]) + fabs(step[Y]) < rules->converged_px;
             settled = certain || (still && grown * at->size < rules->converged_px);

@@ -1,4 +1,4 @@
-/* The brightness of the modules of tags, and which codes they are most like. The definitions in numpy are in
+/* The brightness of the modules of tags, and the codes with the largest correlation. The definitions in numpy are in
  * tests/kernels/reference/surface.py, the numbers in rigkit.detection.tags.codes. */
 #include "kernels.h"
 
@@ -76,7 +76,7 @@ FOR_EACH_PROCESSOR void read_codes(
         best[n] = read_tag(grey, bytes, width, height, quads + 8 * n, side, bright + modules * n) >= min_contrast ? 0 : -1;
         likeness[n] = best[n] < 0 ? 0.0 : -INFINITY;
     }
-    /* Four codes at once, as the sum of one waits for itself, with all tags: the codes of a board are more than the first cache. */
+    /* Four codes at once, whose sums are independent, for all tags: the codes of a board do not fit the first-level cache. */
     for (int64_t c = 0; c < codes; c += 4) {
         const double *one = patterns + modules * c, *two = patterns + modules * (c + 1 < last ? c + 1 : last);
         const double *three = patterns + modules * (c + 2 < last ? c + 2 : last);

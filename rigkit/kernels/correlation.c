@@ -29,9 +29,9 @@ INLINE int lag_at(int row, int column)
     return row == 0 ? column : LAG + 1 + (-row - 1) * ACROSS_LAGS + column + LAG;
 }
 
-/* Set `matrix` to what turns products of noise at LAGS into those of changes. A mirror image falls between four pixels, and
- * blends them: two mirror images share noise if they blend neighbours. With f the part of the way from one pixel to the next,
- * `blend` is f (1 - f) of u, of v, and the product of both. */
+/* Set `matrix` to the linear map from the autocovariance of the noise at LAGS to that of the mirrored differences. A mirrored pixel
+ * is interpolated from four pixels: two of them share noise if they use the same or neighbouring ones. With f the fraction between
+ * pixels, `blend` is f (1 - f) of u, of v, and the product of both. */
 static void set_blended(const double blend[3], double matrix[LAGS][LAGS])
 {
     const double both = blend[2], right = blend[0] - 2.0 * both, below = blend[1] - 2.0 * both;
@@ -79,7 +79,7 @@ static void solve_transposed(double matrix[LAGS][LAGS], double x[LAGS])
     }
 }
 
-/* Set `influence` to w at LAGS, the mean of both lines, and return what the fit takes out of the noise
+/* Set `influence` to w at LAGS, the mean of both lines, and return the amount of noise that the fit absorbs
  * (reference.correlation.influence). */
 static double set_influence(
     const double sides[4], double blur, const double rows[LAGS], const double columns[LAGS], const factor_rules_t *rules,
@@ -93,7 +93,7 @@ static double set_influence(
         reach[line] = across < 2.0 * rules->radius_px ? across : 2.0 * rules->radius_px;
         for (int k = 0; k < LAGS; k++) {
             const double along = cosine * columns[k] + sine * rows[k], lateral = cosine * rows[k] - sine * columns[k];
-            /* Over so much of the line it overlaps with itself, shifted: less over what has the other sign. */
+            /* The overlap of the line with itself shifted along it, minus the parts with opposite sign. */
             const double left = 1.0 - 3.0 * fabs(along) / reach[line];
             influence[k] += exp(lateral * lateral / (-4.0 * blur * blur)) * (left > 0.0 ? left : 0.0);
         }
@@ -190,8 +190,8 @@ void sigma_factors(
     }
 }
 
-/* Set `out` to the factors of the sigmas of corners beside those of their boards, `typical` (boards): 1 but for corners beside
- * which there is more than noise (reference.correlation.uneven_factors). */
+/* Set `out` to the factors of the sigmas of corners relative to those of their boards, `typical` (boards): 1 except for corners
+ * with other residuals than noise in their windows (reference.correlation.uneven_factors). */
 void uneven_factors(
     const double *products, const double *pairs, const double *noise, const double *pixels, const double *sides, const double *blur,
     const double *used, const uint8_t *good, const int64_t *owner, int64_t count, int64_t boards, const double *typical,

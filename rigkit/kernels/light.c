@@ -1,29 +1,29 @@
-/* Steps of the light in the windows of corners, one after the other: the edges of shadows. The definition in numpy is in
+/* Steps of the light, such as edges of shadows, in the windows of corners. The definition in numpy is in
  * tests/kernels/reference/light.py, the numbers are in rigkit.detection.subpixel.shadows.
  *
- * The board is a + b S1 S2, as in edges.c; the light goes from 1 to what is left of it across a straight edge, which has a
- * direction, a place and a width. */
+ * The board's brightness is a + b S1 S2, as in edges.c, times the light, which changes from 1 to the value LEFT across a straight
+ * edge with a direction, a position and a width. */
 #include "kernels.h"
 
 enum { X, Y, T1, T2, S, A, B, TOWARDS, PLACE, WIDTH, LEFT, UNKNOWNS };
-_Static_assert((int)UNKNOWNS == (int)LIGHT_UNKNOWNS, "both sides count alike");
+_Static_assert((int)UNKNOWNS == (int)LIGHT_UNKNOWNS, "api_fits.h has the same number of unknowns");
 
-/* Places of an edge, and the strips beside and between them. */
+/* Tested positions of an edge, and the strips between them. */
 enum { PLACES = 2 * LIGHT_LATERAL + 1, STRIPS = PLACES + 1 };
 /* Sums over pixels, of products of 1, the pattern E and the brightness I. */
 enum { ONE, E, EE, I, EI, II, SUMS };
-/* Pixels are dealt with so many at a time; their rows are the derivatives and what is left. */
+/* Pixels that are processed at a time; their rows are the derivatives and the residuals. */
 enum { BLOCK = LIGHT_BLOCK, ROWS = UNKNOWNS + 1 };
-/* Further from an edge than this, in its widths, it is all one brightness. */
+/* Distance from an edge, in its widths, beyond which the brightness is constant. */
 static const float FAR = 12.0f;
-/* Of Levenberg and Marquardt: at first, and how it changes. */
+/* Initial damping of Levenberg-Marquardt, its factors after better and after worse steps, and the ridge of the normal equations. */
 static const double DAMPING = 1e-3, LESS = 0.3, MORE = 5.0, RIDGE = 1e-6;
-/* Pixels so little beyond an edge, px, are on it. */
+/* Pixels beyond an edge by less than this, px, are on it. */
 static const double ON_EDGE = 1e-9;
-/* Of what is rounded to whole grey levels. */
+/* Variance of rounding to integer grey levels. */
 static const double ROUNDED = 1.0 / 12.0;
 
-/* The pixels of a window, from its centre: arrays of their places, brightness and pattern. */
+/* The pixels of a window: positions relative to its centre, brightness and pattern. */
 typedef struct {
     double *u, *v, *value, *pattern, centre[2];
     int64_t count;
@@ -45,7 +45,7 @@ INLINE double edge_at(double z)
     return (double)edge[0];
 }
 
-/* Gather the pixels that the cell of a corner at `start` has near its lines. */
+/* Gather the pixels in the cell of a corner at `start` that are near its lines. */
 INLINE void gather(
     const void *grey, int64_t bytes, int64_t width, int64_t height, const double start[2], const double sides[4], double lateral,
     double blur, const light_rules_t *rules, lit_t *out)
@@ -79,7 +79,8 @@ INLINE void gather(
         out->u[n] = out->v[n] = out->value[n] = out->pattern[n] = 0.0;
 }
 
-/* Return level and contrast of values = level + contrast * pattern, and the squares that are left, from sums. */
+/* Return level and contrast of the least-squares fit values = level + contrast * pattern, and its sum of squared residuals, from
+ * sums over pixels. */
 INLINE plain_t plain_of(const double sums[SUMS])
 {
     const double det = sums[ONE] * sums[EE] - sums[E] * sums[E];
@@ -90,7 +91,7 @@ INLINE plain_t plain_of(const double sums[SUMS])
     return (plain_t){level, contrast, sums[II] - level * sums[I] - contrast * sums[EI]};
 }
 
-/* Set `sums` to those over the pixels up to each of the places of an edge whose dark side is towards (c, s). */
+/* Set `sums` to those over the pixels before each position of an edge, whose dark side is in the direction (c, s). */
 INLINE void strip_sums(const lit_t *lit, double c, double s, double sums[STRIPS][SUMS])
 {
     memset(sums, 0, STRIPS * SUMS * sizeof(double));
@@ -106,8 +107,8 @@ INLINE void strip_sums(const lit_t *lit, double c, double s, double sums[STRIPS]
             sums[strip][k] += sums[strip - 1][k];
 }
 
-/* Set direction, place, levels and light of `x` to those of the sharp step that explains the window best; return whether
- * there is one. For each direction the two sides are fitted apart. */
+/* Set direction, position, brightness and light of `x` to those of the sharp step with the smallest sum of squared residuals, by
+ * exhaustive search with separate fits of both sides; return whether there is one. */
 INLINE int seek_step(const lit_t *lit, const light_rules_t *rules, double x[UNKNOWNS])
 {
     double best = INFINITY, sums[STRIPS][SUMS], dark[SUMS];
@@ -135,14 +136,13 @@ INLINE int seek_step(const lit_t *lit, const light_rules_t *rules, double x[UNKN
     return best < INFINITY;
 }
 
-/* An edge at the pixels of a block: how far beyond it they are, in its widths; -1 to 1 across it, and its slope there; how
- * the former changes with the four that place the edge. */
+/* An edge at the pixels of a block: their distances beyond it in its widths, the step from -1 to 1 and its slope there, and the
+ * derivatives of the distances by the four parameters of the edge. */
 typedef struct {
     double z[BLOCK], side[BLOCK], slope[BLOCK], by[4][BLOCK];
 } edge_block_t;
 
-/* Set what is across an edge. The limits have a loop of their own: as branches they would keep the other from being
- * vectorised. */
+/* Set step and slope of an edge. The clipping has a loop of its own: otherwise it becomes branches, which prevent vectorisation. */
 INLINE void set_sides(edge_block_t *edge)
 {
     float z[BLOCK];
@@ -158,7 +158,8 @@ INLINE void set_sides(edge_block_t *edge)
     }
 }
 
-/* Set `out` to a line of the board through (x, y) at an angle that bends: by x, y, the angle, the log of its blur. */
+/* Set `out` to a curved line of the board through (x, y) at an angle, with derivatives by x, y, the angle, and the log of its
+ * blur. */
 INLINE void line_block(
     const double *restrict us, const double *restrict vs, double x, double y, double angle, double bend, double per_blur,
     edge_block_t *restrict out)
@@ -176,7 +177,7 @@ INLINE void line_block(
     set_sides(out);
 }
 
-/* The same of the edge of the light: by minus its direction, minus its place, minus the log of its width. */
+/* The same for the edge of the light, with derivatives by minus its direction, minus its position, minus the log of its width. */
 INLINE void shadow_block(const double *restrict us, const double *restrict vs, const double x[UNKNOWNS], edge_block_t *restrict out)
 {
     const double c = cos(x[TOWARDS]), s = sin(x[TOWARDS]), place = x[PLACE], per_width = exp(-x[WIDTH]);
@@ -190,7 +191,7 @@ INLINE void shadow_block(const double *restrict us, const double *restrict vs, c
     set_sides(out);
 }
 
-/* Set the rows of a block of pixels that begins with `start`; those beyond the last pixel are 0. */
+/* Set the rows of the block of pixels that begins at `start`, 0 beyond the last pixel. */
 INLINE void block_rows(const lit_t *lit, int64_t start, const double x[UNKNOWNS], const double bend[2], double rows[ROWS][BLOCK])
 {
     const double per_blur = exp(-x[S]), lost = 1.0 - x[LEFT], level = x[A], contrast = x[B];
@@ -243,8 +244,8 @@ INLINE void linearise(const lit_t *lit, const double x[UNKNOWNS], const double b
     out->squares = sums[UNKNOWNS * ROWS + UNKNOWNS];
 }
 
-/* Add to the equations at `x` what was known at `start`; return the variance of a pixel. */
-INLINE double with_known(
+/* Add the prior around `start` to the equations at `x`; return the variance of a pixel. */
+INLINE double add_prior(
     const lit_t *lit, const double x[UNKNOWNS], const double start[UNKNOWNS], const light_rules_t *rules, equations_t *all)
 {
     const double lines = 1.0 / (rules->line_sigma * rules->line_sigma);
@@ -262,7 +263,8 @@ INLINE double with_known(
     return variance;
 }
 
-/* Fit corner and step together from `x`; return the variance of a pixel, and in `N` the factor of the equations, or -1. */
+/* Fit corner and step jointly from `x`, and set `N` to the factor of the normal equations; return the variance of a pixel, or -1 if
+ * they are singular. */
 INLINE double fit_together(
     const lit_t *lit, const double bend[2], const light_rules_t *rules, const double *max_step, double x[UNKNOWNS],
     double N[UNKNOWNS * UNKNOWNS])
@@ -274,7 +276,7 @@ INLINE double fit_together(
     for (int64_t k = 0; k < rules->iterations; k++) {
         double tried[UNKNOWNS];
         all = now;
-        with_known(lit, x, start, rules, &all);
+        add_prior(lit, x, start, rules, &all);
         for (int i = 0; i < UNKNOWNS; i++)
             all.N[i * UNKNOWNS + i] *= 1.0 + damping;
         damping *= MORE;
@@ -294,13 +296,13 @@ INLINE double fit_together(
         now = fresh;
         memcpy(x, tried, sizeof tried);
     }
-    const double variance = with_known(lit, x, start, rules, &now);
+    const double variance = add_prior(lit, x, start, rules, &now);
     memcpy(N, now.N, sizeof now.N);
     return cholesky(N, UNKNOWNS) ? variance : -1.0;
 }
 
-/* Return whether opposite squares at a corner differ by more than the part `uneven` of its contrast, where they are looked
- * at `parts` places along the lines and `off` beside them, in sides of the cell. */
+/* Return whether opposite squares at a corner differ by more than `uneven` times its contrast, at any of `parts` distances along
+ * the lines, `off` from these, in sides of the cell. */
 static int uneven_at(
     const void *grey, int64_t bytes, int64_t width, int64_t height, const double pixel[2], const double side[4],
     const double *along, int64_t parts, const double off[2], double uneven)
@@ -311,7 +313,7 @@ static int uneven_at(
         for (int line = 0; line < 2; line++) {
             double values[2][2];
             for (int n = 0; n < 4; n++) {
-                /* What is mirrored at the corner has the same colour. */
+                /* A point reflected at the corner has the same colour. */
                 const double mirror = n % 2 ? -1.0 : 1.0, beside = (n < 2 ? -mirror : mirror) * off[1 - line];
                 const double x = mirror * along[k], *one = side + 2 * line, *other = side + 2 * (1 - line);
                 const double u = pixel[0] + x * one[0] + beside * other[0], v = pixel[1] + x * one[1] + beside * other[1];
@@ -329,6 +331,7 @@ static int uneven_at(
     return seen;
 }
 
+/* Set `out` for the corners whose opposite squares differ. */
 void lit_unevenly(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
     const double *lateral, const uint8_t *ends, const double *along, int64_t parts, double max_lateral, double min_px,
@@ -341,7 +344,7 @@ void lit_unevenly(
             off[line] = fmin(max_lateral, lateral[n] / fmax(length[line], 1e-9));
             nearest = fmin(nearest, off[line] * length[line]);
         }
-        /* Where the board may end, only the nearest places are looked at. */
+        /* At corners where the board may end only the nearest distance is used. */
         out[n] = nearest > min_px
             && uneven_at(grey, bytes, width, height, pixels + 2 * n, side, along, ends[n] ? 1 : parts, off, uneven);
     }

@@ -2,7 +2,7 @@
  * purpose and the constants are in rigkit.detection.subpixel.outer_squares. */
 #include "kernels.h"
 
-/* The board's own corners and what was fitted there, as `find_paper` is given them. */
+/* The corners of the boards and the results of their fits: the arguments of `find_paper`. */
 typedef struct {
     const double *pixels, *sides, *gaps, *contrast, *blur, *sign;
     const uint8_t *ends;
@@ -158,8 +158,8 @@ static void read_end(
     end->found = at <= (double)count - 1.0 && fabs(end->bright) < rules->max_paper;
 }
 
-/* Set `paper` and `out_gaps` of `count` corners as defined in `outer_squares.with_paper`. `scratch` has room for 4 numbers
- * a corner and 2 a step, `ends_scratch` for all ends, `near` for their numbers. */
+/* Set `paper` and `out_gaps` of `count` corners as defined in `outer_squares.with_paper`. `scratch` has room for 4 numbers per
+ * corner and 2 per step, `memory` for all ends, `near` for their indices. */
 void find_paper(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
     const double *gaps, const uint8_t *ends, const double *contrast, const double *blur, const double *sign, const int64_t *owner,

@@ -1,11 +1,12 @@
-/* The smooth map from a board's plane to an image: a perspective, and polynomials for what that leaves.
+/* The smooth map from a board's plane to an image: a homography, and polynomials for its residuals.
  *
  * The definitions in numpy are in tests/kernels/reference/surface.py, the numbers in rigkit.detection.tags. */
 #include "kernels.h"
 
 enum { ENTRIES = 9, SWEEPS = 12 };
 
-/* Set `least` to the eigenvector of the smallest eigenvalue of the symmetric A (Jacobi's rotations). */
+/* Set `least` to the eigenvector of the smallest eigenvalue of the symmetric A (cyclic Jacobi: Golub and Van Loan, "Matrix
+ * Computations", section 8.5). */
 static void min_eigenvector(double A[ENTRIES][ENTRIES], double least[ENTRIES])
 {
     double V[ENTRIES][ENTRIES] = {{0.0}};
@@ -67,6 +68,7 @@ static void centred(const double *points, int64_t count, double middle[2], doubl
     *size = *size > 1e-9 ? *size : 1e-9;
 }
 
+/* Set the columns SEEN to GAIN of `out` from the homography at each place. */
 void project_places(const double *places, int64_t count, const double *homography, double *out)
 {
     const double *h = homography;
@@ -83,6 +85,9 @@ void project_places(const double *places, int64_t count, const double *homograph
     }
 }
 
+/* Set `out` to the homography from `places` to `pixels` (normalised direct linear transformation: Hartley and Zisserman, "Multiple
+ * View Geometry", algorithm 4.2), scaled to depth 1 at the mean place; return the smallest depth of the places, -infinity if one
+ * is not finite. */
 FOR_EACH_PROCESSOR double fit_perspective(const double *places, const double *pixels, int64_t count, double *out)
 {
     double from[2], to[2], from_size, to_size, A[ENTRIES][ENTRIES] = {{0.0}}, own[ENTRIES];
@@ -120,7 +125,7 @@ FOR_EACH_PROCESSOR double fit_perspective(const double *places, const double *pi
     return least;
 }
 
-/* Powers 0 to SURFACE_DEGREE of x. */
+/* Set `powers` to the powers 0 to SURFACE_DEGREE of x. */
 INLINE void powers_of(double x, double powers[SURFACE_DEGREE + 1])
 {
     powers[0] = 1.0;
@@ -128,7 +133,7 @@ INLINE void powers_of(double x, double powers[SURFACE_DEGREE + 1])
         powers[k] = powers[k - 1] * x;
 }
 
-/* Set `row` to the terms x^i y^j of each degree in turn, x's power falling. */
+/* Set `row` to the terms x^i y^j by increasing degree, within a degree by decreasing power of x. */
 INLINE void terms_at(double x, double y, int64_t terms, double *row)
 {
     double px[SURFACE_DEGREE + 1], py[SURFACE_DEGREE + 1];
@@ -141,11 +146,12 @@ INLINE void terms_at(double x, double y, int64_t terms, double *row)
 
 #define TERMS_TO(degree) (((degree) + 1) * ((degree) + 2) / 2)
 
-/* A column that is another's sum but for so small a part of its length says nothing. */
+/* A column whose part orthogonal to the others is smaller than this, relative to its length, depends linearly on them. */
 #define SAME_COLUMN 1e-9
 
-/* Make column `k` of the `basis` orthogonal to those before it and of length 1, or 0 where they say the same (Gram and
- * Schmidt, modified: monomials up to degree 8 stay orthogonal to 1e-10), and take its share of the values, `left`. */
+/* Make column `k` of the `basis` orthogonal to the previous ones and of length 1, or 0 if it depends on them (modified
+ * Gram-Schmidt: monomials up to degree 8 stay orthogonal to 1e-10), and subtract its part from the residuals `left`; `gain` sums
+ * up the leverages. */
 FOR_EACH_PROCESSOR static void add_column(
     double *basis, int64_t count, int64_t terms, int64_t k, double *triangle, double *basis_values, double *left, double *gain)
 {
@@ -187,7 +193,7 @@ FOR_EACH_PROCESSOR static void add_column(
     }
 }
 
-/* Set `columns` to the terms of a degree at all places; `powers` of x, then of y, hold those of the degrees before. */
+/* Set `columns` to the terms of a degree at all places; `powers`, of x, then of y, hold those of the lower degrees. */
 INLINE void terms_of_degree(
     const double *places, int64_t count, const double unit[3], int64_t degree, double *powers, double *columns)
 {
@@ -205,6 +211,10 @@ INLINE void terms_of_degree(
     }
 }
 
+/* Fit polynomials of increasing degree to `values`, as long as leave-one-out errors decrease; return the degree with the smallest
+ * median error. `unit` gets the centre and scale of the places, `misses` the median leave-one-out error of each degree, infinite
+ * for those not fitted, `off` and `gain` the leave-one-out errors of the best degree and the standard deviations of its predictions
+ * for values of standard deviation 1, `scatter` the median error in these terms. */
 FOR_EACH_PROCESSOR int64_t fit_polynomials(
     const double *places, const double *values, int64_t count, int64_t terms, double max_leverage, double *basis, double *scratch,
     double *unit, double *triangle, double *basis_values, double *misses, double *off, double *gain, double *scatter)
@@ -228,7 +238,7 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
     int64_t best = 0;
     for (int64_t degree = 0, k = 0; degree <= SURFACE_DEGREE; degree++) {
         misses[degree] = INFINITY;
-        /* What a perspective leaves of a lens begins with degree 3; one that is the same all around has odd terms alone. */
+        /* The residuals of a homography due to a lens begin with degree 3; those of a symmetric lens have odd degrees only. */
         if (TERMS_TO(degree) > terms || degree > (best > 3 ? best + 2 : 5))
             continue;
         terms_of_degree(places, count, unit, degree, scratch + 5 * count, basis + k * count);
@@ -256,8 +266,8 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
     return best;
 }
 
-/* Fit the perspective that takes `places` nearest to `pixels`, and polynomials through what it leaves; return as
- * `fit_polynomials`, or -1 where a place is nearer than `nearest` in it. `rest` (count, 2) is scratch. */
+/* Fit the homography from `places` to `pixels` and polynomials to its residuals; return as `fit_polynomials`, or -1 if the depth of
+ * a place is not above `nearest`. `rest` (count, 2) is scratch. */
 int64_t fit_map(
     const double *places, const double *pixels, int64_t count, int64_t terms, double max_leverage, double nearest, double *rest,
     double *basis, double *scratch, double *homography, double *unit, double *triangle, double *basis_values, double *misses,
@@ -275,7 +285,8 @@ int64_t fit_map(
         places, rest, count, terms, max_leverage, basis, scratch, unit, triangle, basis_values, misses, off, gain, scatter);
 }
 
-/* Set `out` to the values at a place whose terms are `row`, by the degree that is surest there, and to their gain. */
+/* Set `out` to the values at a place with the terms `row`, from the degree with the smallest predicted error there, and their
+ * gain. */
 static void most_certain_values(
     const double *row, int64_t terms, const double *triangle, const double *basis_values, const double *misses, double out[3])
 {
@@ -301,7 +312,7 @@ static void most_certain_values(
     }
 }
 
-/* Set the curvatures and heights of a place whose derivatives are known. */
+/* Set the curvatures and heights of a place from its derivatives. */
 INLINE void line_shapes(double *row)
 {
     const double *x = row + SIDES, *y = x + 2, area = fabs(x[0] * y[1] - y[0] * x[1]);
@@ -315,6 +326,8 @@ INLINE void line_shapes(double *row)
     }
 }
 
+/* Add the polynomial of `degree`, with its derivatives, to the map `out` at the `wanted` places, and set curvatures and heights; if
+ * `most_certain`, with the values of the degree that is most certain at each place. */
 FOR_EACH_PROCESSOR void add_polynomial(
     const double *wanted, int64_t count, const double *unit, int64_t terms, int64_t degree, const double *triangle,
     const double *basis_values, const double *misses, int64_t most_certain, double *out)

@@ -45,7 +45,7 @@ double median_of_numbers(const double *values, int64_t count, int64_t step, doub
     return numbers > 0 ? quick_median(scratch, numbers) : NAN;
 }
 
-double usual_of(const tag_fit_t *fit, tag_room_t *room, int64_t column)
+double typical_of(const tag_fit_t *fit, tag_room_t *room, int64_t column)
 {
     return median_of_numbers(fit->corners + column, fit->board->count, CORNER_COLUMNS, room->ranked);
 }
@@ -75,7 +75,7 @@ void forget_corner(double *corner)
         corner[k] = NAN;
 }
 
-int64_t take_known(const tag_fit_t *fit, tag_room_t *room)
+int64_t select_known(const tag_fit_t *fit, tag_room_t *room)
 {
     uint8_t *cells = marks_of(fit, MARK_CELLS);
     for (int64_t n = 0; n < fit->board->count; n++)
@@ -129,7 +129,7 @@ void map_tag_board(const tag_fit_t *fit)
         return;
     const tag_corner_rules_t *rules = fit->rules;
     tag_room_t room = room_of(fit);
-    const int64_t count = take_known(fit, &room), wanted = (int64_t)((double)count / rules->points_a_term);
+    const int64_t count = select_known(fit, &room), wanted = (int64_t)((double)count / rules->points_a_term);
     const double *values = room.start;
     int64_t terms = terms_within(wanted), best = -1;
     if (numbers[MAP_BY_CAMERA] != 0.0) {
@@ -162,7 +162,7 @@ void map_tag_board(const tag_fit_t *fit)
     numbers[MAP_KNOWN] = 1.0;
 }
 
-void see_marked(const tag_fit_t *fit, tag_room_t *room, int64_t most_certain)
+void map_marked(const tag_fit_t *fit, tag_room_t *room, int64_t most_certain)
 {
     const double *numbers = fit->numbers;
     if (numbers[MAP_BY_CAMERA] != 0.0)
@@ -179,8 +179,8 @@ void see_marked(const tag_fit_t *fit, tag_room_t *room, int64_t most_certain)
         room->basis_values, room->misses, most_certain, room->surface);
 }
 
-/* Set, for a corner of a single tag, on which side of its lines the tag is, and how dark it is. */
-static void tell_side(const tag_fit_t *fit, tag_room_t *room, int64_t k)
+/* Set, for a corner of a single tag, on which side of its lines the tag is, and its contrast. */
+static void set_single(const tag_fit_t *fit, tag_room_t *room, int64_t k)
 {
     const tag_board_t *board = fit->board;
     const int64_t cell = (int64_t)room->cell[k];
@@ -200,32 +200,32 @@ static void tell_side(const tag_fit_t *fit, tag_room_t *room, int64_t k)
     room->contrast[k] = 0.5 * (step > fit->rules->min_contrast ? step : fit->rules->min_contrast);
 }
 
-/* Set what is known of the marked corners in addition to their start positions. */
-static void tell_marked(const tag_fit_t *fit, tag_room_t *room)
+/* Set the inputs of the fits of the selected corners other than their start positions. */
+static void set_inputs(const tag_fit_t *fit, tag_room_t *room)
 {
     for (int64_t k = 0; k < room->count; k++) {
         memcpy(fit->curvature + 2 * (int64_t)room->cell[k], room->surface + SURFACE_COLUMNS * k + CURVATURE, 2 * sizeof(double));
         room->single[2 * k] = room->single[2 * k + 1] = 0.0;
         room->contrast[k] = NAN;
         if (!fit->board->joined)
-            tell_side(fit, room, k);
+            set_single(fit, room, k);
     }
 }
 
 void fit_marked(const tag_fit_t *fit, tag_room_t *room, const edge_rules_t *rules)
 {
-    tell_marked(fit, room);
+    set_inputs(fit, room);
     fit_tag_edges(
         fit->grey, fit->bytes, fit->width, fit->height, fit->board->count, marks_of(fit, MARK_CELLS), fit->board->steps,
         fit->board->signs, room->count, room->start, room->surface, room->single, room->contrast, room->blur, fit->rules->window,
         rules, fit->windows, room->out);
 }
 
-/* Return the blur s of the marked corners, from a quick fit of a few of them. */
+/* Return the blur s of the selected corners, from a quick fit of a few of them. */
 static double quick_blur(const tag_fit_t *fit, tag_room_t *room)
 {
     const int64_t some = (int64_t)((double)room->count / fit->rules->few_corners);
-    tell_marked(fit, room);
+    set_inputs(fit, room);
     const double blur = blur_of_tags(
         fit->grey, fit->bytes, fit->width, fit->height, fit->board->count, marks_of(fit, MARK_CELLS), fit->board->steps,
         fit->board->signs, room->count, room->start, room->surface, room->single, room->contrast, some > 1 ? some : 1,
@@ -256,8 +256,8 @@ void fit_tag_board(const tag_fit_t *fit, double blur)
 {
     tag_room_t room = room_of(fit);
     map_tag_board(fit);
-    take_known(fit, &room);
-    see_marked(fit, &room, 0);
+    select_known(fit, &room);
+    map_marked(fit, &room, 0);
     uint8_t *seen = (uint8_t *)room.ranked;
     for (int64_t k = 0; k < room.count; k++) {
         double sum = 0.0;
@@ -293,8 +293,8 @@ void refit_tag_corners(const tag_fit_t *fit)
         return;
     tag_room_t room = room_of(fit);
     forget_marks(fit);
-    take_known(fit, &room);
-    see_marked(fit, &room, 0);
+    select_known(fit, &room);
+    map_marked(fit, &room, 0);
     uint8_t *bent = (uint8_t *)(room.ranked + fit->board->count);
     int64_t count = 0;
     for (int64_t k = 0; k < room.count; k++) {
@@ -319,7 +319,7 @@ void refit_tag_corners(const tag_fit_t *fit)
     }
     if (count == 0)
         return;
-    const double blur = usual_of(fit, &room, CORNER_BLUR);
+    const double blur = typical_of(fit, &room, CORNER_BLUR);
     if (2 * count > room.count) {
         fit_tag_board(fit, blur);
         return;
@@ -365,7 +365,7 @@ double tag_scatter(const tag_fit_t *fit, double factor)
 {
     tag_room_t room = room_of(fit);
     map_tag_board(fit);
-    take_known(fit, &room);
+    select_known(fit, &room);
     for (int64_t k = 0; k < room.count; k++) {
         const double sigma = fit->corners[CORNER_COLUMNS * (int64_t)room.cell[k] + CORNER_SIGMA];
         room.blur[k] = room.off[k] / (factor * sigma * hypot(1.0, room.gain[k]));
@@ -373,8 +373,8 @@ double tag_scatter(const tag_fit_t *fit, double factor)
     return median_of_numbers(room.blur, room.count, 1, room.ranked);
 }
 
-/* Set `longer` to the longer of two sides of each tag, and `height` to how far the other one's end lies from it; NaN where the tag's
- * corners are not known. */
+/* Set `longer` to the longer of two sides of each tag, and `height` to how far the other one's end lies from it; NaN where the
+ * tag's corners are not known. */
 void tag_heights(const double *pixels, int64_t rows, int64_t columns, double *longer, double *height)
 {
     for (int64_t row = 0; row + 1 < rows; row += 2)

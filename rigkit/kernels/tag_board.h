@@ -1,17 +1,17 @@
-/* What the files of the fit of boards of tags share: the room that it is done in, and what is done in tag_board.c. */
+/* Shared by the files of the fit of boards of tags: its working memory, and the functions of tag_board.c. */
 #ifndef RIGKIT_TAG_BOARD_H
 #define RIGKIT_TAG_BOARD_H
 
 #include "edges.h"
 
-/* The corners that something is done with, marked MARK_CELLS, `count` of them, one after the other: their numbers on the board and
- * places there, how the board lies at these, where their fit starts, what it is told, and its outcomes. */
+/* The `count` selected corners, those marked MARK_CELLS, in order: their indices and places on the board, the board's map there
+ * (`surface`), start positions and other inputs of their fit, and its results (`out`). */
 typedef struct {
     int64_t count;
     double *cell, *places, *start, *surface, *single, *contrast, *blur, *out;
-    /* The map: what its polynomial is, and scratch. */
+    /* The polynomial of the map, and scratch of its fit. */
     double *triangle, *basis_values, *misses, *unit, *homography, *off, *gain, *basis, *left, *rest;
-    /* Scratch, `count` twice of the board's corners. */
+    /* Scratch: twice the number of the board's corners. */
     double *ranked;
 } tag_room_t;
 
@@ -20,27 +20,29 @@ tag_room_t room_of(const tag_fit_t *fit);
 void map_tag_board(const tag_fit_t *fit);
 
 /* Mark the known corners; return their number. */
-int64_t take_known(const tag_fit_t *fit, tag_room_t *room);
+int64_t select_known(const tag_fit_t *fit, tag_room_t *room);
 
-/* Keep of the marked corners those that `keep` says, with their places, surface and start. */
+/* Keep those of the selected corners that `keep` is 1 for, with their places, surface and start; without `keep` select the corners
+ * marked MARK_CELLS. */
 void keep_marked(const tag_fit_t *fit, tag_room_t *room, const uint8_t *keep);
 
-/* Set the surface of the marked corners by the map; by the `most_certain` degree, with gains, for those beyond the known ones. */
-void see_marked(const tag_fit_t *fit, tag_room_t *room, int64_t most_certain);
+/* Set the surface of the selected corners from the map; if `most_certain`, with the polynomial's degree of the least uncertainty at
+ * each corner, and with gains, as corners beyond the known ones need. */
+void map_marked(const tag_fit_t *fit, tag_room_t *room, int64_t most_certain);
 
-/* Fit the marked corners from `start` and `blur`. */
+/* Fit the selected corners from `start` and `blur`. */
 void fit_marked(const tag_fit_t *fit, tag_room_t *room, const edge_rules_t *rules);
 
-/* Put the corner that came out as `outcome` in its place, and the corner `n` out of it. */
+/* Set a corner from the results of its fit, and to NaN. */
 void put_corner(double *corner, const double *outcome);
 void forget_corner(double *corner);
 
 int64_t known_corners(const tag_fit_t *fit);
 
-/* Return the median of a column of the corners that are known. */
-double usual_of(const tag_fit_t *fit, tag_room_t *room, int64_t column);
+/* Return the median of a column over the known corners. */
+double typical_of(const tag_fit_t *fit, tag_room_t *room, int64_t column);
 
-/* Return the median of those of `count` values that are numbers; NaN where none is. */
+/* Return the median of `count` values without NaN; NaN if all are. */
 double median_of_numbers(const double *values, int64_t count, int64_t step, double *scratch);
 
 INLINE int is_known(const tag_fit_t *fit, int64_t n)

@@ -2,8 +2,8 @@
  * tests/kernels/reference/tag_board.py. */
 #include "kernels.h"
 
-/* Set `quads` to the corners of those squares of a lattice (rows, columns) whose row and column together are `odd`, or not, in order
- * of growing angle from u to v, and `cells` to the (column, row) of their first corner; return their number. */
+/* Set `quads` to the corners of those squares of a lattice (rows, columns) whose row and column together are `odd`, or not, in
+ * order of growing angle from u to v, and `cells` to the (column, row) of their first corner; return their number. */
 int64_t squares_of_lattice(const double *pixels, int64_t rows, int64_t columns, int64_t odd, double *quads, int64_t *cells)
 {
     int64_t count = 0;

@@ -2,7 +2,7 @@
  * tests/kernels/reference/tag_board.py, the numbers in rigkit.detection.tags.corners. */
 #include "tag_board.h"
 
-/* A corner not found at its predicted position is searched again after a corner within so many rows and columns was found: of
+/* A corner not found at its predicted position is searched again after another one is found within NEAR_NEW rows and columns: of
  * its own or of a neighbouring tag. */
 enum { NEAR_NEW = 2 };
 
@@ -15,7 +15,7 @@ static int64_t mark_missing(const tag_fit_t *fit, tag_room_t *room)
     for (int64_t n = 0; n < fit->board->count; n++)
         cells[n] = !(is_known(fit, n) || vain[n] || waiting[n]);
     keep_marked(fit, room, NULL);
-    see_marked(fit, room, 1);
+    map_marked(fit, room, 1);
     const double max_u = (double)fit->width - 1.0 - rules->margin_px, max_v = (double)fit->height - 1.0 - rules->margin_px;
     for (int64_t k = 0; k < room->count; k++) {
         const double *seen = room->surface + SURFACE_COLUMNS * k;
@@ -106,7 +106,7 @@ static uint8_t looks_of(
 /* Set `there` to which of the fitted corners agree with the map's prediction; return their number. */
 static int64_t corners_there(const tag_fit_t *fit, tag_room_t *room, double blur, uint8_t *there)
 {
-    const double contrast = usual_of(fit, room, CORNER_CONTRAST), residual = usual_of(fit, room, CORNER_RESIDUAL);
+    const double contrast = typical_of(fit, room, CORNER_CONTRAST), residual = typical_of(fit, room, CORNER_RESIDUAL);
     const int64_t count = fit->board->count;
     int64_t good = 0, coded = 0;
     uint8_t *own = there + count;
@@ -153,7 +153,7 @@ static int64_t add_round(const tag_fit_t *fit, int64_t by_this_map)
         map_tag_board(fit);
     if (mark_missing(fit, &room) == 0)
         return 0;
-    const double blur = usual_of(fit, &room, CORNER_BLUR);
+    const double blur = typical_of(fit, &room, CORNER_BLUR);
     fit_missing(fit, &room, blur);
     uint8_t *there = (uint8_t *)(room.ranked + count), *vain = marks_of(fit, MARK_VAIN), *waiting = marks_of(fit, MARK_WAITING);
     const int64_t good = corners_there(fit, &room, blur, there);
@@ -172,8 +172,8 @@ static int64_t add_round(const tag_fit_t *fit, int64_t by_this_map)
     return good;
 }
 
-/* Add missing corners in at most `rounds` rounds, each predicted by the previous one, the first by the current map; return the
- * number added. */
+/* Add missing corners in at most `rounds` rounds, predicted by the corners known before each round, or by the current map; return
+ * the number added. */
 int64_t add_tag_corners(const tag_fit_t *fit, int64_t rounds, int64_t by_this_map)
 {
     int64_t added = 0;
@@ -195,13 +195,13 @@ static int64_t drop_round(const tag_fit_t *fit)
     if (known_corners(fit) < rules->min_guiding)
         return 0;
     map_tag_board(fit);
-    take_known(fit, &room);
+    select_known(fit, &room);
     double *off = room.blur, *allowed = room.contrast;
     for (int64_t k = 0; k < room.count; k++)
         off[k] = (isnan(room.off[k]) ? 0.0 : room.off[k] < FAR ? room.off[k] : FAR) / room.gain[k];
     const double own = median_of_numbers(off, room.count, 1, room.ranked),
                  typical = own > rules->scatter_floor ? own : rules->scatter_floor;
-    const double typical_sigma = usual_of(fit, &room, CORNER_SIGMA);
+    const double typical_sigma = typical_of(fit, &room, CORNER_SIGMA);
     int seen = 0;
     for (int64_t k = 0; k < room.count; k++) {
         const double sigma = fit->corners[CORNER_COLUMNS * (int64_t)room.cell[k] + CORNER_SIGMA];
@@ -210,7 +210,7 @@ static int64_t drop_round(const tag_fit_t *fit)
     }
     if (!seen)
         return 0;
-    see_marked(fit, &room, 0);
+    map_marked(fit, &room, 0);
     double most = 0.0;
     for (int64_t k = 0; k < room.count; k++) {
         const double least = rules->displaced_cells * fit->board->spacing * lesser_height(room.surface + SURFACE_COLUMNS * k);

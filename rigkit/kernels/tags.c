@@ -1,22 +1,20 @@
-/* The fit of whole tags whose modules are known, one after the other: where their four corners are. The definition in
- * numpy is in tests/kernels/reference/tags.py, the numbers are in rigkit.detection.tags.whole.
+/* The fit of whole tags with known modules, for the positions of their four corners. The definition in numpy is in
+ * tests/kernels/reference/tags.py, the numbers are in rigkit.detection.tags.whole.
  *
- * Cells between `breaks` along both sides of a tag are ink or paper: its modules, the gap around it, what lies beyond.
- * A pixel's place in the tag is a cubic polynomial of its position, from which the four corners move the picture, each
- * by the share that it has in the bilinear interpolation of the place, and in which sides bend: by 4 x (1 - x) and
- * 4 y (1 - y) times how far their middles move. Free are these moves, those of the middles as far as they are not known,
- * the blur s, and the light (1 + g . x) (a + b S), S the share of ink. Pixels are taken in squares, for which the same
- * edges count, side by side as the compiler vectorises them. */
+ * Cells between `breaks` along both sides of a tag are ink or paper: its modules, the gap around it, and what is beyond. The
+ * place of a pixel in the tag is a cubic polynomial of its position. Moves of the four corners displace it with the weights of
+ * bilinear interpolation, moves of the middles of the sides by 4 x (1 - x) and 4 y (1 - y) times these. The parameters are the
+ * moves, those of the middles with a prior, the blur s, and the brightness (1 + g . x) (a + b S) with S the share of ink. Pixels
+ * are processed in squares, which are near the same edges and vectorised. */
 #include "kernels.h"
 
 enum { SHARES = 6, BENDS = 8, MOVES = 2 * SHARES, S = MOVES, A, B, GX, GY, PARAMETERS };
 enum { ORDERS = 4, MAX_CELLS = 32, SIDE = TAG_SIDE, BLOCK = SIDE * SIDE, AT_ONCE = 4, LANES = 16 };
 _Static_assert(4 * LANES == BLOCK * AT_ONCE, "products are taken in four parts");
 
-/* To the compiler so many numbers side by side, of any alignment. */
 typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
 
-/* Edges further away, in s, are as far as this: `decay` has nothing for more than 12.6. */
+/* Distances from edges are clipped to this, in s: `decay` is defined up to 12.6. */
 #define FURTHEST 12.0f
 
 typedef struct {
@@ -26,25 +24,26 @@ typedef struct {
     int64_t cells;
 } tag_t;
 
-/* Pixels of a square: positions from the centre, brightness, shares, and 0 for those that do not count. */
+/* The pixels of a square: positions relative to the centre, brightness, weights of the moves, and 0 in `counts` for those not
+ * used. */
 typedef struct {
     float u[BLOCK], v[BLOCK], value[BLOCK], counts[BLOCK], share[SHARES][BLOCK];
 } tag_block_t;
 _Static_assert(sizeof(tag_block_t) <= TAG_BLOCK * sizeof(double), "scratch holds the pixels");
 
-/* Places (x, y) in the tag, and how they grow along u and v. */
+/* Places (x, y) in the tag, and their derivatives by u and v. */
 typedef struct {
     float at[2][BLOCK], grow[2][2][BLOCK];
 } tag_place_t;
 
-/* The edges between the cells from `first` on along one side: shares of the pixels beyond them, and their derivatives
- * along d / s. */
+/* The edges between `count` cells from `first` on along one side: shares of the pixels beyond them, and their derivatives by the
+ * distance over s. */
 typedef struct {
     float part[MAX_CELLS][ORDERS][BLOCK];
     int64_t first, count;
 } profile_t;
 
-/* The share of ink of pixels, its gradient and its derivative by the blur. */
+/* The share of ink in pixels, its gradient, and its derivative by the blur. */
 typedef struct {
     float of[BLOCK], gradient[2][BLOCK], by_blur[BLOCK];
 } share_t;
@@ -68,7 +67,7 @@ INLINE void tag_place(const tag_t *tag, const float *restrict du, const float *r
     }
 }
 
-/* Set `out` to the profiles at `place`, where a px is `slope` along the side, 1 / `per_slope`. */
+/* Set `out` to the profiles at `place`, a coordinate in the tag with a gradient of `slope` per px; `per_slope` is 1 / slope. */
 INLINE void profile_of(
     const tag_t *tag, const float *restrict place, const float *restrict slope, const float *restrict per_slope,
     const float *restrict kurtosis, const tag_rules_t *rules, profile_t *restrict out)
@@ -104,8 +103,9 @@ INLINE void profile_of(
     }
 }
 
-/* Add to `sums`, by orders along x and y as far as the series below has them, what the cells of one row have more than those
- * of the row before it, `before`, beyond the edge `beyond` between the two; without such a row nothing lies before it. */
+/* Add to `sums`, for the orders along x and y that the series below uses, the difference between the cells of one row and of the
+ * row `before` it, times the share `beyond` the edge between them; for the first row there is no edge, and the difference is to
+ * 0. */
 INLINE void add_row(
     const profile_t *along, const uint8_t *ink, const uint8_t *before, const float (*restrict beyond)[BLOCK],
     float (*restrict sums)[ORDERS][BLOCK])
@@ -133,7 +133,7 @@ INLINE void add_row(
                 sums[order][other][i] += row[order][i] * (beyond ? beyond[other][i] : other ? 0.0f : 1.0f);
 }
 
-/* Set `out` to the share of ink of pixels at (u, v) from the centre (reference.tags.picture). */
+/* Set `out` to the share of ink in the pixels at (u, v) from the centre (reference.tags.picture). */
 INLINE void share_of_ink(const tag_t *tag, const float *u, const float *v, const tag_rules_t *rules, share_t *restrict out)
 {
     tag_place_t here;
@@ -159,7 +159,7 @@ INLINE void share_of_ink(const tag_t *tag, const float *u, const float *v, const
     for (int64_t j = 0; j <= along[1].count; j++, before = ink, ink += tag->cells)
         add_row(along, ink, before, j ? (const float (*)[BLOCK])along[1].part[j - 1] : NULL, sums);
     for (int i = 0; i < BLOCK; i++) {
-        /* Blur along the two normals is correlated: Mehler's series, as in edges_model.c. */
+        /* The blurs along the two normals are correlated: Mehler's series, as in edges_model.c. */
         const float rho = n[0][0][i] * n[1][0][i] + n[0][1][i] * n[1][1][i], half = 0.5f * rho * rho;
         const float by_x = per_s * (sums[1][0][i] + rho * sums[2][1][i] + half * sums[3][2][i]);
         const float by_y = per_s * (sums[0][1][i] + rho * sums[1][2][i] + half * sums[2][3][i]);
@@ -170,8 +170,8 @@ INLINE void share_of_ink(const tag_t *tag, const float *u, const float *v, const
     }
 }
 
-/* Set `pixels` to those of the square whose first is at (u, v), and what lies in the tag, or up to `reach` of its side
- * beside it, to count; return how many. */
+/* Set `pixels` to the square with its first pixel at (u, v); pixels in the tag or within `reach` sides of it count. Return their
+ * number. */
 INLINE int64_t block_pixels(
     const tag_t *tag, const void *grey, int64_t bytes, int64_t width, int64_t height, double reach, int64_t u, int64_t v,
     tag_block_t *restrict pixels)
@@ -191,7 +191,7 @@ INLINE int64_t block_pixels(
     float count = 0.0f;
     for (int i = 0; i < BLOCK; i++) {
         const float x = here.at[0][i], y = here.at[1][i];
-        /* Where the polynomial has turned over it shows the tag once more, mirrored. */
+        /* A negative area means that the polynomial has folded, where it would show the tag again, mirrored. */
         const float area = here.grow[0][0][i] * here.grow[1][1][i] - here.grow[0][1][i] * here.grow[1][0][i];
         pixels->counts[i] *= ((x >= low) & (x <= high) & (y >= low) & (y <= high) & (area > 0.0f)) ? 1.0f : 0.0f;
         const float share[SHARES] = {(1.0f - x) * (1.0f - y), x * (1.0f - y),       (1.0f - x) * y, x * y,
@@ -203,8 +203,8 @@ INLINE int64_t block_pixels(
     return (int64_t)count;
 }
 
-/* Gather the squares of pixels in and around the tag, at most `capacity`; return how many, and set `seen` to how many pixels
- * count. */
+/* Gather at most `capacity` squares of pixels in and around the tag; return their number, and set `seen` to the number of pixels
+ * that count. */
 FOR_EACH_PROCESSOR
 static int64_t tag_pixels(
     const tag_t *tag, const void *grey, int64_t bytes, int64_t width, int64_t height, double reach, tag_block_t *blocks,
@@ -230,8 +230,8 @@ static int64_t tag_pixels(
     return count;
 }
 
-/* Set `rows`, from the pixel `first` of each on, to the derivatives of the residuals of the pixels of a square by every
- * parameter, and to these. */
+/* Set `rows`, from pixel `first` on, to the derivatives of the brightness of a square's pixels by every parameter, and to the
+ * residuals. */
 INLINE void block_rows(
     const tag_t *tag, const tag_block_t *pixels, const tag_rules_t *rules, int64_t first, float (*restrict rows)[AT_ONCE * BLOCK])
 {
@@ -266,7 +266,7 @@ INLINE void block_rows(
     }
 }
 
-/* Fill the normal equations; return the sum of squared residuals. */
+/* Set the normal equations; return the sum of squared residuals. */
 FOR_EACH_PROCESSOR
 static double tag_equations(
     const tag_t *tag, const tag_block_t *blocks, int64_t count, const tag_rules_t *rules, double N[PARAMETERS * PARAMETERS],
@@ -303,7 +303,7 @@ static double tag_equations(
     return products[PARAMETERS];
 }
 
-/* Add what is known of the `curvatures` and of the light beforehand, at noise of this `variance`. */
+/* Add the priors of the moves of the sides' middles and of the gradient of the light, for noise of this `variance`. */
 static void add_prior(
     const tag_t *tag, double curvature_sigma, double variance, const tag_rules_t *rules, double N[PARAMETERS * PARAMETERS],
     double step[PARAMETERS])
@@ -319,7 +319,7 @@ static void add_prior(
     }
 }
 
-/* Take a step, cut where the model is not linear; return the largest of the moves that it wants. */
+/* Move the parameters by a step, clipped where the model is not linear; return the largest move before clipping. */
 static double take_step(tag_t *tag, const double step[PARAMETERS], const tag_rules_t *rules)
 {
     double largest = 0.0;
@@ -336,7 +336,7 @@ static double take_step(tag_t *tag, const double step[PARAMETERS], const tag_rul
     return largest;
 }
 
-/* Write the fitted tag with `N`, the normal equations' factor. */
+/* Write the results of a fitted tag; `N` is the factor of the normal equations. */
 static void write_tag(const tag_t *tag, const double *N, double variance, double *result)
 {
     memcpy(result, tag->moves, BENDS * sizeof(double));
@@ -356,6 +356,7 @@ static void write_tag(const tag_t *tag, const double *N, double variance, double
     result[BENDS + 7] = 1.0;
 }
 
+/* Fit `count` tags by Gauss-Newton steps (reference.tags). */
 void fit_tags(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *maps, const double *centres,
     const double *scales, const uint8_t *ink, int64_t cells, const double *breaks, double reach, const double *blur,
@@ -387,7 +388,7 @@ void fit_tags(
             if (!cholesky(N, PARAMETERS))
                 break;
             cholesky_solve(N, PARAMETERS, step);
-            /* Corners may be right before the light is: what is left then is no noise, and says nothing of sigmas. */
+            /* The corners may converge before the light, when residuals are not yet noise and sigmas would be wrong. */
             double taken = 0.0;
             for (int i = 0; i < PARAMETERS; i++)
                 taken += step[i] * right[i];
