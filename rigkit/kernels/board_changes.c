@@ -1,14 +1,14 @@
-/* How the picture of a whole chessboard changes as the nodes of its corners move: shares of nodes in places, changes node
- * by node in boxes, and their products. boards.c draws the picture; checks are in tests/kernels/test_boards.py. */
+/* The derivatives of the image of a whole chessboard by the nodes of its corners: the weights of nodes at places, derivatives node
+ * by node in boxes of pixels, and their products. boards.c draws the image; checks are in tests/kernels/test_boards.py. */
 #include "kernels.h"
 
 enum { TAPS = 4, LANES = 16 };
 
-/* The third derivative of a cubic that is 1 at a node and 0 at all others, as the spline through the nodes nearly is. */
+/* -a of the cubic convolution kernel (Keys 1981), which approximates the spline that is 1 at a node and 0 at all others. */
 #define CARDINAL 0.75
 
-/* Set `out` to how much of each of TAPS nodes from the one returned there is at `at`, in nodes: a cubic between them, or a
- * straight line. Beyond the first and the last ones, so far as `most`, they go on as these three, or two, do. */
+/* Set `out` to the interpolation weights, cubic or linear, of TAPS nodes at the position `at`, and return the first of these nodes.
+ * Beyond the first and last node, up to a distance of `most`, the values are extrapolated from the outer three, or two. */
 INLINE int64_t node_shares(double at, int64_t count, double most, int cubic, float out[TAPS])
 {
     const double highest = (double)(count - 1) + most;
@@ -46,6 +46,8 @@ INLINE int64_t node_shares(double at, int64_t count, double most, int cubic, flo
     return first;
 }
 
+/* Set `nodes` and `weights` of the places of all pixels, and `boxes` to the pixels in which each node has a weight, with a margin;
+ * empty boxes have no pixels (right -1). */
 void board_shares(
     const double *places, int64_t width, int64_t height, int64_t rows, int64_t columns, double spacing, double most, int64_t cubic,
     int64_t margin, int32_t *nodes, float *weights, int64_t *boxes)
@@ -92,7 +94,7 @@ void board_shares(
     }
 }
 
-/* Set `out` to how much of node (i, j) there is in the box's pixels, row by row. */
+/* Set `out` to the weights of node (i, j) in the pixels of the box, row by row. */
 INLINE void shares(
     const int32_t *nodes, const float *weights, int64_t width, const int64_t box[4], int64_t i, int64_t j, float *out)
 {
@@ -104,6 +106,7 @@ INLINE void shares(
         }
 }
 
+/* Set `out` to `count` sets of node values interpolated at the pixels. */
 void board_values(
     const int32_t *nodes, const float *weights, int64_t width, int64_t height, int64_t rows, int64_t columns, const double *values,
     int64_t count, float *out)
@@ -122,7 +125,7 @@ void board_values(
     }
 }
 
-/* Blur `wide` x `high` values of `from` into `to`, nothing beyond. */
+/* Blur `wide` x `high` values of `from` into `to`; values outside are 0. */
 FOR_EACH_PROCESSOR
 static void blur_box(const float *from, int64_t wide, int64_t high, const float *taps, int64_t radius, float *between, float *to)
 {
@@ -149,6 +152,8 @@ static void blur_box(const float *from, int64_t wide, int64_t high, const float 
     }
 }
 
+/* Set the derivatives of the image by both coordinates of each node, in its box: minus its weight times the gradient, blurred with
+ * `taps` and multiplied by the pixels' `weight`. */
 void move_blocks(
     const int32_t *nodes, const float *weights, int64_t width, int64_t height, int64_t rows, int64_t columns, const float *gradient,
     const float *weight, const float *taps, int64_t radius, const int64_t *boxes, const int64_t *starts, int64_t room,
@@ -179,6 +184,7 @@ void move_blocks(
     }
 }
 
+/* Set `wide_by` blocks for each node, in its box: its weight times each of the `planes`. */
 void share_blocks(
     const int32_t *nodes, const float *weights, int64_t width, int64_t height, int64_t rows, int64_t columns, const float *planes,
     int64_t wide_by, const int64_t *boxes, const int64_t *starts, int64_t room, float *scratch, int64_t size, float *data)
@@ -200,7 +206,7 @@ void share_blocks(
     (void)room;
 }
 
-/* Return the sum of the products of `high` rows of `wide` values that begin `next_a` and `next_b` apart. */
+/* Return the sum of the products of two boxes of `high` rows of `wide` values, with the row strides `next_a` and `next_b`. */
 INLINE double box_product(const float *a, int64_t next_a, const float *b, int64_t next_b, int64_t wide, int64_t high)
 {
     float sums[LANES] = {0.0f};
@@ -220,6 +226,7 @@ INLINE double box_product(const float *a, int64_t next_a, const float *b, int64_
     return total;
 }
 
+/* Set `N` and `right` to the products of all blocks with each other and with the residuals `rest`. */
 FOR_EACH_PROCESSOR
 void block_products(
     const int64_t *boxes, const int64_t *starts, const int64_t *wide_by, const int64_t *first, int64_t count, int64_t size,

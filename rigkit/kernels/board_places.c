@@ -1,30 +1,30 @@
-/* Where on a chessboard pixels lie, in squares from its first corner: its map to the image is a cubic spline. What it is for
- * and the numbers are in rigkit.detection.subpixel.whole_board, checks against closed forms in tests/kernels/test_boards.py. */
+/* The places of pixels on a chessboard, in squares from its first corner, with a cubic spline as its map to the image. Purpose and
+ * constants are in rigkit.detection.subpixel.whole_board, checks against closed forms in tests/kernels/test_boards.py. */
 #include "kernels.h"
 #include "boards.h"
 
 enum { TAPS = 4, NEWTON_STEPS = 8, LANES = 4, GROUPS = 16 };
 
-/* A step of Newton's method from so near, in px, is the last: it ends within 1e-8 px. */
+/* Residual, px, from which a Newton step is the last: it ends within 1e-8 px. */
 #define PLACED_PX 1e-3
 
-/* Places are sought so far from the middle of a square, squares. */
+/* Largest distance of a searched place from the centre of a square, squares, along each axis. */
 #define BEYOND 1.5
 
-/* So far from that they are sought at all where those of the pixel above tell it. */
+/* The same for the place predicted from the pixel above, beyond which a pixel is not searched. */
 #define NEAR_BY 0.75
 
-/* The least area of a square, px^2, that a step divides by. */
+/* Smallest area of a square, px^2, that a step divides by. */
 #define MIN_SCALE 1e-9
 
-/* One beyond another by less than this, in squares, lies in the same square. */
+/* Places outside a square by less than this, squares, are in it. */
 #define SQUARE_SLACK 1e-9
 
-/* Values and slopes of the four parts of a uniform cubic B-spline between two nodes, by powers of how far between. */
+/* Coefficients, by powers of the position between two nodes, of the four basis functions of a uniform cubic B-spline. */
 static const double SPLINE[TAPS][TAPS] = {
     {1.0 / 6.0, -0.5, 0.5, -1.0 / 6.0}, {4.0 / 6.0, 0.0, -1.0, 0.5}, {1.0 / 6.0, 0.5, 0.5, -0.5}, {0.0, 0.0, 0.0, 1.0 / 6.0}};
 
-/* Where the places of a square are seen, along u and v, by powers of y and of x, and how that grows with x. */
+/* The map of a square to u and v: coefficients by powers of y and of x, and those of its derivative by x. */
 typedef struct {
     double value[2][TAPS][TAPS], slope[2][TAPS][TAPS - 1];
 } square_t;
@@ -49,7 +49,7 @@ INLINE void read_square(const double *first, int64_t stride, square_t *out)
     }
 }
 
-/* Set `at` to where (x, y) of the square is seen, and `grow` to how that grows: numbers or lanes of them. */
+/* Set `at` to the pixel of (x, y) in the square, and `grow` to its derivatives; for numbers or vectors of them. */
 #define SEEN_AT(square, x, y, at, grow) \
     _Pragma("GCC unroll 2") for (int axis = 0; axis < 2; axis++) \
     { \
@@ -68,21 +68,21 @@ INLINE void read_square(const double *first, int64_t stride, square_t *out)
 typedef double lanes_t __attribute__((vector_size(8 * LANES)));
 typedef int64_t mask_t __attribute__((vector_size(8 * LANES)));
 
-/* Of numbers or lanes: one or the other; x, at most `most` from 0. Functions of lanes are called in other ways by every
- * processor. */
+/* Select `one` where `mask` is set, else `other`; clip x to -most ... most; the absolute value of x. Macros, as the calling
+ * convention of functions of vectors depends on the instruction set. */
 #define CHOSEN(mask, one, other) ((lanes_t)(((mask_t)(one) & (mask)) | ((mask_t)(other) & ~(mask))))
 #define LIMIT(x, most) \
     x = CHOSEN(x > (most), (lanes_t){0.0} + (most), x); \
     x = CHOSEN(x < -(most), (lanes_t){0.0} - (most), x)
 #define SIZE(x) CHOSEN((x) < 0.0, -(x), x)
 
-/* Places in a square, how they grow with v, which pixels (u, v) are sought there, and how far off these is what is seen. */
+/* Places in a square, their derivatives by v, the pixels (u, v) whose places are searched, and the residuals of their maps. */
 typedef struct {
     lanes_t x, y, x_down, y_down, u, off;
     double v;
 } found_t;
 
-/* Take the places one step of Newton's method nearer to those sought. */
+/* Move the places by a step of Newton's method. */
 INLINE void step_places(const square_t *square, found_t *found)
 {
     lanes_t at[2], grow[2][2];
@@ -96,7 +96,7 @@ INLINE void step_places(const square_t *square, found_t *found)
     LIMIT(y, 1.0);
     x += found->x - 0.5;
     y += found->y - 0.5;
-    /* Beyond its square a cubic is another one's. */
+    /* Far outside its square the cubic is not that of the map. */
     LIMIT(x, BEYOND);
     LIMIT(y, BEYOND);
     found->x = 0.5 + x;
@@ -125,7 +125,7 @@ INLINE int in_square(const found_t *found, int k)
     return found->off[k] < PLACED_PX && fabs(x - 0.5) <= 0.5 + SQUARE_SLACK && fabs(y - 0.5) <= 0.5 + SQUARE_SLACK;
 }
 
-/* Set the `places` of `count` pixels of a row, of those in no square before, that are in the square at (column, row). */
+/* Set the `places` of those of `count` pixels of a row that are in the square at (column, row) and have no place yet. */
 INLINE void fill_lanes(const square_t *square, found_t *found, double v, int64_t count, double column, double row, double *places)
 {
     const lanes_t x = found->x - 0.5, y = found->y - 0.5;
@@ -142,18 +142,18 @@ INLINE void fill_lanes(const square_t *square, found_t *found, double v, int64_t
                 places[2 * k + 1] = row + found->y[k];
             }
     }
-    /* A pixel below it lies nearly where a straight map has it. */
+    /* The linear prediction for the pixels below. */
     found->x += found->x_down;
     found->y += found->y_down;
 }
 
-/* Set the `places` in the square at (column, row) that are seen in a box of the picture and in no square before. */
+/* Set the `places` in the square at (column, row) of the pixels in a box of the image that have none yet. */
 FOR_EACH_PROCESSOR
 static void fill_box(
     const square_t *square, const int64_t box[4], int64_t left, int64_t top, int64_t width, double column, double row,
     double *places)
 {
-    /* Row by row, as they lie in memory. */
+    /* Row by row, in the order of the memory. */
     for (int64_t start = box[0]; start <= box[2]; start += LANES * GROUPS) {
         const int64_t pixels = box[2] - start + 1 < LANES * GROUPS ? box[2] - start + 1 : LANES * GROUPS;
         found_t across[GROUPS] = {0};
@@ -193,7 +193,7 @@ void board_places(
                     high[axis] = at[axis] > high[axis] ? at[axis] : high[axis];
                 }
             }
-            /* Its sides may be bent. */
+            /* A margin for curved sides. */
             const double more_u = around * (high[0] - low[0]), more_v = around * (high[1] - low[1]);
             double from_u = ceil(low[0] - more_u) - (double)left, to_u = floor(high[0] + more_u) - (double)left;
             double from_v = ceil(low[1] - more_v) - (double)top, to_v = floor(high[1] + more_v) - (double)top;

@@ -1,28 +1,28 @@
-/* The picture of a whole chessboard, and how it changes as its places move. What it is for and the numbers are in
+/* The rendered image of a whole chessboard, and its derivatives by the places of its pixels. Purpose and constants are in
  * rigkit.detection.subpixel.whole_board, checks against closed forms in tests/kernels/test_boards.py.
  *
- * Places on the board, in squares from its first corner, are a cubic spline of the board's corners. The picture is drawn
- * sharp, by the distances to the lines that are near, and blurred as a picture; so are its changes. */
+ * Places on the board, in squares from its first corner, are a cubic spline of the board's corners. The image is drawn sharp, from
+ * the distances to the nearest lines, and blurred afterwards; so are its derivatives. */
 #include "kernels.h"
 #include "boards.h"
 
 enum { ORDERS = 4 };
 
-/* Edges of a sharp picture are looked at so far away, standard deviations of its blur. */
+/* Largest distance of the edges that are drawn, in standard deviations of the blur. */
 #define NEAR_SIGMAS 6.0
 
-/* How the picture changes along one side of the board: the squares, what lies before the first line and beyond the last,
- * and derivatives along the distance over the blur; the lines where the board ends, per square; the normal, per px. */
+/* The image along one axis of the board, with its derivatives by the distance over the blur: the squares, and the shares of the
+ * paper before the first and beyond the last line; the densities of the edges at both ends, per square; the unit normal in px. */
 typedef struct {
     double squares[ORDERS], before[ORDERS], beyond[ORDERS], ends[2], normal[2];
 } along_t;
 
-/* How places grow at a pixel: px a square, and how lines are bent and turn. */
+/* The map at a pixel: px per square, and its second derivatives along the normal and along the line. */
 typedef struct {
     double per, bend, turn;
 } growth_t;
 
-/* Add `part` times the edge at `line` to `into`, and return its density per square. */
+/* Add `part` times the edge at `line` to `into`; return its density per square. */
 INLINE double add_line(double place, double line, const growth_t *grow, double sharp, double part, double into[ORDERS])
 {
     const double straight = (place - line) * grow->per;
@@ -32,7 +32,7 @@ INLINE double add_line(double place, double line, const growth_t *grow, double s
         into[0] += part;
         return 0.0;
     }
-    /* The distance from what bends, and is bent; a blurred arc lies inside the arc. */
+    /* The distance to second order; a blurred arc is shifted to its inside. */
     const double away = straight - 0.5 * grow->bend * straight * straight + 0.5 * grow->turn * sharp * sharp;
     float edge[5];
     blurred_edge((float)limited(away / sharp, NEAR_SIGMAS), 0.0f, edge);
@@ -42,8 +42,8 @@ INLINE double add_line(double place, double line, const growth_t *grow, double s
     return 0.5 * (double)edge[1] * grow->per / sharp;
 }
 
-/* Set `out` to the picture along one axis at the place `at`; how far on its neighbours before and after it are, along u and
- * along v, is in `next`. */
+/* Set `out` to the image along one axis at the place `at`; `next` are the offsets of its neighbours before and after, along u and
+ * along v. */
 INLINE void look_along(const double *at, const int64_t next[2][2], int64_t lines, const double ends[2], double sharp, along_t *out)
 {
     for (int order = 0; order < ORDERS; order++)
@@ -55,7 +55,7 @@ INLINE void look_along(const double *at, const int64_t next[2][2], int64_t lines
     double slope = sqrt(gu * gu + gv * gv);
     const double far = NEAR_SIGMAS * sharp * slope, nearest = nearest_line(place, lines);
     if (fabs(place - nearest) > far && fabs(place - ends[0]) > far && fabs(place - ends[1]) > far) {
-        /* Most places are far from any line. */
+        /* Most places are far from all lines. */
         const double low = place > ends[0] ? 1.0 : 0.0, high = place > ends[1] ? 1.0 : 0.0;
         const int64_t passed = (int64_t)nearest + (place > nearest);
         out->squares[0] = low + last * high - (passed % 2 ? 2.0 : 0.0);
@@ -81,7 +81,7 @@ INLINE void look_along(const double *at, const int64_t next[2][2], int64_t lines
         out->before[order] = (order ? 0.0 : 1.0) - low[order];
         out->beyond[order] = high[order];
     }
-    /* Of the lines only those near change with the place: all before add -2 and 2 in turn, those beyond nothing. */
+    /* Only near lines depend on the place: the previous ones add -2 and 2 in turn, the following ones nothing. */
     const double reach = (NEAR_SIGMAS * sharp + 1.0) * slope;
     const int64_t first = place > reach ? (int64_t)limited(place - reach, (double)lines) : 0;
     out->squares[0] -= first % 2 ? 2.0 : 0.0;
@@ -89,7 +89,8 @@ INLINE void look_along(const double *at, const int64_t next[2][2], int64_t lines
         add_line(place, (double)line, &grow, sharp, line % 2 ? 2.0 : -2.0, out->squares);
 }
 
-/* The product of both directions, and its derivatives along them: blur along two normals is correlated (edges_model.c). */
+/* Add `part` times the product of both axes and its derivatives along them; the blurs along the two normals are correlated
+ * (Mehler's series, see edges_model.c). */
 INLINE void multiply(const double a[ORDERS], const double b[ORDERS], double rho, double part, double out[3])
 {
     out[0] += part * (a[0] * b[0] + rho * (a[1] * b[1] + rho * (0.5 * a[2] * b[2] + rho / 6.0 * a[3] * b[3])));
@@ -97,7 +98,7 @@ INLINE void multiply(const double a[ORDERS], const double b[ORDERS], double rho,
     out[2] += part * (a[0] * b[1] + rho * (a[1] * b[2] + 0.5 * rho * a[2] * b[3]));
 }
 
-/* As `board_picture`. */
+/* As `board_picture`, with a constant number of planes. */
 INLINE void draw(
     const double *places, int64_t width, int64_t height, int64_t rows, int64_t columns, const double *ends, const double *paper,
     double sharp, const int64_t planes, float *out)
@@ -108,7 +109,7 @@ INLINE void draw(
         for (int64_t u = 0; u < width; u++) {
             float *to = out + v * width + u;
             const double *at = places + 2 * (v * width + u);
-            /* Both places are known, or none. */
+            /* Both coordinates of a place are known, or none. */
             const int64_t next[2][2] = {{u ? -2 : 0, u + 1 < width ? 2 : 0}, {v ? -2 * width : 0, v + 1 < height ? 2 * width : 0}};
             double known = at[next[0][0]] + at[0] + at[next[0][1]];
             for (int side = 0; side < 2; side++)
@@ -123,7 +124,7 @@ INLINE void draw(
             look_along(at, next, columns, ends, sharp, &one);
             look_along(at + 1, next, rows, ends + 2, sharp, &two);
             const double rho = one.normal[0] * two.normal[0] + one.normal[1] * two.normal[1];
-            /* Where two sides meet, half of what lies beyond is of each. */
+            /* Beyond a corner of the board both sides have half of the paper. */
             double rest1[ORDERS], rest2[ORDERS];
             for (int order = 0; order < ORDERS; order++) {
                 rest1[order] = (order ? 0.0 : 1.0) - 0.5 * (one.before[order] + one.beyond[order]);
@@ -147,7 +148,7 @@ INLINE void draw(
                 continue;
             to[area] = (float)((all[1] * one.normal[0] + all[2] * two.normal[0]) / sharp);
             to[2 * area] = (float)((all[1] * one.normal[1] + all[2] * two.normal[1]) / sharp);
-            /* An end further out: squares in place of paper. */
+            /* Moving an end outwards replaces paper by squares. */
             const double last1 = columns % 2 ? -1.0 : 1.0, last2 = rows % 2 ? -1.0 : 1.0;
             const double aside1 = 0.5 * (paper[2] * two.before[0] + paper[3] * two.beyond[0]);
             const double aside2 = 0.5 * (paper[0] * one.before[0] + paper[1] * one.beyond[0]);

@@ -1,12 +1,12 @@
-/* Rectangles with what is printed on them, painted into the sub-samples of an image's tile, and these reduced to pixels. The
- * definitions in numpy are in tests/kernels/reference/painting.py, their meaning in rigkit.synthetic.raycast.
+/* Printed rectangles, painted into the sub-samples of a tile of an image, and the reduction of these to pixels. The definitions in
+ * numpy are in tests/kernels/reference/painting.py, their meaning in rigkit.synthetic.raycast.
  *
- * A cell, that is a sub-sample's share of a pixel, is a parallelogram to a coordinate of the plane: the sum of two boxes, one
- * from its side along u and one from that along v. Only so do the shares of an edge's two sides add up, whatever its direction. */
+ * A cell is the area of a sub-sample. Seen along a coordinate of the plane it is the convolution of two boxes, the extents of its
+ * sides along u and along v, so that the shares on both sides of an edge sum up to 1 for every direction of the edge. */
 #include "places.h"
 
-/* Return the share of a cell beyond an edge less 1/2, from its middle's distance from it: the integral of a trapezoid, which
- * rises over the narrow box, is flat, and falls over the narrow box. */
+/* Return the share of a cell on the positive side of an edge minus 1/2, from the signed distance of its centre: the integral of a
+ * trapezoid that rises over the narrow box, is constant, and falls over the narrow box. */
 INLINE float beyond(float distance, float wide, float narrow)
 {
     const float far = fabsf(distance), reach = 0.5f * (wide + narrow);
@@ -16,15 +16,16 @@ INLINE float beyond(float distance, float wide, float narrow)
     return copysignf(share, distance);
 }
 
-/* Return the share of a cell with low <= place <= high. */
+/* Return the share of a cell between low and high. */
 INLINE float inside(float place, float low, float high, float wide, float narrow)
 {
     const float upper = high - place, lower = place - low;
     return beyond(upper < lower ? upper : lower, wide, narrow) + 0.5f;
 }
 
-/* Set, averaged over a cell, the indicator of -1 <= place <= count, and return the wave within it: +1 on [0, 1), it changes sign
- * at every inner corner 0 .. count - 1. A cell is narrower than a square, so it meets one edge at most. */
+/* Set `within` to the mean over a cell of the indicator of -1 <= place <= count, and return that of the wave within it, which is +1
+ * on [0, 1) and changes its sign at every inner corner 0 .. count - 1. A cell is narrower than a square: it contains at most one
+ * edge. */
 INLINE float wave_of(float place, int64_t count, float wide, float narrow, float *within)
 {
     *within = inside(place, -1.0f, (float)count, wide, narrow);
@@ -36,7 +37,7 @@ INLINE float wave_of(float place, int64_t count, float wide, float narrow, float
     return place<-0.5f ? -*within : place>(float) count - 0.5f ? last * *within : wave;
 }
 
-/* Lay sheet and squares over the sub-samples of pixel (row, column) of the box. */
+/* Paint sheet and squares into the sub-samples of pixel (row, column) of the box. */
 INLINE void paint_pixel(
     float *restrict fine, int64_t stride, const places_t *places, const surface_t *surface, int64_t row, int64_t column)
 {
@@ -63,8 +64,8 @@ INLINE void paint_pixel(
     }
 }
 
-/* Return whether no edge of sheet and squares is within reach of a coordinate's sub-samples in a pixel; then `*within` says
- * whether they are on the sheet, `*wave` what the squares' wave is there, 0 beyond. */
+/* Return whether no edge of the sheet or its squares along coordinate k crosses a cell of the pixel; then `within` is 1 on the
+ * sheet and 0 outside, `wave` the wave of the squares, 0 beyond them. */
 INLINE int is_even(
     const places_t *places, const surface_t *surface, int k, int64_t pixel, int64_t count, float *within, float *wave)
 {
@@ -87,7 +88,7 @@ INLINE int is_even(
     return 1;
 }
 
-/* Lay the rectangle and its squares over the box. */
+/* Paint the rectangle and its squares into the box. */
 INLINE void paint_sheet(float *fine, int64_t stride, const places_t *places, const surface_t *surface)
 {
     const int64_t per_pixel = places->per_pixel, across = places->box.columns / per_pixel, down = places->box.rows / per_pixel;
@@ -136,7 +137,7 @@ INLINE void add_rectangle(float *fine, int64_t stride, const places_t *places, c
     }
 }
 
-/* Set the range of the box's pixels in x and y, with the farthest reach of a cell. */
+/* Set the range of x and y over the cells of the box. */
 static void set_range(const places_t *places, float low[2], float high[2])
 {
     const int64_t pixels = places->box.columns / places->per_pixel * (places->box.rows / places->per_pixel);
@@ -150,7 +151,7 @@ static void set_range(const places_t *places, float low[2], float high[2])
     }
 }
 
-/* Blacken the marks, which touch but do not overlap. */
+/* Paint the black marks, which may touch but do not overlap. */
 INLINE void paint_marks(float *fine, int64_t stride, const places_t *places, const surface_t *surface)
 {
     float low[2], high[2];
@@ -163,7 +164,7 @@ INLINE void paint_marks(float *fine, int64_t stride, const places_t *places, con
     }
 }
 
-/* Return by how much a coordinate changes to the next sub-sample down or across, mm, at most two squares. */
+/* Return the change of a coordinate from one sub-sample to the next, mm, clipped to MAX_CELL squares. */
 INLINE float side_of(const float *value, int64_t k, int64_t count, int64_t stride, float square_mm)
 {
     const float slope = k == 0 ? value[stride] - value[0]
@@ -172,7 +173,7 @@ INLINE float side_of(const float *value, int64_t k, int64_t count, int64_t strid
     return (slope < -MAX_CELL ? -MAX_CELL : slope > MAX_CELL ? MAX_CELL : slope) * square_mm;
 }
 
-/* Return the share of a sub-sample's cell inside of a disc (x, y, radius in mm), whose edge is taken as straight within it. */
+/* Return the share of a sub-sample's cell inside a disc (x, y, radius in mm), with its edge approximated by its tangent. */
 INLINE float share_of_disc(const places_t *places, const surface_t *surface, const double *disc, int64_t v, int64_t u)
 {
     const int64_t columns = places->box.columns, rows = places->box.rows;
@@ -193,7 +194,7 @@ INLINE float share_of_disc(const places_t *places, const surface_t *surface, con
     return beyond((float)disc[2] - distance, one > other ? one : other, one > other ? other : one) + 0.5f;
 }
 
-/* Paint the discs, which do not overlap, on their ground. `covered` has room for the shares of the box's sub-samples. */
+/* Paint the discs, which do not overlap, on their ground. `covered` is scratch for the shares of the box's sub-samples. */
 INLINE void paint_discs(float *fine, int64_t stride, const places_t *places, const surface_t *surface, float *covered)
 {
     const int64_t per_pixel = places->per_pixel, columns = places->box.columns, rows = places->box.rows;
@@ -217,7 +218,7 @@ INLINE void paint_discs(float *fine, int64_t stride, const places_t *places, con
         for (int64_t pixel = 0; seen && pixel < pixels; pixel++) {
             double reach_mm = 0.0;
             int near = 1;
-            /* Towards a disc a cell reaches at most as far as along x and y together; it changes within a pixel. */
+            /* An upper bound of a cell's extent towards the disc: the sum of those along x and y. */
             for (int k = 0; k < 2; k++)
                 reach_mm += scale[k] * (double)(places->wide[k][pixel] + places->narrow[k][pixel]);
             for (int k = 0; k < 2; k++) {
@@ -240,7 +241,7 @@ INLINE void paint_discs(float *fine, int64_t stride, const places_t *places, con
             fine[v * stride + u] += change * covered[v * columns + u];
 }
 
-/* Lay a rectangle and its pattern over the sub-samples of a tile; return 0 where memory is short, else 1. */
+/* Paint a rectangle with its pattern into the sub-samples of a tile; return 0 if there is no memory, else 1. */
 EXPORT FOR_EACH_PROCESSOR int64_t paint_surface(float *fine, const tile_t *tile, const surface_t *surface)
 {
     const int64_t per_pixel = tile->per_pixel, height = tile->rows / per_pixel, width = tile->columns / per_pixel;
@@ -276,7 +277,7 @@ EXPORT FOR_EACH_PROCESSOR int64_t paint_surface(float *fine, const tile_t *tile,
     return 1;
 }
 
-/* Return how much of the tile the rectangle may cover, NOT_COVERED, PARTLY or WHOLLY; errs towards a part. */
+/* Return whether the rectangle covers the tile: NOT_COVERED, COVERED_WHOLLY, or COVERED_PARTLY also where this is uncertain. */
 EXPORT int64_t tile_cover(const tile_t *tile, const surface_t *surface)
 {
     if (tile->ray_rows)
@@ -299,7 +300,7 @@ EXPORT int64_t tile_cover(const tile_t *tile, const surface_t *surface)
         return in_front ? COVERED_PARTLY : NOT_COVERED;
     int wholly = 1;
     for (int k = 0; k < 2; k++) {
-        /* The nodes stop short of the tile's border; half the range more is ample. */
+        /* The nodes do not reach the tile's border; half their range is a generous margin. */
         const double pad = 0.5 * (high[k] - low[k]), begin = surface->ends[k], end = surface->ends[2 + k];
         if (!(high[k] + pad >= begin && low[k] - pad <= end))
             return NOT_COVERED;

@@ -1,4 +1,5 @@
-/* Where the sub-samples of a tile meet a plane, for painting.c: polynomials where the lens is smooth, ray by ray at its rim. */
+/* The intersections of the rays of a tile's sub-samples with a plane, for painting.c: interpolated where the lens is smooth, ray
+ * by ray at its rim. */
 #ifndef RIGKIT_PLACES_H
 #define RIGKIT_PLACES_H
 
@@ -6,28 +7,31 @@
 
 /* Board coordinate of rays that miss a board's plane. */
 #define FAR_SQUARES 1e4
-/* Depth ratio over a tile above which x and y are interpolated themselves: the error is below 6 ** -TILE_NODES = 1e-7. */
+/* Ratio of the smallest to the largest depth of a tile above which x and y on the plane are interpolated, not the rays: the error
+ * is below 6 ** -TILE_NODES = 1e-7. */
 #define SMOOTH_DEPTH_RATIO 0.5
-/* Least depth of what is in front. */
+/* Smallest depth of points in front of the camera. */
 #define MIN_DEPTH 1e-9
-/* A cell's side, in squares or panel sides: shorter is none; longer, the plane is seen edge on and differences mean nothing. */
+/* Range of a cell's side, in squares or panel sides: it must not be 0, and a longer one means that the plane is seen edge-on, so
+ * that differences between sub-samples are no derivatives. */
 #define MIN_CELL 1e-6f
 #define MAX_CELL 2.0f
 
-/* A part of a tile, in sub-samples: its first row and column, and its size. */
+/* A rectangle of a tile's sub-samples: its first row and column, and its size. */
 typedef struct {
     int64_t top, left, rows, columns;
 } box_t;
 
-/* Where the sub-samples of a box meet the plane, and in each of its pixels (`columns` / per_pixel in a row) the longer and the
- * shorter side of the cells, the least and the most of the sub-samples; of x and of y. */
+/* The coordinates x and y on the plane of the sub-samples of a box (`axes`), and for each of its pixels (`columns` / per_pixel in
+ * a row) the longer and the shorter side of the cells and the smallest and largest coordinate of the sub-samples. */
 typedef struct {
     box_t box;
     int64_t per_pixel;
     float *axes[2], *wide[2], *narrow[2], *least[2], *most[2];
 } places_t;
 
-/* Return the values (TILE_NODES, TILE_NODES) of x, y and perhaps depth that are interpolated: how many of them. */
+/* Set the values at the nodes that are interpolated: x and y on the plane, or x, y and depth before the division; return the number
+ * of these. */
 static int set_node_values(const tile_t *tile, const double *matrix, double values[3][TILE_NODES * TILE_NODES])
 {
     double nearest = INFINITY, farthest = -INFINITY;
@@ -47,7 +51,7 @@ static int set_node_values(const tile_t *tile, const double *matrix, double valu
     return 2;
 }
 
-/* Set x and y of one row of sub-samples, every `step`th from `left` on, `count` of them. */
+/* Set x and y on the plane of `count` sub-samples of one row, every `step`-th from `left` on. */
 INLINE void set_row(
     const tile_t *tile, const double *matrix, const double values[3][TILE_NODES * TILE_NODES], int terms, int64_t row, int64_t left,
     int64_t step, int64_t count, double *restrict x, double *restrict y, double *restrict depth)
@@ -86,7 +90,7 @@ INLINE void set_row(
     }
 }
 
-/* Return the difference of `values` along an axis of `count`, at `k`: between its neighbours, at the ends to the only one. */
+/* Return the derivative by index k of `count` > 1 values: the central difference, one-sided at the ends. */
 INLINE double difference(const double *value, int64_t k, int64_t count, int64_t stride)
 {
     if (k == 0)
@@ -94,8 +98,8 @@ INLINE double difference(const double *value, int64_t k, int64_t count, int64_t 
     return k == count - 1 ? value[0] - value[-stride] : 0.5 * (value[stride] - value[-stride]);
 }
 
-/* Set the sub-samples that can meet the rectangle, in whole pixels with one more around; return whether there are any. `coarse`:
- * where the first sub-sample of every pixel meets the plane, (2, height, width). */
+/* Set `box` to the pixels whose sub-samples can be on the rectangle, with a margin of one pixel; return whether there are any.
+ * `coarse` (2, height, width) are x and y of the first sub-sample of every pixel. */
 static int set_box(const double *coarse, int64_t height, int64_t width, const surface_t *surface, int64_t per_pixel, box_t *box)
 {
     int64_t top = height, bottom = -1, left = width, right = -1;
@@ -105,7 +109,7 @@ static int set_box(const double *coarse, int64_t height, int64_t width, const su
             for (int k = 0; k < 2; k++) {
                 const double *at = coarse + (k * height + v) * width + u;
                 const double down = difference(at, v, height, width), across = difference(at, u, width, 1);
-                /* A rectangle narrower than a pixel falls between the corners: look a pixel further along each axis. */
+                /* A rectangle narrower than a pixel may lie between the samples: search a pixel further along each axis. */
                 const double step = sqrt(down * down + across * across);
                 near &= *at >= surface->ends[k] - step && *at <= surface->ends[2 + k] + step;
             }
@@ -126,7 +130,7 @@ static int set_box(const double *coarse, int64_t height, int64_t width, const su
     return 1;
 }
 
-/* Set the sides of the cells of each pixel of the box, from where the first sub-samples of all pixels are. */
+/* Set the sides of the cells of each pixel of the box from `coarse`. */
 static void set_cells(const double *coarse, int64_t height, int64_t width, const places_t *places)
 {
     const int64_t across = places->box.columns / places->per_pixel, down = places->box.rows / places->per_pixel;
@@ -145,7 +149,7 @@ static void set_cells(const double *coarse, int64_t height, int64_t width, const
             }
 }
 
-/* Set where all sub-samples of the box meet the plane, and the least and the most of each pixel's. */
+/* Set x and y of all sub-samples of the box, and their smallest and largest values in each pixel. */
 INLINE void set_axes(const tile_t *tile, const double *matrix, const places_t *places, double *memory)
 {
     const int64_t columns = places->box.columns, per_pixel = places->per_pixel, across = columns / per_pixel;
