@@ -1,4 +1,4 @@
-/* Which points lie close to each other. */
+/* Pairs of points that are close to each other. */
 #include "kernels.h"
 
 static int are_close(const double *one, const double *other, int64_t axes, double reach)
@@ -9,6 +9,8 @@ static int are_close(const double *one, const double *other, int64_t axes, doubl
     return 1;
 }
 
+/* List in `pairs` the pairs (i, j) of points that differ by at most `reach` along every axis, with j in one of the two ranges of
+ * `ends` of i; return their number, which may exceed `capacity`: then only so many are listed. */
 EXPORT int64_t
 close_pairs(const double *points, int64_t count, int64_t axes, double reach, const int64_t *ends, int64_t *pairs, int64_t capacity)
 {

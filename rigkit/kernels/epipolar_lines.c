@@ -1,7 +1,8 @@
-/* What the epipolar geometry of two cameras of any kind says of a pair of patches: where in image 2, and how turned. */
+/* Epipolar constraints on the position and the affinity of a pair of patches, for two cameras of any kind (Raposo and
+ * Barreto, "Theory and practice of structure-from-motion using affine correspondences", 2016). */
 #include "patch_samples.h"
 
-/* Return the ray of image 2 at a pixel, and its derivatives by the pixel (a row each of three); 0 outside the field. */
+/* Set the ray of image 2 at a pixel, by cubic convolution, and its derivatives by u and v; return 0 outside the field of view. */
 INLINE int ray_at(const epipolar_t *g, double u, double v, double ray[3], double by_u[3], double by_v[3])
 {
     const double x = u / g->spacing, y = v / g->spacing;
@@ -37,8 +38,8 @@ INLINE int ray_at(const epipolar_t *g, double u, double v, double ray[3], double
     return isfinite(ray[0]) && isfinite(ray[1]) && isfinite(ray[2]);
 }
 
-/* Say how far a pair is from its epipolar line in image 2, and how its affinity is from one that agrees with the lines:
- * normal n2 of the line (unit), distance, and n2^T A + n1 / |n2|. Return 0 where there is no line. */
+/* Set the unit normal n2 of a pair's epipolar line in image 2, its distance from the line, px, and the residual of its affinity,
+ * n2^T A + n1 / |n2|; return 0 if there is no line. */
 FOR_EACH_PROCESSOR int miss(const line_t *line, const place_t *at, double n2[2], double *distance, double off[2])
 {
     double ray[3], by_u[3], by_v[3];
@@ -64,8 +65,8 @@ FOR_EACH_PROCESSOR int miss(const line_t *line, const place_t *at, double n2[2],
     return 1;
 }
 
-/* Fill `known` with what the line says of the next step: q2 changes by -A dq, A by -A dA. Samples are `scale` pixels of
- * image 1 apart. Return 0 where there is no line. */
+/* Set `known` to the equations of the epipolar line on the next step, which changes q2 by -A dq and A by -A dA, with samples
+ * `scale` pixels of image 1 apart; return 0 if there is no line. */
 FOR_EACH_PROCESSOR int line_knowledge(const line_t *line, const place_t *at, double scale, knowledge_t *known)
 {
     double n2[2], distance, off[2];

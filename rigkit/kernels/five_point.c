@@ -1,18 +1,16 @@
-/* Essential matrices from five equations (rigkit.relative_pose.solvers.minimal).
- *
- * The numpy version takes the real solutions from the eigenvectors of a 10x10 matrix, this one from the real roots of a
- * polynomial of degree ten (Nister, "An efficient solution to the five-point relative pose problem", 2004); both solve the
- * same ten cubics. */
+/* Essential matrices from five linear equations (rigkit.relative_pose.solvers.minimal), by the real roots of a polynomial of degree
+ * ten (Nister, "An efficient solution to the five-point relative pose problem", 2004). tests/kernels/reference/minimal.py solves
+ * the same ten cubics by the eigenvectors of a 10 x 10 matrix. */
 #include "minimal.h"
 #include "roots.h"
 
-/* Roots of the polynomial lose digits on the way to it: solutions worse than this are polished. */
+/* The coefficients of the polynomial have rounding errors: solutions with a larger `violation` are polished. */
 #define EXACT 1e-11
-/* What is worse than this afterwards, far above the rounding even of double roots, was none. */
+/* Polished solutions with a larger `violation` are none; this is far above the rounding errors of double roots. */
 #define NONE 1e-6
 
-/* Eliminate the first ten columns; afterwards rows 4 to 9 hold their monomials in terms of the last ten columns. Return
- * whether that was possible. */
+/* Eliminate the first ten columns (Gauss, partial pivoting), so that rows 4 to 9 express their monomials by the last ten; return
+ * whether the pivots are not zero. */
 INLINE int eliminate(double m[CUBICS][MONOMIALS])
 {
     for (int k = 0; k < CUBICS; k++) {
@@ -49,7 +47,7 @@ INLINE void add_poly(const double *a, int degree_a, const double *b, int degree_
             out[i + j] += sign * a[i] * b[j];
 }
 
-/* Write x X + y Y + z Z + W, unit norm. */
+/* Set `E` to x X + y Y + z Z + W at unit norm. */
 INLINE void combine(const double *basis, const double place[3], double *E)
 {
     double square = 0.0;
@@ -78,7 +76,7 @@ INLINE double violation(const double *E)
     return most;
 }
 
-/* Take a Gauss-Newton step of (x, y, z) on the ten cubics. */
+/* Move (x, y, z) by a Gauss-Newton step on the ten cubics. */
 INLINE void polish(const double cubics[CUBICS][MONOMIALS], double place[3])
 {
     const double x = place[0], y = place[1], z = place[2], xx = x * x, yy = y * y, zz = z * z;
@@ -89,7 +87,7 @@ INLINE void polish(const double cubics[CUBICS][MONOMIALS], double place[3])
         {x * xx, y * yy, xx * y, x * yy, xx * z, xx, yy * z, yy, x * y * z, x * y,
          x * zz, x * z,  x,      y * zz, y * z,  y,  z * zz, zz, z,         1.0},
     };
-    /* The normal equations, and in the last column their right hand side; solved by Cramer's rule. */
+    /* The normal equations with their right-hand side in the last column, solved by Cramer's rule. */
     double gram[3][4] = {{0.0}};
     for (int c = 0; c < CUBICS; c++) {
         double sums[4] = {0.0};
@@ -105,7 +103,7 @@ INLINE void polish(const double cubics[CUBICS][MONOMIALS], double place[3])
     const double bb = a * f - c * c, bc = b * c - a * e, cc = a * d - b * b, det = a * aa + b * ab + c * ac;
     const double p = gram[0][3], q = gram[1][3], r = gram[2][3];
     const double move[3] = {aa * p + ab * q + ac * r, ab * p + bb * q + bc * r, ac * p + bc * q + cc * r};
-    /* At a double root the equations are singular and the step means nothing. */
+    /* At a double root the equations are singular and the step is not used. */
     for (int i = 0; i < 3; i++)
         if (!(det > 0.0 && fabs(move[i]) < 0.3 * det * (1.0 + fabs(x) + fabs(y) + fabs(z))))
             return;
@@ -118,7 +116,8 @@ typedef struct {
     double at[3][3][5];
 } pencil_t;
 
-/* Make them of the rows of eliminated cubics that begin with x2z, x2, y2z, y2, xyz, xy: of each pair one. */
+/* Set them from the eliminated cubics with the leading monomials x2z, x2, y2z, y2, xyz, xy: each pair gives one equation, the first
+ * minus z times the second. */
 INLINE void fill_pencil(const double cubics[CUBICS][MONOMIALS], pencil_t *out)
 {
     for (int r = 0; r < 3; r++) {
@@ -131,7 +130,7 @@ INLINE void fill_pencil(const double cubics[CUBICS][MONOMIALS], pencil_t *out)
     }
 }
 
-/* Set `p` to the determinant, its largest coefficient 1; return whether there is one. */
+/* Set `p` to the determinant of the equations, scaled so that its largest coefficient is 1; return whether it is not zero. */
 INLINE int fill_determinant(const pencil_t *pencil, double p[DEGREE + 1])
 {
     memset(p, 0, sizeof(double) * (DEGREE + 1));
@@ -152,7 +151,7 @@ INLINE int fill_determinant(const pencil_t *pencil, double p[DEGREE + 1])
     return 1;
 }
 
-/* Set `place` to the x, y, z that solve the equations at z; return whether they do so at a finite place. */
+/* Set `place` to the solution (x, y, z) of the equations at z; return whether it is finite. */
 INLINE int solve_at(const pencil_t *pencil, double z, double place[3])
 {
     double v[3][3], best[3] = {0.0}, longest = 0.0;
@@ -180,7 +179,7 @@ INLINE int solve_at(const pencil_t *pencil, double z, double place[3])
     return 1;
 }
 
-/* Write the up to ten E of five rows, 9 numbers each, unit norm, NaN for those that are missing
+/* Write up to MAX_ROOTS essential matrices of unit norm from five rows, and NaN for the others
  * (minimal.essential_from_five_rows). */
 INLINE void solve_five(const double *rows, double *out)
 {
@@ -214,7 +213,7 @@ INLINE void solve_five(const double *rows, double *out)
         out[i] = NAN;
 }
 
-/* `rows` (count, 5, 9) -> `out` (count, 10, 9). */
+/* Solve `count` problems: `rows` (count, 5, 9), `out` (count, MAX_ROOTS, 9). */
 FOR_EACH_PROCESSOR void five_rows(const double *rows, int64_t count, double *out)
 {
     for (int64_t b = 0; b < count; b++)

@@ -1,5 +1,6 @@
-/* What the five-point and the six-point problem share: the vectors that the rows leave free, and the ten cubics that make a
- * combination of them an essential matrix. Every function repeats the one of the package that its comment names. */
+/* Shared by the five-point and the six-point solver: the null space of the equations, and the ten cubic constraints on the
+ * combinations of its basis that are essential matrices (Nister, "An efficient solution to the five-point relative pose problem",
+ * 2004). Functions repeat those that their comments name. */
 #ifndef RIGKIT_MINIMAL_H
 #define RIGKIT_MINIMAL_H
 
@@ -7,15 +8,16 @@
 
 enum { CUBICS = 10, MONOMIALS = 20 };
 
-/* Places in products of polynomials in x, y, z: of degree one (x y z 1), two (x2 xy xz y2 yz z2 x y z 1) and three:
- * x3 y3 x2y xy2 x2z x2 y2z y2 xyz xy | xz2 xz x yz2 yz y z3 z2 z 1, the first ten of which are eliminated. */
+/* Indices of the monomials of products of polynomials in x, y, z. The order of degree one is x y z 1, of degree two x2 xy xz y2 yz
+ * z2 x y z 1, and of degree three x3 y3 x2y xy2 x2z x2 y2z y2 xyz xy | xz2 xz x yz2 yz y z3 z2 z 1; the first ten are
+ * eliminated. */
 static const int QUADRATIC[4][4] = {{0, 1, 2, 6}, {1, 3, 4, 7}, {2, 4, 5, 8}, {6, 7, 8, 9}};
 static const int CUBIC[10][4] = {
     {0, 2, 4, 5},     {2, 3, 8, 9},   {4, 8, 10, 11}, {3, 1, 6, 7},     {8, 6, 13, 14},
     {10, 13, 16, 17}, {5, 9, 11, 12}, {9, 7, 14, 15}, {11, 14, 17, 18}, {12, 15, 18, 19},
 };
 
-/* Add sign * a * b of degree one, and of degrees two and one. */
+/* Add sign * a * b with a and b of degree one, and a * b with a of degree two. */
 INLINE void add_product(const double *a, const double *b, double sign, double *out)
 {
 #pragma GCC unroll 4
@@ -36,7 +38,7 @@ INLINE void add_cubic(const double *a, const double *b, double *out)
     }
 }
 
-/* Fill `basis` (9 - count, 9) with orthonormal vectors perpendicular to the `count` rows: Householder reflections. */
+/* Set `basis` (9 - count, 9) to an orthonormal basis of the null space of the `count` rows, by Householder reflections. */
 INLINE void null_space(const double *rows, int count, double *basis)
 {
     double v[6][9], work[6][9];
@@ -47,7 +49,7 @@ INLINE void null_space(const double *rows, int count, double *basis)
             square += work[k][i] * work[k][i];
         const double size = sqrt(square);
         memset(v[k], 0, sizeof v[k]);
-        /* A row that says nothing; one that is not finite makes everything NaN. */
+        /* A zero row is no constraint; a row that is not finite makes the basis NaN. */
         if (size == 0.0)
             continue;
         memcpy(v[k] + k, work[k] + k, sizeof(double) * (size_t)(9 - k));
@@ -78,8 +80,8 @@ INLINE void null_space(const double *rows, int count, double *basis)
     }
 }
 
-/* Fill `out` (10, 20) with the coefficients of 2 E E^T E - tr(E E^T) E = 0 and det E = 0, E = x X + y Y + z Z + W with
- * X to W the rows of `basis` (minimal._constraint_coefficients, which finds them from values). */
+/* Set `out` (10, 20) to the coefficients of 2 E E^T E - tr(E E^T) E = 0 and det E = 0 for E = x X + y Y + z Z + W with X to W the
+ * rows of `basis` (reference.minimal._constraint_coefficients, which interpolates them). */
 INLINE void constraints(const double *basis, double out[CUBICS][MONOMIALS])
 {
     double E[3][3][4], square[3][3][10], minor[3][10];

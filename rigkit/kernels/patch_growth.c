@@ -1,7 +1,8 @@
-/* Pairs of patches grown over a surface from neighbour to neighbour, the best first. */
+/* Pairs of patches grown over a surface from neighbour to neighbour, the best first (Otto and Chau, "Region-growing algorithm for
+ * matching of terrain images", 1989). */
 #include "patches.h"
 
-/* The nodes whose neighbours are still to be tried, the best correlation on top. */
+/* A binary heap of the nodes whose neighbours are to be tried, the best correlation on top. */
 typedef struct {
     const double *out;
     int32_t *nodes;
@@ -43,7 +44,7 @@ static int32_t pop_node(heap_t *heap)
     }
 }
 
-/* Try the pair `place` at its node; return 1 and write it if it is good. */
+/* Align the pair `place` at its node; return 1 and write it if it is good. */
 INLINE int try_node(
     const pyramid_t *first, const pyramid_t *second, const epipolar_t *epipolar, const patch_rules_t *rules,
     const patch_grid_t *grid, int64_t node, patch_t *patch, place_t *place)
@@ -71,8 +72,8 @@ INLINE int try_node(
     return 1;
 }
 
-/* Grow pairs over the nodes of image 1 from `seeds` (as the starts of `align_patches`), the best first; `out` is NaN where
- * there is none. Return how many nodes have a pair. */
+/* Grow pairs over the nodes of image 1 from `seeds` (as the starts of `align_patches`), the best first; `out` is NaN at nodes
+ * without a pair. Return the number of pairs. */
 FOR_EACH_PROCESSOR int64_t grow_patches(
     const pyramid_t *first, const pyramid_t *second, const epipolar_t *epipolar, const patch_rules_t *rules,
     const patch_grid_t *grid, const double *seeds, int64_t count)
@@ -105,7 +106,7 @@ FOR_EACH_PROCESSOR int64_t grow_patches(
             push_node(&heap, (int32_t)node);
             grown++;
         }
-        /* A bad seed must not keep the surface from coming this way. */
+        /* A failed seed does not count as a try of its node. */
         grid->tries[node] = 0;
     }
     while (heap.count > 0) {

@@ -1,4 +1,5 @@
-/* Images read between pixels by cubic convolution (Catmull and Rom): the samples of a patch. */
+/* The samples of a patch, interpolated by cubic convolution (Catmull-Rom; Keys, "Cubic convolution interpolation for digital image
+ * processing", 1981, with a = -1/2). */
 #ifndef RIGKIT_PATCH_SAMPLES_H
 #define RIGKIT_PATCH_SAMPLES_H
 
@@ -6,7 +7,7 @@
 
 typedef float four_t __attribute__((vector_size(16), aligned(4)));
 
-/* Write the weights of four neighbours at the fraction t after the second (Catmull and Rom). */
+/* Write the weights of four neighbours for the fraction t from the second to the third. */
 #define CUBIC(t, w0, w1, w2, w3) \
     do { \
         (w0) = (t) * (-0.5f + (t) * (1.0f - 0.5f * (t))); \
@@ -15,7 +16,7 @@ typedef float four_t __attribute__((vector_size(16), aligned(4)));
         (w3) = (t) * (t) * (-0.5f + 0.5f * (t)); \
     } while (0)
 
-/* Read `image` at the `count` places (u, v) + A (x, y), which lie at least a pixel inside; count is a multiple of 16. */
+/* Read `image` at the `count` positions (u, v) + A (x, y), which are at least a pixel inside; count is a multiple of 16. */
 INLINE void read_samples(
     const image_t image, float u, float v, const float A[4], const float *x, const float *y, int64_t count, float *out)
 {
@@ -50,7 +51,7 @@ INLINE void read_samples(
             + (across[2][n] * sums[4 * n + 2] + across[3][n] * sums[4 * n + 3]);
 }
 
-/* Read `image` at side x side places a pixel apart, from (u, v), which lies at least a pixel inside. */
+/* Read `image` at side x side positions a pixel apart from (u, v) on, at least a pixel inside. */
 INLINE void read_square(const image_t image, float u, float v, int64_t side, float *out)
 {
     enum { MAX_LINE = MAX_SIDE + 2 };
@@ -70,6 +71,7 @@ INLINE void read_square(const image_t image, float u, float v, int64_t side, flo
                 + down[2] * lines[(j + 2) * side + i] + down[3] * lines[(j + 3) * side + i];
 }
 
+/* Return whether cubic convolution at (u, v) reads pixels at least `margin` inside the image only. */
 INLINE int is_inside(const image_t image, double u, double v, double margin)
 {
     return u >= 1.0 + margin && v >= 1.0 + margin && u < (double)image.width - 2.0 - margin

@@ -1,9 +1,9 @@
-/* Patches of two images aligned, and grown over a surface from neighbour to neighbour.
+/* The alignment of patches of two images.
  *
- * A patch of image 1 is a square of samples around q1; in image 2 it lies at A u + q2 for the offset u. Gain and offset of
- * the brightness are free. The alignment is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 Years On", 2004):
- * derivatives are those of the patch of image 1, taken once. Images are read between pixels by cubic convolution.
- * The functions in numpy that say what is computed are in tests/kernels/reference/patches.py. */
+ * A patch of image 1 is a square of samples at offsets u from q1, which correspond to A u + q2 in image 2 up to gain and offset of
+ * the brightness. The alignment is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 years on", 2004): derivatives are
+ * those of the patch of image 1, computed once. Images are interpolated by cubic convolution. The definitions in numpy are in
+ * tests/kernels/reference/patches.py. */
 #include "patch_samples.h"
 
 void make_window(const patch_rules_t *rules, patch_t *patch)
@@ -25,7 +25,7 @@ void make_window(const patch_rules_t *rules, patch_t *patch)
     }
     for (; patch->count % 16; patch->count++)
         patch->u[patch->count] = patch->v[patch->count] = patch->window[patch->count] = 0.0f;
-    /* As many samples of equal weight as the window is worth. */
+    /* The number of samples of equal weight with the same variance of the mean. */
     patch->effective = patch->total * patch->total / squares;
 }
 
@@ -38,7 +38,7 @@ INLINE double product(const float *a, const float *b, int64_t count)
     return (double)sum;
 }
 
-/* The products of six rows of samples with one. */
+/* Set `out` to the products of six rows of samples with one. */
 INLINE void six_products(float rows[UNKNOWNS][MAX_SAMPLES], const float *with, int64_t count, double out[UNKNOWNS])
 {
     float s0 = 0.0f, s1 = 0.0f, s2 = 0.0f, s3 = 0.0f, s4 = 0.0f, s5 = 0.0f;
@@ -55,7 +55,8 @@ INLINE void six_products(float rows[UNKNOWNS][MAX_SAMPLES], const float *with, i
     memcpy(out, sums, sizeof sums);
 }
 
-/* Read the patch around (u, v) of `image`; return 0 where it has too little contrast or reaches beyond the image. */
+/* Read the patch around (u, v) of `image` and prepare its alignment; return 0 if it has too little contrast or is not inside the
+ * image. */
 INLINE int take_patch(const image_t image, double u, double v, double min_contrast, patch_t *p)
 {
     const int64_t half = p->half, side = 2 * half + 1, wide = side + 2, count = p->count;
@@ -119,7 +120,7 @@ INLINE int factor(double M[UNKNOWNS][UNKNOWNS])
             for (int64_t k = 0; k < j; k++)
                 sum -= M[i][k] * M[j][k];
             if (i == j) {
-                /* Rounding of single precision: less is not known. */
+                /* Pivots below the rounding errors of single precision count as 0. */
                 if (!(sum > 1e-6 * M[i][i]))
                     return 0;
                 M[i][i] = sqrt(sum);
@@ -131,14 +132,14 @@ INLINE int factor(double M[UNKNOWNS][UNKNOWNS])
     return 1;
 }
 
-/* Say how the patch read from image 2 (`there`) agrees with that of image 1: its products with `steep` and with the patch,
- * and its own energy, free of offset. `steep` and the weighted patch sum up to nothing: an offset is no part of theirs. */
+/* Set the products of the patch of image 2 (`there`) with `steep` and with that of image 1, and its energy without offset. As
+ * `steep` and the weighted patch have a sum of 0, the offset does not affect the products. */
 INLINE void compare(patch_t *p, double sums[UNKNOWNS], double *common, double *energy)
 {
     float s0 = 0.0f, s1 = 0.0f, s2 = 0.0f, s3 = 0.0f, s4 = 0.0f, s5 = 0.0f, with = 0.0f, level = 0.0f, square = 0.0f;
 #pragma omp simd reduction(+ : s0, s1, s2, s3, s4, s5, with, level, square)
     for (int64_t n = 0; n < p->count; n++) {
-        /* Less the mean of image 1: small numbers keep their digits. */
+        /* Minus the mean of image 1, which avoids cancellation. */
         const float there = p->there[n] - p->mean, weighted = p->window[n] * there;
         s0 += p->steep[0][n] * there;
         s1 += p->steep[1][n] * there;
@@ -160,7 +161,7 @@ INLINE void compare(patch_t *p, double sums[UNKNOWNS], double *common, double *e
     *energy = (double)square - (double)level * (double)level / p->total;
 }
 
-/* Fill `matrix` and add to `step` what the line says of them; return whether there is a line. */
+/* Add the equations of the epipolar line to `matrix` and `step`; return whether there is a line. */
 INLINE int add_line(
     const line_t *line, const place_t *place, double scale1, double weight, double step[UNKNOWNS],
     double matrix[UNKNOWNS][UNKNOWNS])
@@ -178,8 +179,8 @@ INLINE int add_line(
     return 1;
 }
 
-/* Move `place` by a step: W <- W o dW^-1, that is A <- A (I + dA)^-1, q2 <- q2 - A dq with the new A. Return whether the
- * step is one that the linear model can mean. */
+/* Move `place` by a step: W <- W o dW^-1, that is A <- A (I + dA)^-1, q2 <- q2 - A dq with the new A. Return whether the step is
+ * small enough for the linear model. */
 INLINE int move_place(place_t *place, const double step[UNKNOWNS], double scale1)
 {
     const double e = 1.0 + step[0], f = step[1], g = step[2], h = 1.0 + step[3];
@@ -196,7 +197,7 @@ INLINE int move_place(place_t *place, const double step[UNKNOWNS], double scale1
     return 1;
 }
 
-/* Read the patch of `image2` at `place`; return whether all of it is inside. */
+/* Read the patch of `image2` at `place`; return whether it is inside. */
 INLINE int read_there(patch_t *p, const image_t image2, double scale1, double scale2, const place_t *place)
 {
     const double ratio = scale1 / scale2, half = (double)p->half;
@@ -210,8 +211,8 @@ INLINE int read_there(patch_t *p, const image_t image2, double scale1, double sc
     return 1;
 }
 
-/* Align the patch `p`, taken `scale1` pixels a sample around (u1, v1), with `image2` of `scale2` pixels a sample; return
- * whether it settled. */
+/* Align the patch `p`, of `scale1` pixels per sample around (u1, v1), with `image2`, of `scale2` pixels per sample; return whether
+ * it converged. */
 INLINE int align_patch(
     patch_t *p, const image_t image2, double scale1, double scale2, const patch_rules_t *rules, const line_t *line, place_t *place,
     agreement_t *out)
@@ -228,7 +229,7 @@ INLINE int align_patch(
         if (!(common > 0.0))
             return 0;
         out->correlation = common / sqrt(p->energy * energy);
-        /* What the patches differ by, beyond gain and offset, a sample; the unknowns and those two are fitted. */
+        /* The variance of the brightness residuals; the degrees of freedom are reduced by the unknowns, gain and offset. */
         out->noise = p->energy * (1.0 - out->correlation * out->correlation) / p->total;
         out->noise = out->noise * p->effective / (p->effective - UNKNOWNS - 2.0) + rules->min_noise * rules->min_noise;
         const double gain = p->energy / common;
@@ -252,15 +253,15 @@ INLINE int align_patch(
         double border = fabs(step[4]) + fabs(step[5]);
         for (int64_t n = 0; n < 4; n++)
             border += half * fabs(step[n]);
-        /* So small a step changes nothing that the patches were compared by. */
+        /* A step this small does not change the residuals. */
         if (border < rules->settled)
             return place->A[0] * place->A[3] - place->A[1] * place->A[2] > 0.0;
     }
     return 0;
 }
 
-/* Write the covariance (upper triangle) of (u2, v2, A) from the normal matrix; return the larger standard deviation of the
- * place, negative where there is none. */
+/* Write the covariance (upper triangle) of (u2, v2, A) from the normal matrix; return the standard deviation of (u2, v2) along the
+ * major axis, -1 if the matrix is singular. */
 INLINE double covariance_of(const place_t *place, double scale1, const agreement_t *found, const patch_rules_t *rules, double *out)
 {
     double L[UNKNOWNS][UNKNOWNS], spread[UNKNOWNS][UNKNOWNS], by[UNKNOWNS][UNKNOWNS];
@@ -274,7 +275,7 @@ INLINE double covariance_of(const place_t *place, double scale1, const agreement
         for (int64_t m = 0; m < UNKNOWNS; m++)
             spread[m][n] = unit[m];
     }
-    /* Of (u2, v2, a11, a12, a21, a22) by the step: -A dq and -A dA. */
+    /* Derivatives of (u2, v2, a11, a12, a21, a22) by the step: -A dq and -A dA. */
     const double *A = place->A;
     memset(by, 0, sizeof by);
     by[0][4] = -scale1 * A[0];
@@ -309,8 +310,8 @@ INLINE double covariance_of(const place_t *place, double scale1, const agreement
     return sqrt(variance * (mean + sqrt(apart * apart + full[0][1] * full[0][1])));
 }
 
-/* Align the patches around a pair as finely as its texture allows; write PATCH_COLUMNS numbers and return 1 if it is good.
- * The patch of the image that shows the surface larger is read from a coarser level: both are equally sharp. */
+/* Align the patches of a pair on the finest level that succeeds; write PATCH_COLUMNS numbers and return 1 if the result is good.
+ * The image that shows the surface larger is read from a coarser level, so that both patches are equally sharp. */
 FOR_EACH_PROCESSOR int align_pair(
     const pyramid_t *first, const pyramid_t *second, const patch_rules_t *rules, const line_t *line, patch_t *patch, place_t *place,
     double *out)
@@ -344,7 +345,7 @@ FOR_EACH_PROCESSOR int align_pair(
     return 0;
 }
 
-/* Align patches from `starts`: u1, v1, u2, v2 and the affinity row by row. What fails is NaN throughout. */
+/* Align patches from `starts`: u1, v1, u2, v2 and the affinity row by row; all columns are NaN if this fails. */
 FOR_EACH_PROCESSOR void align_patches(
     const pyramid_t *first, const pyramid_t *second, const patch_rules_t *rules, const double *starts, int64_t count, double *out)
 {

@@ -1,15 +1,17 @@
-/* What the kernels of patches share: a patch of image 1, a pair of patches, and what is done with them in which file.
- * The functions in numpy that say what is computed are in tests/kernels/reference/patches.py. */
+/* Shared by the kernels of patches: a patch of image 1, a pair of patches, and the functions of each file. The definitions in
+ * numpy are in tests/kernels/reference/patches.py. */
 #ifndef RIGKIT_PATCHES_H
 #define RIGKIT_PATCHES_H
 
 #include "kernels.h"
 
-/* Samples of a patch are filled up to whole vectors by ones without weight. */
+/* Samples of a patch are padded to a multiple of 16 by samples of weight 0. */
 enum { MAX_SIDE = 2 * MAX_HALF + 1, MAX_SAMPLES = (MAX_SIDE * MAX_SIDE + 15) / 16 * 16, UNKNOWNS = 6 };
 
-/* The window, and a patch of image 1 with what the alignment takes from it: `steep` are the derivatives by the six unknowns
- * (the rows of dA, then dq, in the frame of image 1), free of brightness's gain and offset, times the window. */
+/* The window, and a patch of image 1 with the terms of its alignment. `steep` are the steepest-descent images: the derivatives by
+ * the six unknowns (the rows of dA, then dq, in the frame of image 1), made orthogonal to gain and offset of the brightness, times
+ * the window. `total` is the sum of the window's weights, `effective` the number of samples of equal weight with the same
+ * variance of a mean. */
 typedef struct {
     int64_t half, count;
     float window[MAX_SAMPLES], u[MAX_SAMPLES], v[MAX_SAMPLES];
@@ -19,7 +21,7 @@ typedef struct {
     double total, effective, energy, normal[UNKNOWNS][UNKNOWNS];
 } patch_t;
 
-/* A pair of patches: where, and what the alignment says of it. */
+/* A pair of patches: positions and affinity, and the results of its alignment. */
 typedef struct {
     double u1, v1, u2, v2, A[4];
 } place_t;
@@ -28,12 +30,12 @@ typedef struct {
     double correlation, noise, normal[UNKNOWNS][UNKNOWNS];
 } agreement_t;
 
-/* What is known of a pair beside the images: rows on the six unknowns with what they should be, each over its sigma. */
+/* Equations on the six unknowns from the epipolar geometry: rows and right-hand sides, each over its standard deviation. */
 typedef struct {
     double rows[3][UNKNOWNS], values[3];
 } knowledge_t;
 
-/* The epipolar geometry at a node of image 1: the ray f1 of the node turned into line E f1, and E B1. */
+/* The epipolar geometry at a node of image 1: the line E f1 of its ray f1, and its derivatives E B1 by the pixel. */
 typedef struct {
     const epipolar_t *geometry;
     double line[3], by_pixel[3][2];

@@ -1,11 +1,11 @@
-/* Planes through what the nodes of a grid say of a surface, robustly: tests/kernels/reference/planes.py says what is
- * computed. Nodes side by side are fitted together, one in each lane of a vector. */
+/* Robust fits of planes to the measurements of a surface at the nodes of a grid. Adjacent nodes are fitted together, one in each
+ * lane of a vector. The definition in numpy is in tests/kernels/reference/planes.py. */
 #include "kernels.h"
 
 enum { LANES = 8, UPPER = 6, XX = 0, XY, XZ, YY, YZ, ZZ };
 
-/* What each node adds to the fit of a plane m: |z - F m|^2 in sigmas is m'N m - 2 b'm + c. Zero where it says nothing, as
- * around the grid: `reach` nodes to each side, and what fills up the last lanes. */
+/* The terms of each node in the fit of a plane m: |z - F m|^2 in sigmas is m'N m - 2 b'm + c. They are 0 for nodes without
+ * measurements, and in a margin of `reach` nodes around the grid and of the last lanes. */
 typedef struct {
     int64_t columns, size;
     double *terms;
@@ -31,7 +31,7 @@ static int make_sums(const plane_grid_t *g, sums_t *out)
             c += z[i] * Wz[i];
         }
         for (int64_t j = 0; j < 3; j++) {
-            /* Column j of W F, and that of the upper triangle of F'W F. */
+            /* Column j of W F, and of the upper triangle of F'W F. */
             double Wf[3];
             for (int64_t i = 0; i < 3; i++)
                 Wf[i] = W[3 * i] * F[j] + W[3 * i + 1] * F[3 + j] + W[3 * i + 2] * F[6 + j];
@@ -45,8 +45,8 @@ static int make_sums(const plane_grid_t *g, sums_t *out)
     return 1;
 }
 
-/* Write x with N x = b for a symmetric matrix by its upper triangle, and whether it has an inverse; scaled first, its units
- * differ by thousands. */
+/* Set x to the solution of N x = b, with N a symmetric matrix given by its upper triangle; return whether N is positive definite. N
+ * is scaled first to a unit diagonal, as the units of its rows differ by thousands. */
 INLINE int solve3(const double N[UPPER], const double b[3], double x[3])
 {
     const double s0 = 1.0 / sqrt(N[XX]), s1 = 1.0 / sqrt(N[YY]), s2 = 1.0 / sqrt(N[ZZ]);
@@ -65,8 +65,8 @@ typedef struct {
     double plane[3][LANES], sum[TERMS][LANES], own[UPPER][LANES];
 } fits_t;
 
-/* Add what the neighbours at `there` say to the sums of a round, each with the weight of its distance from the plane; in
- * the first round the node's own plane is as uncertain as its neighbours say of theirs. */
+/* Add the terms of the neighbours at `there`, weighted by their distances from the plane (Geman-McClure), to the sums of a round;
+ * in the first round the distance has the uncertainty of the node's own plane added. */
 INLINE void add_neighbours(const sums_t *sums, const double *there, const int first, double loss, fits_t *fits)
 {
 #pragma omp simd
@@ -83,7 +83,7 @@ INLINE void add_neighbours(const sums_t *sums, const double *there, const int fi
         g[2] = b[2] - (N[XZ] * x + N[YZ] * y + N[ZZ] * z);
         double square = at[TERM_C * sums->size] - (b[0] + g[0]) * x - (b[1] + g[1]) * y - (b[2] + g[2]) * z;
         if (first) {
-            /* With the plane's own covariance S: (W^-1 + F S F')^-1 = W - W F (S^-1 + F'W F)^-1 F'W. */
+            /* With the covariance S of the plane: (W^-1 + F S F')^-1 = W - W F (S^-1 + F'W F)^-1 F'W (Woodbury). */
             double both[UPPER], less[3];
             for (int64_t k = 0; k < UPPER; k++)
                 both[k] = fits->own[k][l] + N[k];
@@ -98,7 +98,7 @@ INLINE void add_neighbours(const sums_t *sums, const double *there, const int fi
     }
 }
 
-/* Solve for the planes of the sums; lanes without one become NaN. */
+/* Set the planes from the sums; NaN in lanes without one. */
 INLINE void solve_planes(fits_t *fits)
 {
 #pragma omp simd
@@ -160,7 +160,7 @@ FOR_EACH_PROCESSOR int64_t fit_planes(const plane_grid_t *g, double *planes, dou
                 if (!(here[TERM_SEEN * sums.size + l] > 0.0 && isfinite(fits.plane[0][l])))
                     continue;
                 support[at] = fits.sum[TERM_SEEN][l];
-                /* At the minimum b'm is m'N m. */
+                /* At the minimum b'm = m'N m. */
                 squares[at] = fits.sum[TERM_C][l];
                 for (int64_t k = 0; k < 3; k++) {
                     planes[3 * at + k] = fits.plane[k][l];

@@ -1,7 +1,8 @@
-/* What the kernels of the robust and of the maximum likelihood pose share: matches against E, weights, steps of a pose.
+/* Shared by the kernels of the robust and of the maximum likelihood pose: residuals of matches, weights, steps of a pose.
  *
- * Every function repeats the one of the package that its comment names. The matches come as 18 rows of `count` numbers
- * (local.SampsonRows.packed): the rays f1 and f2, then by pixel coordinate the columns of sigma1 B1 and of sigma2 B2. */
+ * Functions repeat those of the package that their comments name. The matches are 18 rows of `count` numbers
+ * (local.SampsonRows.packed): the rays f1 and f2, then the columns of sigma1 B1 and of sigma2 B2, with B the derivatives of a
+ * ray by its pixel. */
 #ifndef RIGKIT_POSE_H
 #define RIGKIT_POSE_H
 
@@ -9,7 +10,7 @@
 
 #define QUANTILE 2.576
 
-/* Vectors without loops, so that the loops over matches around them are vectorised. */
+/* Vectors as structures: loops over matches that call functions of them are vectorised. */
 typedef struct {
     double x, y, z;
 } v3_t;
@@ -45,13 +46,13 @@ INLINE v3_t apply_transposed(const double *M, v3_t v)
     return plus(times(v.x, v3(M)), plus(times(v.y, v3(M + 3)), times(v.z, v3(M + 6))));
 }
 
-/* Three successive rows of numbers, `count` each, at one match. */
+/* Return the vector of match i, from three consecutive rows of `count` numbers. */
 INLINE v3_t column(const double *rows, int64_t count, int64_t i)
 {
     return (v3_t){rows[i], rows[count + i], rows[2 * count + i]};
 }
 
-/* What a match says of E: the constraint f2^T E f1 and its gradients by both pixels, in sigmas. */
+/* The epipolar constraint f2^T E f1 of a match, its gradients by both pixels times their sigmas, and its variance. */
 typedef struct {
     double c, n1u, n1v, n2u, n2v, variance;
 } constraint_t;
@@ -69,7 +70,7 @@ INLINE constraint_t constraint_of(const double *packed, int64_t count, int64_t i
     return out;
 }
 
-/* Return [t]x R in `E`. */
+/* Set `E` to [t]x R. */
 INLINE void essential(const double *R, const double *t, double E[9])
 {
     for (int j = 0; j < 3; j++) {
@@ -78,7 +79,7 @@ INLINE void essential(const double *R, const double *t, double E[9])
     }
 }
 
-/* A noise level, and what the loss at it divides by: inverted once, not for every match. */
+/* A noise level, and the inverses of the divisors of the loss at it. */
 typedef struct {
     double noise, near, far;
 } level_t;
@@ -121,7 +122,7 @@ INLINE void fill_basis(pose_t *pose)
     memcpy(pose->basis + 3, &second, sizeof second);
 }
 
-/* Write exp([w]x) R to `out`. */
+/* Write exp([w]x) R to `out` (Rodrigues' formula, its series for small angles). */
 INLINE void turn(const double *R, v3_t w, double *out)
 {
     const double square = dot(w, w), angle = sqrt(square);
@@ -158,7 +159,7 @@ INLINE void add_rows(const double *w, const double *r, const double *J, int64_t 
 {
     const double *j0 = J, *j1 = J + stride, *j2 = J + 2 * stride, *j3 = J + 3 * stride, *j4 = J + 4 * stride;
     for (int p = 0; p < 5; p++) {
-        /* Six sums at a time, none of which waits for the others; half of the matrix is computed twice. */
+        /* Six independent sums at a time; the off-diagonal elements are computed twice. */
         const double *own = J + p * stride;
         double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0, s4 = 0.0, along = 0.0;
 #pragma omp simd reduction(+ : s0, s1, s2, s3, s4, along)
@@ -178,8 +179,8 @@ INLINE void add_rows(const double *w, const double *r, const double *J, int64_t 
     }
 }
 
-/* Write the step of the `free` ones of five unknowns, with a share `damping` of the diagonal added to it; return whether
- * it exists. */
+/* Write the Levenberg-Marquardt step of the `free` ones of the five unknowns, with `damping` times the diagonal added to the
+ * normal equations; return whether these are positive definite. */
 INLINE int damped_step(const normal_t *normal, double damping, const int64_t *free, int64_t freedom, double step[5])
 {
     double m[5][6], trace = 0.0;
@@ -211,6 +212,7 @@ INLINE int damped_step(const normal_t *normal, double damping, const int64_t *fr
     return 1;
 }
 
+/* Return the largest absolute value of a step. */
 INLINE double longest(const double step[5])
 {
     double out = 0.0;

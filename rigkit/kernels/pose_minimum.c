@@ -1,8 +1,8 @@
-/* The maximum likelihood pose of matched points and affinities: Levenberg-Marquardt on one pose. */
+/* The maximum likelihood relative pose of matched points and affinities, by the Levenberg-Marquardt method. */
 #include "pose.h"
 
-/* All residuals in sigmas, with derivatives J (5, rows): first the points, then the first, then the second of each
- * affinity. */
+/* All residuals over their standard deviations, with derivatives J (5, rows): those of the points, then the first ones of all
+ * affinities, then the second ones. */
 typedef struct {
     double *r, *J;
 } terms_t;
@@ -19,7 +19,7 @@ INLINE void point_terms(const pose_problem_t *p, const pose_t pose, int64_t rows
     for (int64_t i = 0; i < count; i++) {
         v3_t f1 = column(packed, count, i), f2 = column(packed + 3 * count, count, i);
         const constraint_t first = constraint_of(packed, count, i, E, f1, f2);
-        /* In sigmas the displacement of the pixels is minus `step` times the gradients. */
+        /* The corrections of the pixels, in sigmas, are minus `step` times the gradients. */
         const double step = first.variance > 0.0 ? first.c / first.variance : 0.0;
         f1 = plus(f1, times(-step * first.n1u, column(packed + 6 * count, count, i)));
         f1 = plus(f1, times(-step * first.n1v, column(packed + 9 * count, count, i)));
@@ -41,9 +41,9 @@ INLINE void point_terms(const pose_problem_t *p, const pose_t pose, int64_t rows
     }
 }
 
-/* residuals.affinity_terms with sigma_A. With a = R f1, C = R B1 and the columns B of B2 the gradients are n2 = B . (t x a)
- * and n1 = C . (f2 x t); by rotation a x (B x t) and C x (f2 x t), by direction a x B and C x f2. In the pixels' share of
- * the variance (weights.pixel_share) M = B . (t x C). */
+/* residuals.affinity_terms with sigma_A. With a = R f1, C = R B1 and the columns B of B2 the gradients are n2 = B . (t x a) and
+ * n1 = C . (f2 x t). Their derivatives by the rotation are a x (B x t) and C x (f2 x t), by the direction a x B and C x f2. The
+ * pixels' part of the variance (weights.pixel_share) has M = B . (t x C). */
 INLINE void affinity_terms(const pose_problem_t *p, const pose_t pose, int64_t rows, terms_t out)
 {
     const int64_t count = p->count, chosen = p->chosen;
@@ -78,7 +78,7 @@ INLINE void affinity_terms(const pose_problem_t *p, const pose_t pose, int64_t r
         const double gu = a1 * n2u + a3 * n2v + dot(Cu, line1), gv = a2 * n2u + a4 * n2v + dot(Cv, line1);
         const v3_t by_u = cross(a, cross(Bu, t)), by_v = cross(a, cross(Bv, t));
         const v3_t to_u = cross(a, Bu), to_v = cross(a, Bv);
-        /* The second terms of the factors: how the variance changes with n2. */
+        /* The second terms of the factors are the derivatives of the variance by n2. */
         const double uu = a1 - gu * n2u * inverse, uv = a3 - gu * n2v * inverse;
         const double vu = a2 - gv * n2u * inverse, vv = a4 - gv * n2v * inverse;
         const v3_t by_line_u = plus(cross(Cu, line1), times(-gu, slope_rotation));
@@ -134,15 +134,16 @@ INLINE double weighted_squares(const double *w, const double *r, int64_t rows)
     return sum;
 }
 
-/* Where row i of numpy's order is here: there the two of an affinity follow each other. */
+/* Return the row here of row i of the results, where both residuals of an affinity are adjacent. */
 INLINE int64_t place_of(const pose_problem_t *p, int64_t i)
 {
     const int64_t k = i - p->count;
     return k < 0 ? i : p->count + k / 2 + k % 2 * p->chosen;
 }
 
-/* PoseProblem._minimum: R (9,) and t (3,) move to the minimum; `r`, `w` (rows,) and `J` (rows, 5) there, `rows` = count + 2
- * chosen. Returns the iterations, negative if not converged; 0 without freedom, and NO_MEMORY without memory. */
+/* Replace R (3, 3) and t (3,) by the minimum (PoseProblem._descend); set `r`, `w` (rows,) and `J` (rows, 5) there, with `rows` =
+ * count + 2 chosen. Return the number of iterations, negated if they have not converged; 0 without degrees of freedom, NO_MEMORY
+ * without memory. */
 FOR_EACH_PROCESSOR int64_t minimise(const pose_problem_t *p, double *R, double *t, double *r, double *J, double *w)
 {
     const int64_t rows = p->count + 2 * p->chosen;

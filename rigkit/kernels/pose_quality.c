@@ -1,15 +1,16 @@
-/* Many hypotheses of a relative pose against matches: distances, qualities, and the best pose near each. */
+/* Hypotheses of a relative pose against matches: Sampson distances, robust qualities, and the local optimum near each
+ * hypothesis. */
 #include "pose.h"
 
 #define BLOCK 64
 
-/* Distances in sigmas of a block of matches, and one over the sigmas of their constraints, both zero where it has no
- * gradient. */
+/* Sampson distances in sigmas of a block of matches, and the reciprocals of the standard deviations of their constraints; both 0
+ * where a constraint has no gradient. */
 typedef struct {
     double r[BLOCK], inverse[BLOCK];
 } block_t;
 
-/* Fill `out` with `size` distances of the matches from `first` on (SampsonRows.residuals). */
+/* Set `out` to the distances of `size` matches from `first` on (SampsonRows.residuals). */
 INLINE void distances(const double *packed, int64_t count, int64_t first, int64_t size, const double *E, block_t *out)
 {
 #pragma omp simd
@@ -61,8 +62,8 @@ FOR_EACH_PROCESSOR void qualities(
     }
 }
 
-/* SampsonRows.quality_ahead: the greatest of the four sums of E = [t]x R with both rotations (hypotheses, 2, 9) and both
- * signs of t (hypotheses, 3), over the matches that are not behind a camera by a parallax of so many `sigmas`. */
+/* SampsonRows.quality_ahead: the largest of the four sums for E = [t]x R with both rotations (hypotheses, 2, 9) and both signs of
+ * t (hypotheses, 3), over the matches that are in front of both cameras or have a parallax below `sigmas`. */
 FOR_EACH_PROCESSOR void qualities_ahead(
     const double *packed, int64_t count, const double *R, const double *t, int64_t hypotheses, double noise, double sigmas,
     double *out)
@@ -106,8 +107,8 @@ FOR_EACH_PROCESSOR void qualities_ahead(
     }
 }
 
-/* Return the quality of the pose; fill its normal equations. J is the derivative of the constraint over its sigma: the
- * sigma is held during a step. */
+/* Return the quality of the pose and set its normal equations. J is the derivative of the constraint over its standard deviation,
+ * which is constant during a step. */
 INLINE double sum_up(const double *packed, int64_t count, level_t level, const pose_t *pose, normal_t *normal)
 {
     double E[9], J[5 * BLOCK], weight[BLOCK], total = 0.0;
@@ -138,7 +139,7 @@ INLINE double sum_up(const double *packed, int64_t count, level_t level, const p
     return total;
 }
 
-/* SampsonRows.improved: R (hypotheses, 9) and t (hypotheses, 3) move to the best quality at `noise`. */
+/* SampsonRows.improved: replace R (hypotheses, 9) and t (hypotheses, 3) by the poses of locally best quality at `noise`. */
 FOR_EACH_PROCESSOR void improve(
     const double *packed, int64_t count, double *R, double *t, double noise, int64_t hypotheses, const int64_t *free,
     int64_t freedom, int64_t max_steps, double settled)

@@ -1,13 +1,13 @@
-/* Real roots of a polynomial of degree ten, isolated by Sturm's theorem. */
+/* Real roots of a polynomial of degree ten, isolated by Sturm's theorem and refined by Newton's method. */
 #include "roots.h"
 
-/* A chain of Sturm: coefficient d of polynomial i at [d][i], zero above its degree. */
+/* A Sturm chain: coefficient d of polynomial i at [d][i], zero above its degree. */
 typedef struct {
     double at[DEGREE + 1][12];
     int count;
 } chain_t;
 
-/* Fill the chain of p, lowest coefficient first. */
+/* Set the Sturm chain of p, whose lowest coefficient comes first. */
 INLINE void sturm_chain(const double *p, chain_t *chain)
 {
     double poly[DEGREE + 2][DEGREE + 1];
@@ -41,7 +41,7 @@ INLINE void sturm_chain(const double *p, chain_t *chain)
         degree[i] = -1;
         for (int d = 0; d < degree[i - 1]; d++) {
             rest[d] = -rest[d] / most;
-            /* A leading coefficient that is rounding is none: division by it would make the rest rounding too. */
+            /* A leading coefficient as small as rounding errors is 0: division by it would amplify them. */
             degree[i] = fabs(rest[d]) > 1e-13 ? d : degree[i];
         }
         for (int d = degree[i] + 1; d <= DEGREE; d++)
@@ -53,7 +53,7 @@ INLINE void sturm_chain(const double *p, chain_t *chain)
             chain->at[d][i] = poly[i][d];
 }
 
-/* Return how many signs change along the chain at x. */
+/* Return the number of sign changes along the chain at x. */
 INLINE int sign_changes(const chain_t *chain, double x)
 {
     double value[12] = {0.0};
@@ -71,7 +71,8 @@ INLINE int sign_changes(const chain_t *chain, double x)
     return changes;
 }
 
-/* Return the root of p between `low` and `high`, at which its signs differ: Newton's method inside the bracket. */
+/* Return the root of p between `low` and `high`, where p has different signs: Newton's method, bisection where it leaves the
+ * bracket. */
 INLINE double root_between(const double *p, double low, double high, int low_negative)
 {
     double x = 0.5 * (low + high);
@@ -132,7 +133,7 @@ INLINE int roots_inside(const double *p, double *roots, int found)
             }
         }
         if (high - low < 1e-11) {
-            /* A double root, to rounding. */
+            /* A double root, up to rounding. */
             roots[found++] = middle;
             continue;
         }
@@ -149,8 +150,8 @@ INLINE int roots_inside(const double *p, double *roots, int found)
     return found;
 }
 
-/* Return the real roots of the polynomial p of degree ten: those within the unit circle, and the others as inverses of
- * roots of the reversed polynomial, so that no root lies far out. */
+/* Set `roots` to the real roots of p and return their number: those in (-1, 1], and the others as inverses of such roots of the
+ * reversed polynomial. */
 FOR_EACH_PROCESSOR int real_roots(const double p[DEGREE + 1], double roots[MAX_ROOTS])
 {
     double reversed[DEGREE + 1];

@@ -6,7 +6,7 @@
 
 enum { DEGREE = 10 };
 
-/* Set `roots` to the real roots of the polynomial p, the lowest coefficient first; return how many. */
+/* Set `roots` to the real roots of the polynomial p, the lowest coefficient first; return their number. */
 int real_roots(const double p[DEGREE + 1], double roots[MAX_ROOTS]);
 
 #endif

@@ -1,8 +1,9 @@
-/* Essential matrices from six equations (rigkit.relative_pose.solvers.minimal). */
+/* Essential matrices from six linear equations (rigkit.relative_pose.solvers.minimal). */
 #include "minimal.h"
 
-/* Rotate the `size` columns of `m`, `length` numbers each and one after the other, until they are perpendicular; `v`
- * (size columns of size) collects the rotations: one-sided Jacobi, as exact for the small singular values. */
+/* Rotate the `size` columns of `m`, of `length` numbers each, until they are orthogonal, and set `v` (size columns of size) to the
+ * rotations: a singular value decomposition by one-sided Jacobi, which is accurate for small singular values, too (Golub and Van
+ * Loan, "Matrix Computations", section 8.6.3). */
 INLINE void orthogonalise(double *m, int length, double *v, int size)
 {
     for (int i = 0; i < size * size; i++)
@@ -38,7 +39,7 @@ INLINE void orthogonalise(double *m, int length, double *v, int size)
     }
 }
 
-/* Return which of the `size` columns of `m` is the longest, or with `sign` -1 the shortest. */
+/* Return the index of the longest of the `size` columns of `m`, or with `sign` -1 of the shortest. */
 INLINE int extreme(const double *m, int length, int size, double sign)
 {
     int found = 0;
@@ -55,7 +56,7 @@ INLINE int extreme(const double *m, int length, int size, double sign)
     return found;
 }
 
-/* Replace E by the essential matrix nearest to it, unit norm (eight_point.essential_nearest). */
+/* Replace E by the nearest essential matrix of unit norm (eight_point.essential_nearest). */
 INLINE void make_essential(double *E)
 {
     double m[9], v[9];
@@ -72,12 +73,13 @@ INLINE void make_essential(double *E)
     }
 }
 
-/* Write the E of six rows (minimal.essential_from_six_rows): the monomials that violate the cubics least. */
+/* Write the essential matrix of six rows (minimal.essential_from_six_rows): the vector of monomials that violates the cubics
+ * least. */
 INLINE void solve_six(const double *rows, double *E)
 {
     /* The first of four basis matrices is zero: ten of the monomials do not contain x. */
     static const int WITHOUT_X[CUBICS] = {1, 6, 7, 13, 14, 15, 16, 17, 18, 19};
-    /* How often each occurs among the products of three of y, z, 1, and where each product is. */
+    /* The multiplicity of each among the products of three of y, z, 1, and the index of each product. */
     static const double OFTEN[CUBICS] = {1.0, 3.0, 3.0, 3.0, 6.0, 3.0, 1.0, 3.0, 3.0, 1.0};
     static const int PRODUCTS[3][9] = {{0, 1, 2, 1, 3, 4, 2, 4, 5}, {1, 3, 4, 3, 6, 7, 4, 7, 8}, {2, 4, 5, 4, 7, 8, 5, 8, 9}};
     double basis[4 * 9] = {0.0}, cubics[CUBICS][MONOMIALS], m[CUBICS * CUBICS], v[CUBICS * CUBICS];
@@ -98,7 +100,7 @@ INLINE void solve_six(const double *rows, double *E)
     make_essential(E);
 }
 
-/* `rows` (count, 6, 9) -> `out` (count, 9). */
+/* Solve `count` problems: `rows` (count, 6, 9), `out` (count, 9). */
 FOR_EACH_PROCESSOR void six_rows(const double *rows, int64_t count, double *out)
 {
     for (int64_t b = 0; b < count; b++)

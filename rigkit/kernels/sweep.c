@@ -1,21 +1,23 @@
-/* A sweep through the ranges: what two images differ by at each, and the surfaces of least cost along eight paths.
+/* A sweep over ranges: the matching cost of two images at each (census transform: Zabih and Woodfill, "Non-parametric local
+ * transforms for computing visual correspondence", 1994), and its semi-global aggregation along eight paths (Hirschmueller, "Stereo
+ * processing by semiglobal matching and mutual information", 2008, equation 13).
  *
- * Functions in numpy that say what is computed are in tests/kernels/reference/sweep.py. */
+ * The definitions in numpy are in tests/kernels/reference/sweep.py. */
 #include "kernels.h"
 
 enum { CENSUS_REACH = 2, BAND = 16, SIDE_BYTES = 8 };
 
-/* Cost of what is no level, above that of any path. */
+/* Cost of the levels that pad the arrays, above that of any path. */
 enum { NO_LEVEL = 128 };
 
-/* Return the number of levels, with those that only fill up vectors. */
+/* Return the number of levels with their padding to vectors of 16. */
 int64_t sweep_levels(int64_t levels)
 {
     return (levels + 15) / 16 * 16;
 }
 
-/* Write the census of `rows` x `columns` samples from (2, 2) of `from`, (rows + 4) x (columns + 4): which neighbours are
- * darker. */
+/* Write the census transform of the inner `rows` x `columns` samples of `from`, (rows + 4) x (columns + 4): a bit for each
+ * neighbour, 1 if it is darker. */
 INLINE void take_census(const float *from, int64_t rows, int64_t columns, uint32_t *out)
 {
     const int64_t wide = columns + 2 * CENSUS_REACH;
@@ -36,7 +38,7 @@ INLINE void take_census(const float *from, int64_t rows, int64_t columns, uint32
     }
 }
 
-/* Read image 2 at the places of a row of samples at one level; NaN where there is none, or beyond the image. */
+/* Read image 2 at the pixels of a row of samples at one level; NaN outside the field of view or the image. */
 INLINE void read_row(const sweep_t *sweep, const image_t image2, int64_t level, int64_t row, float *out)
 {
     const int64_t columns = sweep->columns, spacing = sweep->spacing, wide = sweep->table_columns;
@@ -73,8 +75,8 @@ int64_t sweep_cost_memory(int64_t columns)
     return (BAND + 2 * CENSUS_REACH) * (columns + 2 * CENSUS_REACH) + 2 * BAND * columns;
 }
 
-/* Write in how many bits the census of `samples1` and of what image 2 shows at each level differ; half of them where image
- * 2 shows nothing. Band by band: a band's costs stay in the cache from level to level. */
+/* Write the Hamming distance of the census transforms of `samples1` and of image 2 at each level, half of the bits outside image 2.
+ * The rows are processed in bands, whose costs stay in the cache from level to level. */
 FOR_EACH_PROCESSOR void sweep_costs(
     const sweep_t *sweep, const image_t *image2, const float *samples1, float *memory, uint8_t *costs)
 {
@@ -85,7 +87,7 @@ FOR_EACH_PROCESSOR void sweep_costs(
     for (int64_t top = 0; top < rows; top += BAND) {
         const int64_t count = BAND < rows - top ? BAND : rows - top;
         for (int64_t level = -1; level < sweep->levels; level++) {
-            /* What is beyond the border of the samples is not darker than anything. */
+            /* Neighbours beyond the border count as not darker. */
             fill(around, (count + 2 * CENSUS_REACH) * wide, INFINITY);
             for (int64_t j = -CENSUS_REACH; j < count + CENSUS_REACH; j++) {
                 const int64_t row = top + j;
@@ -113,8 +115,8 @@ FOR_EACH_PROCESSOR void sweep_costs(
     }
 }
 
-/* One step of a path: `now` are the costs of the best surfaces that end at each level here, of those that came from the
- * sample before, less their least. Return the least of them. */
+/* Take one step of a path: set `now` to the cost of each level plus the smallest cost of a transition from the previous sample
+ * (`came`, with minimum `least`), minus that minimum, and add it to `total`; return the minimum of `now`. */
 INLINE uint8_t follow(
     const uint8_t *restrict came, uint8_t least, uint8_t jump, uint8_t bend, const uint8_t *restrict cost, uint8_t *restrict now,
     uint16_t *restrict total, int64_t levels)
@@ -139,7 +141,7 @@ INLINE uint8_t follow(
     return low;
 }
 
-/* The first step of a path, at the border. */
+/* Start a path at the border: as `follow` without a previous sample. */
 INLINE uint8_t begin(const uint8_t *restrict cost, uint8_t *restrict now, uint16_t *restrict total, int64_t levels)
 {
     uint8_t low = 255;
@@ -151,7 +153,7 @@ INLINE uint8_t begin(const uint8_t *restrict cost, uint8_t *restrict now, uint16
     return low;
 }
 
-/* Of a path's costs at a sample: the least, then SIDE_BYTES from there the levels, with NO_LEVEL to either side. */
+/* Bytes of a path's costs at a sample: their minimum, and from byte SIDE_BYTES on the levels, with NO_LEVEL on both sides. */
 #define PATH_BYTES(padded) ((padded) + 2 * SIDE_BYTES)
 
 int64_t sweep_path_memory(int64_t columns, int64_t levels)
@@ -166,8 +168,8 @@ INLINE uint8_t jump_cost(const surface_rules_t *rules, float here, float there)
     return (uint8_t)((float)rules->bend + (float)(rules->jump - rules->bend) * part);
 }
 
-/* Add to `total` (rows, columns, levels filled up) the costs with those of the best surfaces that lead there along eight
- * paths: four with the rows downwards, then the same four backwards. */
+/* Set `total` (rows, columns, padded levels) to the aggregated costs of eight paths: four in a pass downwards, then the opposite
+ * four in a pass upwards. */
 FOR_EACH_PROCESSOR void sweep_surfaces(
     const surface_rules_t *rules, const uint8_t *costs, const float *samples1, uint8_t *memory, uint16_t *total)
 {
@@ -183,7 +185,7 @@ FOR_EACH_PROCESSOR void sweep_surfaces(
                 const int64_t column = way > 0 ? n : columns - 1 - n, at = row * columns + column;
                 const uint8_t *cost = costs + at * levels;
                 for (int64_t path = 0; path < 4; path++) {
-                    /* From the line before: aside of it, along it, to the other side; from this line: along. */
+                    /* Three paths come from the previous row, one from the previous column. */
                     const int64_t dr = path < 3 ? -way : 0, dc = path < 3 ? path - 1 : -way;
                     uint8_t *here = now + path * size + column * bytes;
                     const int inside = row + dr >= 0 && row + dr < rows && column + dc >= 0 && column + dc < columns;
@@ -202,8 +204,8 @@ FOR_EACH_PROCESSOR void sweep_surfaces(
     }
 }
 
-/* Write the level of least cost of each sample, that cost, and those of the levels before and after: the nearest inner
- * level's where it is the first or the last. */
+/* Write the level of the smallest cost of each sample, that cost, and those of this level and its two neighbours; of the nearest
+ * inner level if it is the first or the last. */
 FOR_EACH_PROCESSOR void sweep_winners(const surface_rules_t *rules, const uint16_t *total, int32_t *best, int32_t *around)
 {
     const int64_t count = rules->rows * rules->columns, levels = rules->levels, padded = sweep_levels(levels);
@@ -224,10 +226,10 @@ FOR_EACH_PROCESSOR void sweep_winners(const surface_rules_t *rules, const uint16
     }
 }
 
-/* Samples around one that are asked, weights of those that count fully, and steps of a weight's table. */
+/* Largest offset of the samples that are summed up, the largest weight, and the size and resolution of the table of weights. */
 enum { RIVAL_REACH = 5, FULL_WEIGHT = 16, WEIGHT_STEPS = 64, STEPS_OF_ONE = 16 };
 
-/* Add `weight` times the costs of a sample to those of its surfaces, which lie `shift` levels higher there. */
+/* Add `weight` times the costs of a sample whose surface is `shift` levels higher there. */
 INLINE void add_shifted(const uint8_t *cost, int64_t shift, uint16_t weight, int64_t levels, uint16_t *sum)
 {
     const int64_t from = shift < 0 ? -shift : 0, to = shift > 0 ? levels - shift : levels;
@@ -241,8 +243,8 @@ INLINE void add_shifted(const uint8_t *cost, int64_t shift, uint16_t weight, int
         sum[k] = (uint16_t)(sum[k] + above);
 }
 
-/* Write for each claim the costs a sample of its surface, at most a level off, and of the cheapest other one of the same
- * slant: over the samples around that are as bright. NaN where the sweep has no such level. */
+/* Write for each claim the mean cost of its surface, within one level, and of the cheapest other surface of the same slant, over
+ * the surrounding samples of similar brightness; NaN if the sweep has no such levels. */
 FOR_EACH_PROCESSOR void sweep_rivals(
     const claims_t *claims, const uint8_t *costs, const float *samples1, uint16_t *memory, float *found)
 {
