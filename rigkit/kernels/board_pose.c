@@ -1,18 +1,18 @@
-/* How far a rigid board's points lie from rays, and how that changes as the board moves: r = 2 T u / (1 + f . u) with f the
- * ray, T the basis across it and u the unit ray to the point. To first order that is the measured offset, 2 tan(angle / 2) in
- * general, which grows up to the opposite ray (T u alone would call the opposite ray a perfect fit). */
+/* Residuals of a rigid board's points against rays, with derivatives by the pose: r = 2 T u / (1 + f . u) with f the measured ray,
+ * T the basis perpendicular to it and u the unit ray to the point. Its length is 2 tan(angle / 2), to first order the angle, and
+ * grows up to the opposite ray; T u alone would be zero there, too. */
 #include "pose.h"
 
-/* Of the opposite ray: its residual is large, and finite. */
+/* Smallest 1 + f . u: the residual of the opposite ray is large but finite. */
 #define MIN_CLOSENESS 1e-9
 
-/* Of a descent, as a share of the diagonal of J^T J. */
+/* Damping of Levenberg-Marquardt steps, as a factor of the diagonal of J^T J. */
 #define FIRST_DAMPING 1e-4
 #define MIN_DAMPING 1e-12
 #define MAX_DAMPING 1e6
 
-/* The residuals of a point against the ray f with two rows of its basis, and their derivatives by a turn and a shift: two
- * rows of seven numbers, the residual last, ACROSS apart. */
+/* Write two rows of POSE + 1 numbers, ACROSS apart: the derivatives of the residuals of a point against the ray f, with the two
+ * rows of its basis, by rotation and translation, and last the residuals. */
 INLINE void point_rows(const double *ray, const double *basis, const double *point, const double *R, v3_t t, double *rows)
 {
     const v3_t f = v3(ray), lever = apply(R, v3(point));
@@ -50,7 +50,7 @@ FOR_EACH_PROCESSOR void ray_residuals(
     }
 }
 
-/* Write the products of derivatives and residuals (ACROSS, ACROSS), upper triangle: J^T J, J^T r, and last the cost. */
+/* Write the upper triangle of `sums` (ACROSS, ACROSS): J^T J, J^T r, and last the cost r^T r. */
 INLINE void pose_products(
     const double *rays, const double *bases, const double *points, int64_t count, const double *R, const double *t, double *sums)
 {
@@ -65,7 +65,7 @@ INLINE void pose_products(
     }
 }
 
-/* Write the step against `sums` damped by a share of the diagonal; return whether there is one. */
+/* Write the step of the normal equations `sums` with damping; return whether they are positive definite. */
 INLINE int pose_step(const double *sums, double damping, double *step)
 {
     double damped[POSE * POSE];
@@ -81,14 +81,15 @@ INLINE int pose_step(const double *sums, double damping, double *step)
     return 1;
 }
 
+/* Return the largest absolute value of a's components. */
 INLINE double largest(v3_t a)
 {
     const double x = fabs(a.x), y = fabs(a.y), z = fabs(a.z);
     return x > y ? (x > z ? x : z) : (y > z ? y : z);
 }
 
-/* Levenberg-Marquardt from each pose: it stops where a step is less than `tolerance`, in radians and in parts of the
- * distance. */
+/* Levenberg-Marquardt from each pose, until a step's rotation in radians plus its translation relative to the distance is below
+ * `tolerance`. */
 FOR_EACH_PROCESSOR void refine_board_poses(
     const double *rays, const double *bases, int64_t sets, const double *points, int64_t count, double *rotation,
     double *translation, int64_t poses, int64_t max_steps, double tolerance, double *costs)

@@ -1,23 +1,23 @@
-/* The perspective camera with Brown's distortion: pixels and their derivatives, point by point. cameras/brown.py has the
- * formulas, tests/kernels/reference/brown.py says in numpy what is computed. */
+/* The perspective camera with Brown's distortion: pixels and their derivatives. The formulas are in cameras/brown.py, the
+ * definition in numpy in tests/kernels/reference/brown.py. */
 #include "kernels.h"
 
-/* Where the parameters stand. */
+/* Indices of the parameters. */
 enum { FX, FY, CX, CY, K1, K2, P1, P2, K3, K4, K5, K6 };
 
-/* Newton in the plane stops where the next step would be this small, in units of the focal length. */
+/* Newton's method stops when the next step is predicted to be below this, in the plane at unit depth. */
 #define SETTLED 1e-13
 #define MAX_STEPS 30
-/* Keeps lengths off zero, where they divide. */
+/* Added to lengths that are divisors. */
 #define TINY 1e-300
 
-/* A place (x, y) in the plane at unit depth: t = x^2 + y^2, the radial factor L and its denominator, the tangential part's
- * (t + 2 x^2, 2 x y, t + 2 y^2), where it is imaged, m, and the symmetric d m / d (x, y). */
+/* The distortion of a point (x, y) in the plane at unit depth: t = x^2 + y^2, the radial factor and its denominator, the tangential
+ * terms (t + 2 x^2, 2 x y, t + 2 y^2), the distorted point m, and the symmetric dm / d(x, y). */
 typedef struct {
     double t, factor, bottom, along_x, across, along_y, mx, my, xx, xy, yy;
 } bent_t;
 
-/* Return what a place comes to; without denominator where the model is not `rational`. */
+/* Return the distortion of (x, y); only the `rational` model has a denominator. */
 INLINE bent_t bend(const double *k, const int rational, double x, double y)
 {
     bent_t b;
@@ -39,7 +39,7 @@ INLINE bent_t bend(const double *k, const int rational, double x, double y)
     return b;
 }
 
-/* Write what the points come to. */
+/* Write the pixels of the points and their derivatives. */
 INLINE void differentiate(
     const brown_points_t *at, const int rational, double *d_pixels_d_point, double *d_pixels_d_parameters, double *u, double *v,
     uint8_t *valid)
@@ -97,6 +97,7 @@ EXPORT FOR_EACH_PROCESSOR void differentiate_brown(
         differentiate(points, 0, d_pixels_d_point, d_pixels_d_parameters, u, v, valid);
 }
 
+/* Replace `plane`, initial points, by those within `max_r` that are distorted to `m`; `valid` says which have converged. */
 INLINE void undistort(
     const double *k, double max_r, const int rational, const double *m, int64_t count, double *plane, uint8_t *valid)
 {
@@ -109,13 +110,13 @@ INLINE void undistort(
             const double dx = (b.yy * miss_x - b.xy * miss_y) / area, dy = (b.xx * miss_y - b.xy * miss_x) / area;
             x -= dx;
             y -= dy;
-            /* Kept inside the circle, where the derivative is positive definite: Newton cannot leave for another branch. */
+            /* Clipped to the circle in which dm / d(x, y) is positive definite: Newton's method cannot reach another branch. */
             const double length = sqrt(x * x + y * y + TINY);
             if (length > max_r) {
                 x *= max_r / length;
                 y *= max_r / length;
             }
-            /* The next step is (size / before)^2 of this one, for as long as the convergence is quadratic. */
+            /* With quadratic convergence the next step is (size / before)^2 of this one. */
             const double size = fabs(dx) + fabs(dy), slower = size < before ? size / before : 1.0;
             valid[n] = size * slower * slower <= SETTLED * (1.0 + (length < max_r ? length : max_r));
             before = size > TINY ? size : TINY;

@@ -1,11 +1,11 @@
-/* Which pixels of an image boards covered. */
+/* The pixels of an image that boards have covered. */
 #include "kernels.h"
 
-/* Determinant of a grid's scatter, as a part of its squared trace, of a single row or column. */
+/* Determinant of the scatter matrix of a single row or column, relative to its squared trace, up to rounding. */
 #define ONE_LINE 1e-9
 
-/* Return the longer side of a square of a view's board in the image, as the affine map nearest to its corners has it. A
- * single row or column leaves the other side open, which then counts as zero: the pseudo-inverse of rank one. */
+/* Return the longer side of a square of a board in the image, px, from the affine map fitted to its corners. For a single row or
+ * column the other side is zero, by the pseudo-inverse of rank one. */
 static double longer_side(const int64_t *grid, const double *corners, int64_t count)
 {
     double mean[4] = {0.0}, xx = 0.0, xy = 0.0, yy = 0.0, xu = 0.0, yu = 0.0, xv = 0.0, yv = 0.0;
@@ -38,6 +38,7 @@ static double longer_side(const int64_t *grid, const double *corners, int64_t co
     return (along > across ? along : across) / whole;
 }
 
+/* Set `covered` for the pixels within `squares` sides of a square of a corner of any view. */
 EXPORT void cover_pixels(
     const int64_t *grid, const double *corners, int64_t count, const int64_t *counts, int64_t views, double squares,
     const double *pixels, int64_t asked, uint8_t *covered)

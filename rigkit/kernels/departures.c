@@ -1,8 +1,8 @@
-/* What a lens may do beyond its model: displacements of its image, and the sums of products with what poses and parameters
- * do. tests/kernels/reference/departures.py says in numpy what is computed. */
+/* Departures of a lens from its model: displacements of its image, and the sums of their products with the derivatives by poses
+ * and parameters. The definition in numpy is in tests/kernels/reference/departures.py. */
 #include "kernels.h"
 
-/* Write the displacements of the corner at (x, y), from the middle of the image in units of half its diagonal. */
+/* Write the displacements at (x, y), relative to the centre of the image in units of half its diagonal. */
 INLINE void displace(double x, double y, double u[DISPLACEMENTS], double v[DISPLACEMENTS])
 {
     const double xx = x * x, xy = x * y, yy = y * y, square = xx + yy;
@@ -12,7 +12,8 @@ INLINE void displace(double x, double y, double u[DISPLACEMENTS], double v[DISPL
         u[j] = square * u[j - 1];
         v[j] = square * v[j - 1];
     }
-    /* Decentring (tangential distortion), thin prisms, these again with the square of the radius, aspect ratio, shear. */
+    /* Decentring (tangential distortion) and thin prism (Weng, Cohen and Herniou, "Camera calibration with distortion models and
+     * accuracy evaluation", 1992), thin prism times the squared radius, aspect ratio, shear. */
     const double others_u[] = {square + 2.0 * xx, 2.0 * xy, square, 0.0, square * square, 0.0, x, y};
     const double others_v[] = {2.0 * xy, square + 2.0 * yy, 0.0, square, 0.0, square * square, -y, x};
     for (int64_t j = RADIAL_POWERS; j < DISPLACEMENTS; j++) {
@@ -53,7 +54,7 @@ EXPORT FOR_EACH_PROCESSOR void displace_by(
     }
 }
 
-/* Write both rows of a corner: derivatives by the pose (turn, shift) and the parameters, displacements, residual. */
+/* Write both rows of a corner: derivatives by the pose (rotation, translation) and the parameters, displacements, residual. */
 INLINE void write_rows(const lens_corners_t *c, double scale, int64_t n, int64_t across, double *row)
 {
     const int64_t N = c->count, P = c->parameters;

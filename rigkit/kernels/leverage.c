@@ -1,7 +1,7 @@
-/* What images would have pulled a solution without their leverage (calibration.clustered). */
+/* Scores of clusters of images without their leverage, (I - M)^-1/2 z, by Chebyshev series (calibration.solving.clustered). */
 #include "kernels.h"
 
-/* Set `out` to (2 M / bound - 1) z of a symmetric M: a sum of its rows, which takes many numbers at a time. */
+/* Set `out` to (2 M / bound - 1) z for a symmetric M, as a sum of its rows, which is vectorised. */
 INLINE void centred(const double *restrict M, const double *restrict z, int64_t n, double bound, double *restrict out)
 {
     for (int64_t i = 0; i < n; i++)
@@ -13,6 +13,7 @@ INLINE void centred(const double *restrict M, const double *restrict z, int64_t 
     }
 }
 
+/* Set `out` to the Chebyshev series of the leverage matrices M, with eigenvalues from 0 to `bound`, times the scores z (`pull`). */
 EXPORT FOR_EACH_PROCESSOR void sum_series(
     const double *leverage, const double *pull, int64_t clusters, int64_t n, double bound, const double *series, int64_t terms,
     double *memory, double *out)

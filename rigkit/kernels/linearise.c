@@ -1,5 +1,5 @@
-/* The normal equations of views of boards: every corner's weighted rows of derivatives, and the sums of their products.
- * tests/kernels/reference/linearise.py says in numpy what is computed. */
+/* The normal equations of views of boards: weighted rows of derivatives of every corner, and the sums of their products. The
+ * definition in numpy is in tests/kernels/reference/linearise.py. */
 #include "kernels.h"
 
 EXPORT FOR_EACH_PROCESSOR void place_corners(const board_views_t *seen, int64_t first, int64_t count, double *lever, double *points)
@@ -24,7 +24,7 @@ int64_t rows_memory(int64_t across)
     return padded(across) * (padded(across) + 2 * CORNERS);
 }
 
-/* Add what the two rows (across) of a corner come to with its released point, whose derivatives are `left`. */
+/* Add the products of the two rows of a corner with the derivatives `left` by its released point. */
 INLINE void add_released(
     const view_sums_t *sums, int64_t view, int64_t place, const double left[2][3], const double *row_u, const double *row_v)
 {
@@ -41,8 +41,8 @@ INLINE void add_released(
     }
 }
 
-/* Set the row of one coordinate of a corner, from the derivatives of its pixel by the point, weighted (`j`), and by the
- * parameters (`by`, `stride` apart); `left` to the derivatives by the board's point, `q` is the lever. */
+/* Set the row of one coordinate of a corner from the derivatives of its pixel by the point in the camera frame, weighted (`j`), and
+ * by the parameters (`by`, `stride` apart); `q` is the lever arm. Set `left` to the derivatives by the board's point. */
 INLINE void fill_row(
     const board_views_t *seen, const double *R, const double *q, int64_t point, double weight, const double j[3], const double *by,
     int64_t stride, int64_t parameters, double off, double left[3], double *row)
@@ -64,7 +64,7 @@ INLINE void fill_row(
     motion[POSE] = weight * off;
 }
 
-/* Return a corner's robust cost, and scale its `weight` by the loss. */
+/* Return the robust cost of a corner (Cauchy's loss), and multiply `weight` by the square root of the loss's weight. */
 INLINE double robust_cost(const double away[2], double loss, double *weight)
 {
     const double squared = (away[0] * away[0] + away[1] * away[1]) * *weight * *weight;
@@ -75,6 +75,7 @@ INLINE double robust_cost(const double away[2], double loss, double *weight)
     return loss * loss * log1p(relative);
 }
 
+/* Set the parts of `sums` that belong to the views of `count` corners from the view `first` on. */
 EXPORT FOR_EACH_PROCESSOR void add_views(
     const board_views_t *seen, int64_t first, int64_t count, int64_t parameters, const double *d_pixels_d_point,
     const double *d_pixels_d_parameters, const double *u, const double *v, const uint8_t *projects, const double *lever,
@@ -98,7 +99,7 @@ EXPORT FOR_EACH_PROCESSOR void add_views(
             sums->valid[m] = projects[n];
             double weight = seen->weight[m];
             cost += robust_cost(away, seen->loss_px, &weight);
-            /* A corner outside the model's field of view has no derivative; it waits until a step brings it back. */
+            /* A corner outside the model's field of view has no derivatives: it adds to the cost only. */
             if (!projects[n] || weight == 0.0)
                 continue;
             const double q[3] = {lever[n], lever[count + n], lever[2 * count + n]};

@@ -1,7 +1,8 @@
-/* Inverting what a lens polynomial makes of a radius or an angle, point by point, and where it ends (cameras.monotone). */
+/* Inverses of lens polynomials of a radius or an angle, point by point, and the range in which they increase (cameras.monotone). */
 #include "monotone.h"
 
-/* A polynomial that comes so near to zero, as a part of x, touches it: rounding parts a double root. */
+/* Width of an interval, relative to x, below which a polynomial that may touch zero there has a double root: rounding can split
+ * it. */
 #define TOUCHING 1e-8
 
 enum { BISECTIONS = 32 };
@@ -14,7 +15,7 @@ INLINE double value_at(const double *p, int64_t terms, double x)
     return value;
 }
 
-/* Set `b` to Bernstein's coefficients of p between `low` and `low` + `width`; return whether all are positive. */
+/* Set `b` to the Bernstein coefficients of p from `low` to `low` + `width`; return whether all are positive, and with them p. */
 INLINE int positive(const double *p, int64_t terms, double low, double width, double *b)
 {
     const int64_t n = terms - 1;
@@ -69,7 +70,7 @@ EXPORT FOR_EACH_PROCESSOR double smallest_root(
 {
     double least = 1.0, *scaled = memory + terms;
     for (int64_t i = 0; i < count; i++) {
-        /* Scaled to x in (0, 1], so that coefficients of high powers of pixels are not lost beside the others. */
+        /* Scaled to x in (0, 1], where the coefficients of all powers are comparable. */
         const double *p = polynomials + i * terms;
         double power = 1.0;
         for (int64_t k = 0; k < terms; k++) {

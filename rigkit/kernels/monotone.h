@@ -1,23 +1,24 @@
-/* Inverting increasing functions that a polynomial makes: Newton's method, all points of a block at a time. */
+/* Inverses of increasing functions with a polynomial term, by Newton's method for all points of a block at a time. */
 #ifndef RIGKIT_KERNELS_MONOTONE_H
 #define RIGKIT_KERNELS_MONOTONE_H
 
 #include "kernels.h"
 
 enum {
-    /* Points at a time: their polynomials stay in the first cache. */
+    /* Points at a time: their numbers fit the first-level cache. */
     POINTS = 64,
-    /* Newton steps from the table for all points; nearly all are done after two. The rest is bracketed: bisection alone
-     * reaches double precision in so many. */
+    /* Largest number of Newton steps from the table for all points, of which nearly all converge in two. The others are bracketed;
+     * MAX_BISECTIONS bisections alone reach double precision. */
     QUICK_STEPS = 3,
     MAX_BISECTIONS = 60
 };
 
-/* Newton doubles the digits at each step: after one this small, as a share of the range, all are right. */
+/* Newton's method converges quadratically: a step this small, relative to the range, leaves double precision. */
 #define LAST_STEP_REL 1e-9
+/* Smallest step of a bracketed point, relative to its bracket. */
 #define RELATIVE_STEP 1e-14
 
-/* Write g(x) = linear x + factor P(x) - offset, which increases, and its slope. */
+/* Write g(x) = linear x + factor P(x) - offset and its derivative. */
 INLINE void evaluate(const increasing_t *g, int64_t first, int64_t count, const double *x, double *residual, double *slope)
 {
     const double *linear = g->linear + first, *factor = g->factor + first, *offset = g->offset + first;
@@ -38,7 +39,7 @@ INLINE void evaluate(const increasing_t *g, int64_t first, int64_t count, const 
     }
 }
 
-/* Return the root number `n` between `low` and `high`, from x: Newton kept inside the bracket. */
+/* Return the root of function `n` between `low` and `high`: Newton's method from x, bisection where it leaves the bracket. */
 INLINE double bracketed(const increasing_t *g, int64_t n, double x, double low, double high)
 {
     const double least = RELATIVE_STEP * (high - low);
@@ -62,7 +63,7 @@ INLINE double bracketed(const increasing_t *g, int64_t n, double x, double low, 
     return at;
 }
 
-/* Write the roots of `count` <= POINTS of the functions, from the `first` on, to `x`. */
+/* Write the roots of `count` <= POINTS functions from `first` on to `x`. */
 INLINE void invert(const increasing_t *g, int64_t first, int64_t count, double *x)
 {
     const double range = g->high - g->low, per_cell = (double)g->cells / (g->last - g->first);

@@ -1,10 +1,10 @@
-/* Cameras that look the same all around, Kannala-Brandt's and Scaramuzza's: pixels and their derivatives. cameras/radial.py,
- * kannala_brandt.py and scaramuzza.py have the formulas, tests/kernels/reference/radial.py says in numpy what is computed. */
+/* Rotationally symmetric cameras, Kannala-Brandt's and Scaramuzza's: pixels and their derivatives. The formulas are in
+ * cameras/radial.py, kannala_brandt.py and scaramuzza.py, the definition in numpy in tests/kernels/reference/radial.py. */
 #include "monotone.h"
 
-/* Return the angle from 0 to pi of a unit vector with these parts across and along the axis, to four roundings; unlike atan2
- * it is vectorised with the loop around it. Its eighth has a tangent below tan(pi / 8), where the arc tangent is x P(x^2) with
- * the polynomial that equals it at Chebyshev's points, right to 4e-17. */
+/* Return the angle, 0 to pi, of a unit vector with these components across and along the axis, to four rounding errors; unlike
+ * atan2 it is vectorised with the loop around it. An eighth of it has a tangent x below tan(pi / 8), where the arc tangent is
+ * x P(x^2), with P interpolated at Chebyshev points and an error below 4e-17. */
 INLINE double angle_of(double across, double along)
 {
     static const double P[] = {
@@ -19,7 +19,7 @@ INLINE double angle_of(double across, double along)
         0.056883492268090106,
         -0.04348052215716462,
         0.021135373157693246};
-    /* Sine and cosine of the half; of the two the one that is not lost in a difference comes first. */
+    /* Sine and cosine of half the angle; the larger one is computed first, which avoids cancellation. */
     const double larger = sqrt(0.5 * (1.0 + fabs(along))), smaller = 0.5 * across / larger;
     const double sine = along < 0.0 ? larger : smaller, cosine = along < 0.0 ? smaller : larger;
     const double fourth = sine / (1.0 + cosine), x = fourth / (1.0 + sqrt(1.0 + fourth * fourth)), t = x * x;
@@ -28,19 +28,19 @@ INLINE double angle_of(double across, double along)
     return 8.0 * x * (low + t4 * (high + t4 * (P[8] + t * (P[9] + t * P[10]))));
 }
 
-/* Scales s of POINTS points with their derivatives (ds/dr) / r and ds/dz, and by the first number of the shape; those by the
- * others are each `factor` times the one before. */
+/* Scales s of POINTS points with their derivatives (ds/dr) / r, ds/dz and by the first coefficient of the model; each further
+ * coefficient's derivative is `factor` times the previous one. */
 typedef struct {
     double scale[POINTS], by_r[POINTS], by_z[POINTS], by_shape[POINTS], factor[POINTS];
 } scales_t;
 
 enum {
-    /* Samples of the radius over the angle from which its inverse starts, and cells of the table made of them. */
+    /* Number of samples of the angle over the radius, and of cells of the table of its inverse, from which Newton starts. */
     KNOTS = 129,
     CELLS = 4 * (KNOTS - 1)
 };
 
-/* Write pixels and derivatives by the points of `count` points from the `first` on: pixel = L s (x, y) + centre. */
+/* Write pixel = L s (x, y) + centre and its derivatives by the point for `count` points from `first` on. */
 INLINE void write_points(
     const radial_points_t *at, const scales_t *of, int64_t first, int64_t count, double *d_pixels_d_point, double *u, double *v)
 {
@@ -65,8 +65,8 @@ INLINE void write_points(
     }
 }
 
-/* Write the derivatives by `terms` numbers of the shape, from the row `from` on; the second differs from the first by the
- * factor to the power of `gap`. */
+/* Write the derivatives by `terms` coefficients of the model from row `from` on; from the first to the second the power of `factor`
+ * grows by `gap`. */
 INLINE void write_shape(
     const radial_points_t *at, scales_t *of, int64_t first, int64_t count, int64_t from, int64_t terms, int64_t gap,
     double *d_pixels_d_parameters)
@@ -84,6 +84,8 @@ INLINE void write_shape(
     }
 }
 
+/* s = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) / r (Kannala and Brandt, "A generic camera model and
+ * calibration method for conventional, wide-angle, and fish-eye lenses", 2006, equation 6 with a first coefficient of 1). */
 EXPORT FOR_EACH_PROCESSOR void differentiate_kannala_brandt(
     const radial_points_t *at, double *d_pixels_d_point, double *d_pixels_d_parameters, double *u, double *v, uint8_t *valid)
 {
@@ -128,7 +130,7 @@ EXPORT FOR_EACH_PROCESSOR void differentiate_kannala_brandt(
     }
 }
 
-/* Write radii in even steps of the angle; return the largest angle. */
+/* Set `table` to the radii at equal steps of the angle; return the largest angle. */
 static double fill_table(const radial_points_t *at, double table[CELLS + 1])
 {
     double angles[KNOTS];
@@ -149,13 +151,14 @@ static double fill_table(const radial_points_t *at, double table[CELLS + 1])
     return angles[KNOTS - 1];
 }
 
-/* Angles of POINTS points off the axis with sines, their negatives and cosines, and one over the points' lengths. */
+/* Angles between POINTS points and the axis with sines, their negatives, cosines, and the reciprocals of the points' lengths. */
 typedef struct {
     double angle[POINTS], sine[POINTS], minus_sine[POINTS], cosine[POINTS], per[POINTS];
 } directions_t;
 
-/* Fill `out` for `count` points from the `first` on, those beyond `max_angle` as if on the axis. */
-INLINE void look(const radial_points_t *at, int64_t first, int64_t count, double max_angle, directions_t *out, uint8_t *valid)
+/* Set `out` for `count` points from `first` on, with those beyond `max_angle` replaced by the axis. */
+INLINE void directions_of(
+    const radial_points_t *at, int64_t first, int64_t count, double max_angle, directions_t *out, uint8_t *valid)
 {
     const double *xs = at->x + first, *ys = at->y + first, *zs = at->z + first;
     double inside[POINTS];
@@ -175,6 +178,8 @@ INLINE void look(const radial_points_t *at, int64_t first, int64_t count, double
         valid[i] = inside[i] > 0.0;
 }
 
+/* s = rho / r with rho the root of z rho = r f(rho) (Scaramuzza, Martinelli and Siegwart, "A toolbox for easily calibrating
+ * omnidirectional cameras", 2006). */
 EXPORT FOR_EACH_PROCESSOR void differentiate_scaramuzza(
     const radial_points_t *at, double *d_pixels_d_point, double *d_pixels_d_parameters, double *u, double *v, uint8_t *valid)
 {
@@ -182,13 +187,13 @@ EXPORT FOR_EACH_PROCESSOR void differentiate_scaramuzza(
     directions_t seen;
     const double zero[POINTS] = {0.0}, max_angle = fill_table(at, table), a0 = at->polynomial[0];
     const int64_t N = at->count, n = at->terms - 1;
-    /* z rho - r f = |(rho, f)| sin(angle(rho) - theta) changes sign once, from minus to plus, on the range. */
+    /* z rho - r f = |(rho, f)| sin(angle(rho) - theta) changes its sign once in the range, from minus to plus. */
     const increasing_t g = {at->polynomial, seen.cosine, seen.minus_sine, zero, seen.angle,    table, at->terms, POINTS,
                             CELLS,          0.0,         max_angle,       0.0,  at->max_radius};
     for (int64_t first = 0; first < N; first += POINTS) {
         const int64_t count = N - first < POINTS ? N - first : POINTS;
         scales_t of;
-        look(at, first, count, max_angle, &seen, valid + first);
+        directions_of(at, first, count, max_angle, &seen, valid + first);
         invert(&g, 0, count, rho);
         for (int64_t i = 0; i < count; i++)
             f[i] = slope[i] = 0.0;

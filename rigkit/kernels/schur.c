@@ -1,5 +1,6 @@
-/* A damped step of normal equations over globals and poses: the poses eliminated one by one (Schur complement), what is left
- * solved by Cholesky's factors. tests/kernels/test_schur.py has it as one dense system. */
+/* A damped step of the normal equations of global parameters and poses: the poses are eliminated one by one (Schur complement), the
+ * rest is solved by Cholesky factorisation (Triggs et al., "Bundle adjustment - a modern synthesis", 2000, section 6.1).
+ * tests/kernels/test_schur.py compares it with the dense system. */
 #include "kernels.h"
 
 INLINE double damped(double diagonal, double damping)
@@ -7,7 +8,7 @@ INLINE double damped(double diagonal, double damping)
     return diagonal + damping * (diagonal > 0.0 ? diagonal : 1.0);
 }
 
-/* Set the upper triangle of A (n x n, rows `across` apart) to its factor U with A = U' U, and `right` (n, across) to U'^-1
+/* Replace the upper triangle of A (n x n, rows `across` apart) by its factor U with A = U' U, and `right` (n, columns) by U'^-1
  * `right`; return whether A is positive definite. */
 INLINE int factored(double *A, int64_t n, int64_t across, double *right, int64_t columns)
 {
@@ -32,7 +33,7 @@ INLINE int factored(double *A, int64_t n, int64_t across, double *right, int64_t
     return 1;
 }
 
-/* Set x to U^-1 x. */
+/* Replace x by U^-1 x. */
 INLINE void substituted(const double *U, int64_t n, int64_t across, double *x)
 {
     for (int64_t i = n - 1; i >= 0; i--) {
@@ -55,7 +56,7 @@ solve_schur(const normal_equations_t *n, double damping, double *memory, double 
     double *sums = memory, *rows = sums + across * across, *factors = rows + V * size;
     memset(memory, 0, (size_t)(across * across + V * size) * sizeof(double));
     for (int64_t v = 0; v < V; v++) {
-        /* [pp | gp' p] becomes [U | Y], and gp pp^-1 [gp' p] is Y' Y. */
+        /* [pp | gp' p] is replaced by [U | Y]; gp pp^-1 [gp' p] = Y' Y. */
         double *U = factors + v * POSE * POSE, *Y = rows + v * size;
         memcpy(U, n->pp + v * POSE * POSE, POSE * POSE * sizeof(double));
         for (int64_t k = 0; k < POSE; k++) {
