@@ -5,13 +5,13 @@
 - `solving`: initial values (`radial_alignment`, `initialise`, `poses`), then least squares for one camera model
   (`state`, `shape`, `camera_prior`, `evidence`, `linearise`, `normal_equations`, `solver`, `outliers`, `fit`) with a
   cluster-robust covariance (`clustered`)
-- `choosing`: model selection by held-out error (`heldout`, `choice`, `models_tried`, `lens_choice`, `one_model`), the
+- `choosing`: model selection by held-out error (`choice`, `models_tried`, `lens_choice`, `one_model`), the
   uncertainty that it leaves (`between_models`), boards numbered from the other end (`board_orientation`), and what a
   rig takes over from its cameras (`begun`)
 - `certainty`: uncertainty of parameters and projection (`covariance`, `uncertainty`), model inadequacy (`departures`,
   `series`, `displaced`), and which part of the image the boards covered (`coverage`)
 - `judging`: diagnosis of images, residuals and result (`captured`, `moved`, `changing`, `mixed`, `turned`, `two_kinds`,
-  `pupil`, with `view_evidence` and `neighbours`), summarised by `verdicts`
+  `pupil`, with `view_evidence`), summarised by `verdicts`
 - the result: `assemble`, `result` (with `board_shape`, `pupil`)
 - a second calibration with a moving entrance pupil, where the residuals indicate one: `with_pupil`
 

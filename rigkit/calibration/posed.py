@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from rigkit.calibration.assemble import with_covariance
 from rigkit.calibration.calibrate import FOLDS
-from rigkit.calibration.choosing.choice import FittedModel
-from rigkit.calibration.choosing.heldout import heldout_squares
+from rigkit.calibration.choosing.choice import FittedModel, heldout_squares
 from rigkit.calibration.choosing.models_tried import Request, enough_agree
 from rigkit.calibration.choosing.one_model import with_board_shape
 from rigkit.calibration.judging.verdicts import judge

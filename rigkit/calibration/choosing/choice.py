@@ -1,15 +1,20 @@
-"""Model selection: among the options with the smallest held-out error, the one with the fewest parameters."""
+"""Model selection by cross-validation: among the options with the smallest error on images that were left out of the
+fit, the one with the fewest parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rigkit.calibration.certainty.departures import SMALLEST_PX
 from rigkit.calibration.result import Candidate
 from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.solving.poses import refine_poses
+from rigkit.calibration.solving.solver import FROM_OPTIMUM, solve
+from rigkit.calibration.solving.state import weighted_squares
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray
 
 MARGIN = 0.02
@@ -24,6 +29,8 @@ BOOTSTRAP_DRAWS = 2000
 """Bootstrap samples: probabilities are accurate to 0.01."""
 CLEARLY = 2.0
 """Standard errors by which the common model of like cameras must be worse than its own for a camera to leave them."""
+MIN_IMAGES_OF_FIT = 3
+"""Smallest number of images for leave-one-out: two others still determine a camera."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -47,6 +54,40 @@ class FittedModel:
     @property
     def count(self) -> int:
         return int(self.fit.state.camera.parameters.size + self.fit.state.shape.count)
+
+
+def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatArray | None:
+    """Return the sum of squared held-out residuals, px^2, of the inliers of each image: camera and board shapes are
+    those of the other folds, only the poses of its boards are fitted. Near-duplicate images are in one fold. With fewer
+    images than folds each image is a fold. None with less than MIN_IMAGES_OF_FIT different images.
+
+    Residuals are weighted as in the solution, so that blurred images count less.
+    """
+    if folds < 2:
+        return None
+    images = list(dict.fromkeys(observations.images))
+    if int(observations.clusters().max()) + 1 < MIN_IMAGES_OF_FIT:
+        return None
+    place = {name: i for i, name in enumerate(images)}
+    image = np.array([place[name] for name in observations.images])
+    fold = observations.folds(folds)
+    squared = np.zeros(len(images))
+    weight = fit.weight(observations)
+    for k in range(int(fold.max()) + 1):
+        train, test = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
+        solved = solve(
+            observations.subset(train),
+            fit.state.subset(train),
+            weight=weight[train],
+            prior_sigma_px=fit.sigma_px,
+            cost_tolerance=FROM_OPTIMUM,
+        ).state
+        part = observations.subset(test)
+        start = fit.state.subset(test)
+        moved = replace(solved, rotation=start.rotation, translation_mm=start.translation_mm)
+        found, _ = refine_poses(part, moved, weight[test])
+        np.add.at(squared, image[test], weighted_squares(found, part, weight[test]))
+    return squared
 
 
 def models_of(options: Sequence[FittedModel]) -> list[str]:

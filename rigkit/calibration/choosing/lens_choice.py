@@ -13,8 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut, choose, converged_ones, models_of
-from rigkit.calibration.choosing.heldout import heldout_squares
+from rigkit.calibration.choosing.choice import (
+    MIN_SIGMAS,
+    FittedModel,
+    HeldOut,
+    choose,
+    converged_ones,
+    heldout_squares,
+    models_of,
+)
 from rigkit.calibration.choosing.models_tried import Request, agreeing_views, cross_validated, reweighted
 from rigkit.calibration.choosing.one_model import ModelOutcome
 from rigkit.calibration.solving.fit import fit_kept, fit_other_lens

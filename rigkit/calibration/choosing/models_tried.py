@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigkit.calibration.choosing.choice import FittedModel
-from rigkit.calibration.choosing.heldout import heldout_squares
+from rigkit.calibration.choosing.choice import FittedModel, heldout_squares
 from rigkit.calibration.result import Candidate
 from rigkit.calibration.solving.fit import fit_kept, fit_model, identifiable, not_identifiable, robust_sigma
 from rigkit.calibration.solving.shape import SHAPES

@@ -25,12 +25,12 @@ import numpy as np
 from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.judging.captured import SMALL_PX
 from rigkit.calibration.judging.changing import MIN_NEIGHBOUR_CORRELATION
-from rigkit.calibration.judging.neighbours import neighbour_correlation
 from rigkit.calibration.judging.view_evidence import (
     CHANGE_COLUMNS,
     MIN_INFORMATIVE_CORNERS,
     MIN_INFORMATIVE_VIEWS,
     columns_of,
+    neighbour_correlation,
     points_of,
     products_of,
     rows_of,

@@ -28,9 +28,9 @@ from rigkit.calibration.judging.captured import (
 from rigkit.calibration.judging.changing import CHANGES, changing
 from rigkit.calibration.judging.mixed import two_cameras
 from rigkit.calibration.judging.moved import moment
-from rigkit.calibration.judging.neighbours import neighbour_correlation
 from rigkit.calibration.judging.pupil import modelled_pupil, moving_pupil
 from rigkit.calibration.judging.two_kinds import KINDS_REMEDY, min_of_a_kind
+from rigkit.calibration.judging.view_evidence import neighbour_correlation
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.views.observations import Observations

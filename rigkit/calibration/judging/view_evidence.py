@@ -241,3 +241,21 @@ def without_pose(products: FloatArray, length: FloatArray) -> FloatArray:
     whitened = np.where(sizes > MIN_OWN_PART**2, sizes, np.inf) ** -0.5
     back = np.swapaxes(axes * whitened[:, None], -1, -2) @ (products[:, :6] / pose[:, :, None])
     return np.asarray(products - np.swapaxes(back, -1, -2) @ back)
+
+
+def neighbour_correlation(c: Calibration) -> float:
+    """Return the correlation of the residuals of inliers that are neighbours on their board, 0 if there are none: zero
+    for noise, positive for errors of the lens or board model."""
+    corners = c.corners
+    kept, grid = corners.kept, corners.grid
+    columns, rows = (grid.max(axis=0) + 1).tolist()
+    lattice, there = np.zeros((len(c.views) * rows * columns, 2)), np.zeros(len(c.views) * rows * columns)
+    place = ((corners.view * rows + grid[:, 1]) * columns + grid[:, 0])[kept]
+    lattice[place], there[place] = corners.residuals_px[kept], 1.0
+    lattice, there = lattice.reshape(-1, rows, columns, 2), there.reshape(-1, rows, columns)
+    squared = lattice[..., 0] ** 2 + lattice[..., 1] ** 2
+    products, power = 0.0, 0.0
+    for one, other in ((np.s_[:, :, 1:], np.s_[:, :, :-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        products += float((lattice[one] * lattice[other]).sum())
+        power += 0.5 * float((squared[one] * there[other] + squared[other] * there[one]).sum())
+    return products / power if power > 0.0 else 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.calibration.choosing.heldout import MIN_IMAGES_OF_FIT
+from rigkit.calibration.choosing.choice import MIN_IMAGES_OF_FIT
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solving.shutters import readout_steps, with_longer_readouts
 from rigkit.calibration.rig.solving.solver import refine_frames, solve_rig

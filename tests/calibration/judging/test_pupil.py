@@ -12,10 +12,9 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty
 from rigkit.calibration.judging.changing import changing
-from rigkit.calibration.judging.neighbours import neighbour_correlation
 from rigkit.calibration.judging.pupil import BY_CHANCE, MovingPupil
 from rigkit.calibration.judging.verdicts import judge
-from rigkit.calibration.judging.view_evidence import view_evidence
+from rigkit.calibration.judging.view_evidence import neighbour_correlation, view_evidence
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.with_pupil import CENTRAL, MOVING

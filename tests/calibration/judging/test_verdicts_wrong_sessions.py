@@ -13,9 +13,8 @@ from helpers.session_scenes import NOISE_PX, poses, seen
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging.changing import MIN_NEIGHBOUR_CORRELATION, changing
-from rigkit.calibration.judging.neighbours import neighbour_correlation
 from rigkit.calibration.judging.verdicts import judge
-from rigkit.calibration.judging.view_evidence import view_evidence
+from rigkit.calibration.judging.view_evidence import neighbour_correlation, view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.compare import compare_cameras
