@@ -70,7 +70,7 @@ class BoardShape:
 
     @property
     def board(self) -> Board:
-        """The flat board that fits the solved corners best. One without a declaration is taken for a chessboard whose
+        """The flat board that fits the solved corners best. One without a declaration is read as a chessboard whose
         corners are listed row by row."""
         if self.declared is None:
             return _chessboard_of(self.board_id, self.points_mm)

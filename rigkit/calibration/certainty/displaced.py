@@ -175,9 +175,9 @@ def uncertain_camera(calibration: Calibration, *, quoted: bool = True, near: boo
     """Return a calibrated camera and its covariance, with its model inadequacy as further parameters where that is
     significant; with a model that fits and boards all over the image it is not, and the camera is the calibration's.
 
-    The covariance is widened as it is `quoted`; with quoted=False it is that of Student's t, for callers that use the
-    calibration's degrees of freedom. The camera is for far points; with `near` for points in mm, a `NearCamera` where
-    the pupil moves, as the errors of lens and pupil are correlated.
+    The covariance is widened if `quoted`, else that of Student's t, for callers that use the calibration's degrees of
+    freedom. The camera is for far points; with `near` for points in mm, a `NearCamera` where the pupil moves, as the
+    errors of lens and pupil are correlated.
     """
     pupil = calibration.pupil if near else None
     known = calibration.covariance if pupil is None else calibration.near_covariance[:-6, :-6]

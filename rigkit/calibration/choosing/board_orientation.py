@@ -4,7 +4,7 @@ The first corner of such a board is ambiguous, and for a flat board it does not 
 the flat board, a view numbered from the other end has these deviations rotated. The part of the deviations that is
 invariant under the rotation gives no information; the rest changes its sign. So each view has a sign, and the signs
 that agree best on one common deviation maximise s^T K s, with K from the single views. Each view is then tested against
-the others: is their common deviation in it as it is numbered, or rotated?
+the others: does it contain their common deviation unrotated, or rotated?
 
 Errors of the lens model, or a board bent differently in each view, are smooth. They must not count as deviations of the
 board: in each view all displacements that are quadratic over the board, its pose included, are projected out. What is
@@ -194,7 +194,7 @@ class _Patterns:
 
 
 def _projected_onto(basis: FloatArray, values: FloatArray) -> FloatArray:
-    """Return the part of `values` (V, N) that lies in the orthonormal `basis` (V, N, K)."""
+    """Return the projection of `values` (V, N) onto the orthonormal `basis` (V, N, K)."""
     return np.asarray((basis @ (np.swapaxes(basis, -1, -2) @ values[..., None]))[..., 0])
 
 

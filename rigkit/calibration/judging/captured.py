@@ -32,7 +32,7 @@ NEARLY_ALL = 0.9
 ONE_DISTANCE = 1.15
 """Boards are at one distance where the far corners are within this factor of the near ones."""
 ASKED_DEG = 95.0
-"""Largest angle from the axis at which boards are expected: beyond it they would have to be beside the camera."""
+"""Largest angle from the axis at which boards are expected: beyond it they would have to be next to the camera."""
 GRID = (16, 12)
 """Pixels (columns, rows) at which coverage is evaluated."""
 MIN_SHARE_COVERED = 2.0 / 3.0

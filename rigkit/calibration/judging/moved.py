@@ -54,9 +54,27 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
     scores, order = _ImageScores.of(fit, number), np.arange(len(images))
     first = scores.split_at(order)
     later = order >= first
+    positions = [*_places(observations, state), number % 2]
+
+    def difference_sigmas(second: BoolArray) -> float | None:
+        """Return the difference, in standard deviations, between the lenses of the images `second` (N,) and of the
+        others, None unless it is significant and larger than for splits by the boards' places."""
+        distance = _cost_difference(observations, fit, state, second[number])
+        if not distance > MIN_HALF_SIGMAS:
+            return None
+        alone = scores.gain_of(second)
+        for values in positions:
+            other = scores.split_by(np.bincount(number, values) / np.bincount(number))
+            if not other.any() or (other == second).all() or (other != second).all():
+                continue
+            both = scores.gain_of_both(second, other)
+            if both - scores.gain_of(other) < AGAINST_PLACE**2 * (both - alone):
+                return None
+        return distance
+
     named = _of_other_name_kind(images)
     if named is not None and not (named == later).all() and not (named != later).all():
-        distance = _lens_difference_sigmas(observations, fit, state, number, named, scores)
+        distance = difference_sigmas(named)
         if distance is not None:
             other, one = images[int(np.argmax(named))], images[int(np.argmin(named))]
             message = (
@@ -64,7 +82,7 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
                 f"({distance:.0f} standard deviations)"
             )
             return (Finding.bad(message, "calibrate each camera from its own images"),)
-    distance = _lens_difference_sigmas(observations, fit, state, number, later, scores)
+    distance = difference_sigmas(later)
     if distance is None or (chance := scores.chance(observations.clusters(), number)) > CHANCE:
         return ()
     message = (
@@ -171,26 +189,6 @@ def _of_other_name_kind(images: Sequence[str]) -> BoolArray | None:
         return None
     other = np.array([kind != kinds[0] for kind in kinds])
     return other if 2 * min(other.sum(), (~other).sum()) >= MIN_IMAGES_FOR_HALVES else None
-
-
-def _lens_difference_sigmas(
-    observations: Observations, fit: Fit, state: State, number: IntArray, second: BoolArray, scores: _ImageScores
-) -> float | None:
-    """Return the difference, in standard deviations, between the lenses of the images `second` (N,) and of the others,
-    None unless it is significant and larger than for splits by place; `number` (V,) is the index of each view's
-    image."""
-    distance = _cost_difference(observations, fit, state, second[number])
-    if not distance > MIN_HALF_SIGMAS:
-        return None
-    alone = scores.gain_of(second)
-    for values in (*_places(observations, state), number % 2):
-        other = scores.split_by(np.bincount(number, values) / np.bincount(number))
-        if not other.any() or (other == second).all() or (other != second).all():
-            continue
-        both = scores.gain_of_both(second, other)
-        if both - scores.gain_of(other) < AGAINST_PLACE**2 * (both - alone):
-            return None
-    return distance
 
 
 def _places(observations: Observations, state: State) -> FloatArray:

@@ -2,7 +2,7 @@
 
 Image viewers apply the EXIF orientation; conferencing programs mirror. Such an image is of the same lens with the
 principal point reflected at the image centre, and a mirrored image shows a mirrored board. The only unknown is which
-images were flipped. Each image is tested: with lens and board shape held, does it fit better as it is, or flipped back?
+images were flipped. Each image is tested: with lens and board shape held, does it fit better unchanged or flipped back?
 Then lens and board shape are solved for again. This needs no two clusters of principal points, which few images, or
 boards that compensate by their tilt, do not show clearly.
 """

@@ -153,7 +153,7 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
         # The model lacks a bow common to all images: the residuals are not those of a minimum.
         return None
     return ViewEvidence(
-        views=[k for k, tells in zip(informative, finite, strict=True) if tells],
+        views=[k for k, is_finite in zip(informative, finite, strict=True) if is_finite],
         own=own,
         length=length,
         along=own[:, :, residual] - own[:, :, COMMON] @ step,

@@ -103,10 +103,10 @@ class JointRig:
     @property
     def timing(self) -> Timing:
         """What was estimated of the times at which images were taken."""
-        moments = self.solution.state.moments
-        if moments is None:
+        exposures = self.solution.state.exposures
+        if exposures is None:
             return "trigger"
-        return "readouts" if moments.readouts.any() else "lags"
+        return "readouts" if exposures.readouts.any() else "lags"
 
     @property
     def shared_count(self) -> int:

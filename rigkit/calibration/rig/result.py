@@ -12,8 +12,8 @@ from rigkit.calibration.certainty.displaced import LensModes, with_modes
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_rig import BoardRig
+from rigkit.calibration.rig.solving.exposure_times import Lag
 from rigkit.calibration.rig.solving.layout import Layout
-from rigkit.calibration.rig.solving.moments import Lag
 from rigkit.calibration.rig.solving.shutters import Readout
 from rigkit.calibration.solving.clustered import effective_freedom, widening
 from rigkit.calibration.solving.solver import Convergence

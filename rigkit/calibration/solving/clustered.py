@@ -82,7 +82,7 @@ def effective_freedom(
     """Return the degrees of freedom of the variance in one of so many directions (Satterthwaite).
 
     The variance expected from independent corners is known from all directions of all images. The excess between images
-    has `freedom` degrees of freedom; a factor common to all directions has `common_freedom` besides.
+    has `freedom` degrees of freedom; a further factor common to all directions has `common_freedom`.
     """
     beyond = max(0.0, 1.0 - 1.0 / overdispersion**2) if overdispersion > 0.0 else 0.0
     variance_of_ratio = beyond**2 * (1.0 / freedom + 1.0 / common_freedom)

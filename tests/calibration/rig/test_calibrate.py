@@ -12,7 +12,7 @@ from helpers.rig_scenes import MODELS, NOISE_PX, SIGMAS, mounts, rig_views, size
 from rigkit.calibration.certainty.covariance import GlobalCovariance
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.certainty.uncertainty import transfer_covariance, transfer_uncertainty
-from rigkit.calibration.rig.solving.moments import Moments
+from rigkit.calibration.rig.solving.exposure_times import ExposureTimes
 from rigkit.calibration.rig.solving.pose_jacobians import pose_jacobians
 from rigkit.calibration.rig.solving.solver import rig_normal
 from rigkit.calibration.rig.solving.state import RigObservations, RigState
@@ -105,7 +105,7 @@ def _lagging(state: RigState, rng: np.random.Generator) -> RigState:
     ways = np.concatenate([axis * [[0.2], [0.1]], 30.0 * rng.normal(size=(poses, 2, 3))], axis=-1)
     own, information = np.zeros((2, poses)), np.full((2, poses), np.inf)
     own[1], information[1] = 0.1 * rng.normal(size=poses), 1e6 * rng.uniform(1.0, 2.0, poses)
-    return replace(state, moments=Moments(np.array([0.0, 0.3]), ways, own, information, np.zeros(2)))
+    return replace(state, exposures=ExposureTimes(np.array([0.0, 0.3]), ways, own, information, np.zeros(2)))
 
 
 @pytest.mark.parametrize("kind", ["flat", "warp", "released"])
@@ -125,8 +125,8 @@ def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, late: bool, rng
 
     def residuals(x: np.ndarray, own_times: np.ndarray | float = 0.0) -> np.ndarray:
         moved = state.moved(SchurStep(x[: layout.count], x[layout.count :].reshape(-1, 6), 0.0), layout)
-        if moved.moments is not None:
-            moved = replace(moved, moments=replace(moved.moments, own=moved.moments.own + own_times))
+        if moved.exposures is not None:
+            moved = replace(moved, exposures=replace(moved.exposures, own=moved.exposures.own + own_times))
         return np.concatenate(
             [
                 (evaluate(moved.of_camera(c, observations), own).px * w[..., None]).ravel()
@@ -147,10 +147,10 @@ def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, late: bool, rng
         gauss_newton[own, own] = normal.pp[f]
     here = residuals(np.zeros(h.size))
     numeric, gradient = jacobian @ jacobian.T, jacobian @ here
-    if state.moments is not None:
+    if state.exposures is not None:
         each = 1e-5 * np.eye(poses)[:, None] * [[0.0], [1.0]]
         times = np.array([(residuals(0.0 * h, -e) - residuals(0.0 * h, e)) / 2e-5 for e in each])
-        known, own_times = np.diag(state.moments.information[1]), state.moments.own[1]
+        known, own_times = np.diag(state.exposures.information[1]), state.exposures.own[1]
         back = jacobian @ times.T @ np.linalg.inv(times @ times.T + known)
         numeric -= back @ times @ jacobian.T
         gradient -= back @ (times @ here - known @ own_times)

@@ -19,7 +19,7 @@ from rigkit.calibration.rig.solving.state import RigState
 from rigkit.calibration.solving.poses import steps_between
 from rigkit.calibration.solving.solver import FROM_OPTIMUM
 from rigkit.cameras.moving_pupil import far_camera, with_pupil_of
-from rigkit.core.arrays import FloatArray, Mat3, Rays
+from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.core.errors import DegenerateError, InputError
 
 
@@ -35,6 +35,21 @@ def between_rig_models(joint: JointRig, sigmas: FloatArray) -> FloatArray:
     for c, weight in enumerate(joint.observations.weights):
         points, _ = here.of_camera(c, joint.observations).points_in_cam(joint.observations.cameras[c])
         rays.append(spread_rays(points[weight > 0.0]))
+
+    def fitted_to(there: RigState) -> tuple[list[FloatArray], list[Mat3]]:
+        """Return the change of each camera's parameters that fits it to that of another state, and the rotations
+        there_from_here of the rays."""
+        steps, turns = [], []
+        for camera, other, own, run in zip(here.cameras, there.cameras, rays, layout.cameras, strict=True):
+            far, far_other = far_camera(camera), far_camera(other)
+            p = far.parameters.size
+            step, turn = step_to_lens(far, far_other, own, sigmas[run][:p])
+            # The pupil moves along the axis of its own lens: its terms are compared directly.
+            pupil = other.parameters[far_other.parameters.size :] - camera.parameters[p:]
+            steps.append(np.concatenate([step, pupil]))
+            turns.append(turn)
+        return steps, turns
+
     others = [rival.name for one in single for rival in one.rivals if not same_model(rival.camera, one.camera)]
     for name in dict.fromkeys(others):
         own = [next((r for r in calibration.rivals if r.name == name), None) for calibration in single]
@@ -45,32 +60,17 @@ def between_rig_models(joint: JointRig, sigmas: FloatArray) -> FloatArray:
             ),
         )
         try:
-            turns = _turns(here, start, rays, sigmas, joint)[1]
-            there = solve_rig(joint.observations, _turned(start, turns), joint.sigma_px, FROM_OPTIMUM).state
-            global_step = _global_step(here, there, rays, sigmas, joint)
+            start = _turned(start, fitted_to(start)[1])
+            there = solve_rig(joint.observations, start, joint.sigma_px, FROM_OPTIMUM).state
+            steps, turns = fitted_to(there)
         except (InputError, DegenerateError):
             continue
+        global_step = globals_between(layout, here, _turned(there, [turn.T for turn in turns]))
+        for lens, step in zip(layout.cameras, steps, strict=True):
+            global_step[lens] = step
         likely = [r.likely for r in own if r is not None]
         out += np.mean(likely) * np.outer(global_step, global_step)
     return out
-
-
-def _turns(
-    here: RigState, there: RigState, rays: Sequence[Rays], sigmas: FloatArray, joint: JointRig
-) -> tuple[list[FloatArray], list[Mat3]]:
-    """Return the change of each camera's parameters that fits it to the other one, and the rotations there_from_here of
-    the rays."""
-    steps, turns = [], []
-    layout = here.layout(joint.observations)
-    for camera, other, own, run in zip(here.cameras, there.cameras, rays, layout.cameras, strict=True):
-        far, far_other = far_camera(camera), far_camera(other)
-        p = far.parameters.size
-        step, turn = step_to_lens(far, far_other, own, sigmas[run][:p])
-        # The pupil moves along the axis of its own lens: its terms are compared directly.
-        pupil = other.parameters[far_other.parameters.size :] - camera.parameters[p:]
-        steps.append(np.concatenate([step, pupil]))
-        turns.append(turn)
-    return steps, turns
 
 
 def _turned(state: RigState, turns: Sequence[Mat3]) -> RigState:
@@ -82,24 +82,12 @@ def _turned(state: RigState, turns: Sequence[Mat3]) -> RigState:
         mount_mm=np.einsum("cij,cj->ci", turn, state.mount_mm),
         frame_rotation=first @ state.frame_rotation,
         frame_mm=state.frame_mm @ first.T,
-        moments=None if state.moments is None else state.moments.turned(first),
+        exposures=None if state.exposures is None else state.exposures.turned(first),
     )
 
 
-def _global_step(
-    here: RigState, there: RigState, rays: Sequence[Rays], sigmas: FloatArray, joint: JointRig
-) -> FloatArray:
-    """Return the change of the globals (G,) from the state `here` to the state `there`."""
-    layout = here.layout(joint.observations)
-    steps, turns = _turns(here, there, rays, sigmas, joint)
-    global_step = globals_between(layout, here, _turned(there, [turn.T for turn in turns]))
-    for lens, step in zip(layout.cameras, steps, strict=True):
-        global_step[lens] = step
-    return global_step
-
-
 def globals_between(layout: Layout, here: RigState, there: RigState) -> FloatArray:
-    """Return how far the globals (G,) must move for the rig to be as it is there; lenses of another model stay."""
+    """Return the change of the globals (G,) from the state `here` to `there`; zero for lenses of another model."""
     global_step = np.zeros(layout.count)
     for lens, camera, other in zip(layout.cameras, here.cameras, there.cameras, strict=True):
         if camera.parameters.size == other.parameters.size:
@@ -112,7 +100,7 @@ def globals_between(layout: Layout, here: RigState, there: RigState) -> FloatArr
         for k, run in enumerate(runs):
             if run is not None:
                 global_step[run] = moved[k]
-    if here.moments is not None and there.moments is not None:
-        global_step[layout.lags] = (there.moments.lags - here.moments.lags)[1:]
+    if here.exposures is not None and there.exposures is not None:
+        global_step[layout.lags] = (there.exposures.lags - here.exposures.lags)[1:]
     global_step[layout.shape] = there.unknowns - here.unknowns
     return global_step

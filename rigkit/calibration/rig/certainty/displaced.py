@@ -52,11 +52,11 @@ def _of_camera(
     alone, own = state.of_camera(c, observations), observations.cameras[c]
     n = layout.shape.start
     by_globals = np.zeros((n, modes.shape[1]))
-    late = None
-    if state.moments is not None:
-        information = state.moments.information[c, observations.frame[c]]
-        late = board_velocities(observations, state, c, alone.translation_mm), information
-    by_globals[layout.cameras[c]], by_own = _products(alone, own, observations.weights[c], modes, late)
+    motion = None
+    if state.exposures is not None:
+        information = state.exposures.information[c, observations.frame[c]]
+        motion = board_velocities(observations, state, c, alone.translation_mm), information
+    by_globals[layout.cameras[c]], by_own = _products(alone, own, observations.weights[c], modes, motion)
     by_pose = np.zeros((len(observations.keys), 6, modes.shape[1]))
     for part in pose_jacobians(observations, state, c, alone.translation_mm):
         shown = by_own[part.views]
@@ -72,10 +72,10 @@ def _products(
     own: Observations,
     weight: FloatArray,
     modes: FloatArray,
-    late: tuple[FloatArray, FloatArray] | None,
+    motion: tuple[FloatArray, FloatArray] | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the weighted products of the modes with the derivatives by the parameters (P, M) and by the pose of each
-    view (V, 6, M); `late` are the velocity of each view's pose (V, 6) and the information on its own time."""
+    view (V, 6, M); `motion` are the velocity of each view's pose (V, 6) and the information on its own time."""
     points, lever = alone.points_in_cam(own)
     pixels, valid, d_pixels_d_point, d_pixels_d_parameters = alone.camera.project_with_jacobians(points)
     used = valid & (weight > 0.0)
@@ -88,11 +88,11 @@ def _products(
     )
     by_view = np.concatenate([-d_pixels_d_point @ skew(lever), d_pixels_d_point], axis=-1)
     views, count = len(weight), modes.shape[1]
-    if late is not None:
+    if motion is not None:
         # The images' own times absorb a part.
-        by_time = np.einsum("vcxi,vi->vcx", by_view, late[0])
+        by_time = np.einsum("vcxi,vi->vcx", by_view, motion[0])
         weighted = by_time * np.where(used, weight, 0.0)[..., None] ** 2
-        known = np.einsum("vcx,vcx->v", weighted, by_time) + late[1]
+        known = np.einsum("vcx,vcx->v", weighted, by_time) + motion[1]
         taken = np.einsum("vcx,vcxm->vm", by_time, moved) / known[:, None]
         moved -= weighted[..., None] * taken[:, None, None]
     of_views = np.swapaxes(by_view.reshape(views, -1, 6), 1, 2) @ moved.reshape(views, -1, count)

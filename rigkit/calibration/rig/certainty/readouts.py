@@ -26,7 +26,7 @@ def readout_error(joint: JointRig) -> tuple[FloatArray, FloatArray]:
     observations, state = joint.observations, joint.solution.state
     layout, cameras = state.layout(observations), len(state.cameras)
     out, sigmas = np.zeros((layout.count, layout.count)), np.zeros(cameras)
-    if state.moments is None or not state.moments.readouts.any():
+    if state.exposures is None or not state.exposures.readouts.any():
         return out, sigmas
     before, alone, _ = readout_steps(observations, state)
     for c in np.flatnonzero(alone).tolist():

@@ -1,8 +1,8 @@
 """Cameras without a common trigger: each has a time lag behind the first, in which boards move on.
 
-Lags are solved for together with all other unknowns, with the boards' trajectories (`moments`) recomputed from the
-resulting poses. They are kept only where frames agree on them far beyond their scatter: boards at rest, or placed anew
-for every frame, contain no information on lags, and trajectories through such frames are not real motion.
+Lags are solved for together with all other unknowns, with the boards' trajectories (`exposure_times`) recomputed from
+the resulting poses. They are kept only where frames agree on them far beyond their scatter: boards at rest, or placed
+anew for every frame, contain no information on lags, and trajectories through such frames are not real motion.
 
 The lag of a free-running camera differs between frames. The standard deviation of that is estimated over all frames
 from the disagreement of views that share a pose, along their trajectories (expectation maximisation). The time of each
@@ -21,8 +21,8 @@ from typing import Literal
 import numpy as np
 
 from rigkit.calibration.rig.certainty.frame_covariance import frame_covariance, residual_sigma
+from rigkit.calibration.rig.solving.exposure_times import ExposureTimes, Lag, trajectories_through
 from rigkit.calibration.rig.solving.flatness import STEP_DAMPING
-from rigkit.calibration.rig.solving.moments import Lag, Moments, trajectories_through
 from rigkit.calibration.rig.solving.pose_jacobians import pose_jacobians_at_exposure
 from rigkit.calibration.rig.solving.shutters import readout_steps, with_longer_readouts
 from rigkit.calibration.rig.solving.solver import rig_normal, solve_rig
@@ -81,7 +81,7 @@ def with_lags(
     """
     cameras, keys = len(observations.cameras), len(observations.keys)
     none = np.zeros((cameras, keys))
-    start = Moments(none[:, 0], np.zeros((keys, 0, 6)), none, np.full_like(none, np.inf), none[:, 0])
+    start = ExposureTimes(none[:, 0], np.zeros((keys, 0, 6)), none, np.full_like(none, np.inf), none[:, 0])
     start = _with_trajectories(start, solution.state, observations, times)
     if (
         timing == "trigger"
@@ -90,7 +90,7 @@ def with_lags(
         or not _lags_lower_cost(observations, solution.state, start, sigma_px)
     ):
         return observations, solution
-    lagging = replace(solution, state=replace(solution.state, moments=start))
+    lagging = replace(solution, state=replace(solution.state, exposures=start))
     for own_times in (False, True):
         for _ in range(MAX_ROUNDS):
             before = lagging.normal.cost
@@ -111,12 +111,12 @@ def _solved_again(
 ) -> Solution[RigState]:
     """Return the solution with trajectories through its own poses, and with the images' times estimated from them."""
     state = lagging.state
-    assert state.moments is not None
-    moments = _with_trajectories(state.moments, state, observations, times)
+    assert state.exposures is not None
+    exposures = _with_trajectories(state.exposures, state, observations, times)
     if own_times:
         sigma = residual_sigma(observations, lagging, sigma_px)
-        moments = _with_own_times(replace(state, moments=moments), moments, observations, sigma)
-    return solve_rig(observations, replace(state, moments=moments), sigma_px, FROM_OPTIMUM)
+        exposures = _with_own_times(replace(state, exposures=exposures), exposures, observations, sigma)
+    return solve_rig(observations, replace(state, exposures=exposures), sigma_px, FROM_OPTIMUM)
 
 
 def _with_readouts(
@@ -133,10 +133,10 @@ def _with_readouts(
         return observations, lagging
     for _ in range(MAX_ROUNDS):
         state, before = lagging.state, lagging.normal.cost
-        assert state.moments is not None
+        assert state.exposures is not None
         observations = with_longer_readouts(observations, state, step)
-        moments = replace(state.moments, readouts=state.moments.readouts + step)
-        lagging = replace(lagging, state=replace(state, moments=moments))
+        exposures = replace(state.exposures, readouts=state.exposures.readouts + step)
+        lagging = replace(lagging, state=replace(state, exposures=exposures))
         lagging = _solved_again(observations, lagging, sigma_px, times, own_times=True)
         step = readout_steps(observations, lagging.state)[0]
         if abs(before - lagging.normal.cost) < SETTLED * before:
@@ -147,26 +147,28 @@ def _with_readouts(
 def lags_of(names: Sequence[str], state: RigState, covariance: FloatArray, lags: slice) -> dict[str, Lag]:
     """Return the lags of all cameras but the first by their `names`, where they were solved for; `covariance` (G, G) is
     that of the globals, among which the slice `lags` is theirs."""
-    if state.moments is None:
+    if state.exposures is None:
         return {}
     sigmas, out = np.sqrt(np.diag(covariance)[lags]), {}
     for c, sigma in enumerate(sigmas.tolist(), 1):
-        known = state.moments.information[c]
+        known = state.exposures.information[c]
         # The only image, or the first, of a frame defines the frame's time: it has no scatter.
-        scatter = float(np.std(state.moments.own[c][np.isfinite(known)])) if np.isfinite(known).any() else 0.0
-        out[names[c]] = Lag(float(state.moments.lags[c]), sigma, scatter)
+        scatter = float(np.std(state.exposures.own[c][np.isfinite(known)])) if np.isfinite(known).any() else 0.0
+        out[names[c]] = Lag(float(state.exposures.lags[c]), sigma, scatter)
     return out
 
 
-def _with_trajectories(moments: Moments, state: RigState, observations: RigObservations, times: FloatArray) -> Moments:
-    """Return the moments with trajectories through the poses of a state."""
+def _with_trajectories(
+    exposures: ExposureTimes, state: RigState, observations: RigObservations, times: FloatArray
+) -> ExposureTimes:
+    """Return the exposure times with trajectories through the poses of a state."""
     targets = [target for _, target in observations.keys]
-    return replace(moments, trajectories=trajectories_through(state.frame_rotation, state.frame_mm, targets, times))
+    return replace(exposures, trajectories=trajectories_through(state.frame_rotation, state.frame_mm, targets, times))
 
 
-def _lags_lower_cost(observations: RigObservations, state: RigState, start: Moments, sigma_px: float) -> bool:
+def _lags_lower_cost(observations: RigObservations, state: RigState, start: ExposureTimes, sigma_px: float) -> bool:
     """Say whether a step with lags lowers the cost by more than chance would."""
-    state = replace(state, moments=start)
+    state = replace(state, exposures=start)
     normal, more = rig_normal(observations, state, sigma_px), len(state.cameras) - 1
     step, before = normal.step(STEP_DAMPING), normal.cost / max(2 * observations.corner_count, 1)
     limit = max(before, sigma_px**2) * chance_limit(more)
@@ -178,20 +180,22 @@ def _chance(observations: RigObservations, solution: Solution[RigState], sigma_p
     # Imported here: scipy is slow to import, and few rigs need it.
     from scipy.special import fdtrc
 
-    assert solution.state.moments is not None
-    found, run = solution.state.moments.lags[1:], solution.state.layout(observations).lags
+    assert solution.state.exposures is not None
+    found, run = solution.state.exposures.lags[1:], solution.state.layout(observations).lags
     known = frame_covariance(observations, solution, sigma_px, frames)[0].clustered
     size = float(found @ np.linalg.pinv(known.covariance[run, run], hermitian=True) @ found) / len(found)
     return float(fdtrc(len(found), min(known.freedom, LARGE_FREEDOM), size))
 
 
-def _with_own_times(state: RigState, moments: Moments, observations: RigObservations, sigma_px: float) -> Moments:
-    """Return the moments with the estimated time of every image and the standard deviation of a camera's times, with
-    all but the poses held; `sigma_px` is the standard deviation of a corner."""
+def _with_own_times(
+    state: RigState, exposures: ExposureTimes, observations: RigObservations, sigma_px: float
+) -> ExposureTimes:
+    """Return the exposure times with the estimated time of every image and the standard deviation of a camera's times.
+    All but the poses is held; `sigma_px` is the standard deviation of a corner."""
     by_target = _by_target(state, observations)
     free = _free(by_target)
-    products = _with_times(by_target, moments.all_speeds())
-    spread, own = np.where(free.any(axis=0), FIRST_SPREAD, 0.0), moments.own.T
+    products = _with_times(by_target, exposures.all_speeds())
+    spread, own = np.where(free.any(axis=0), FIRST_SPREAD, 0.0), exposures.own.T
     for _ in range(SPREAD_ROUNDS):
         system, information = _regularised(products, free, (sigma_px / np.maximum(spread, MIN_SPREAD)) ** 2)
         right = products[..., -1].copy()
@@ -201,7 +205,7 @@ def _with_own_times(state: RigState, moments: Moments, observations: RigObservat
         second = (found**2 + sigma_px**2 * np.einsum("fii->fi", inverse)[:, 6:]) * free
         spread = np.sqrt(second.sum(axis=0) / np.maximum(free.sum(axis=0), 1))
     information = np.where(free, information, np.inf)
-    return replace(moments, own=np.where(free, found, 0.0).T, information=information.T)
+    return replace(exposures, own=np.where(free, found, 0.0).T, information=information.T)
 
 
 def _by_target(state: RigState, observations: RigObservations) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -256,7 +260,7 @@ def _free(by_target: tuple[FloatArray, FloatArray, FloatArray]) -> BoolArray:
     return np.asarray((shown & (np.cumsum(shown, axis=0) > 1)).T)
 
 
-def _chance_of_scatter(state: RigState, observations: RigObservations, start: Moments, sigma_px: float) -> float:
+def _chance_of_scatter(state: RigState, observations: RigObservations, start: ExposureTimes, sigma_px: float) -> float:
     """Return the p-value of the agreement gained by image times of their own: permuted trajectories, which have nothing
     to do with the views, gain as much by chance."""
     by_target, rng = _by_target(state, observations), np.random.default_rng(0)

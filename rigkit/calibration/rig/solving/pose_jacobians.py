@@ -28,11 +28,11 @@ def pose_jacobians(
     """Return the derivatives for the views of camera `c`, with boards at `translation_mm` (V, 3): by targets, by its
     mount and lag if unknown, and by the boards' places on targets, then in one part for each board."""
     parts = pose_jacobians_at_exposure(observations, state, c, translation_mm)
-    if state.moments is None:
+    if state.exposures is None:
         return parts
     frame, lag = observations.frame[c], state.layout(observations).lags.start + c - 1
-    meanwhile = state.targets(c, observations)[0] @ np.swapaxes(state.frame_rotation[frame], -1, -2)
-    return [state.moments.at_reference(part, c, meanwhile[part.views], lag) for part in parts]
+    rotation_since = state.targets(c, observations)[0] @ np.swapaxes(state.frame_rotation[frame], -1, -2)
+    return [state.exposures.at_reference(part, c, rotation_since[part.views], lag) for part in parts]
 
 
 def board_velocities(observations: RigObservations, state: RigState, c: int, translation_mm: Points) -> FloatArray:
@@ -40,8 +40,8 @@ def board_velocities(observations: RigObservations, state: RigState, c: int, tra
     time."""
     out = np.zeros((len(translation_mm), 6))
     for part in pose_jacobians_at_exposure(observations, state, c, translation_mm):
-        if state.moments is not None:
-            out[part.views] = (part.target @ state.moments.speeds(c, part.poses)[:, :, None])[..., 0]
+        if state.exposures is not None:
+            out[part.views] = (part.target @ state.exposures.speeds(c, part.poses)[:, :, None])[..., 0]
     return out
 
 

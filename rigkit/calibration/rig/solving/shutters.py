@@ -1,8 +1,8 @@
 """Rolling shutters: a camera reads its image row by row, while boards move.
 
 A corner at some part of the image's height below its middle is exposed this part of the camera's `readout` time after
-the image's time, when its board has moved on (`moments`). A readout is observable in residuals that no pose of the view
-explains. Corners are then corrected to their positions at the image's time.
+the image's time, when its board has moved on (`exposure_times`). A readout is observable in residuals that no pose of
+the view explains. Corners are then corrected to their positions at the image's time.
 
 References: C. Geyer, M. Meingast, S. Sastry, "Geometric models of rolling-shutter cameras", OMNIVIS 2005. L. Oth,
 P. Furgale, L. Kneip, R. Siegwart, "Rolling shutter camera calibration", CVPR 2013.
@@ -54,9 +54,9 @@ def readout_steps(observations: RigObservations, state: RigState) -> tuple[Float
 
 def readouts_of(names: Sequence[str], state: RigState, sigmas: FloatArray) -> dict[str, Readout]:
     """Return the readouts of the cameras by their `names`, where they were solved for, with their `sigmas` (n,)."""
-    if state.moments is None or not state.moments.readouts.any():
+    if state.exposures is None or not state.exposures.readouts.any():
         return {}
-    found = zip(state.moments.readouts.tolist(), sigmas.tolist(), strict=True)
+    found = zip(state.exposures.readouts.tolist(), sigmas.tolist(), strict=True)
     return {name: Readout(*own) for name, own in zip(names, found, strict=True)}
 
 

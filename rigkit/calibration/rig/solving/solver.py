@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.rig.solving.moments import without_own_times
+from rigkit.calibration.rig.solving.exposure_times import without_own_times
 from rigkit.calibration.rig.solving.pose_jacobians import board_velocities, pose_jacobians
 from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.calibration.solving.linearise import normal_equations
@@ -35,9 +35,9 @@ def rig_data(observations: RigObservations, state: RigState) -> NormalEquations:
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
         n = normal_equations(own, alone, observations.weights[c])
-        if (moments := state.moments) is not None:
-            f, gone = observations.frame[c], board_velocities(observations, state, c, alone.translation_mm)
-            n = without_own_times(n, gone, moments.own[c, f], moments.information[c, f])
+        if (exposures := state.exposures) is not None:
+            f, velocity = observations.frame[c], board_velocities(observations, state, c, alone.translation_mm)
+            n = without_own_times(n, velocity, exposures.own[c, f], exposures.information[c, f])
         each.append(n)
         size = alone.camera.parameters.size
         # Slices of the camera's own unknowns in the rig, and in the camera's equations.
@@ -69,7 +69,7 @@ def rig_data(observations: RigObservations, state: RigState) -> NormalEquations:
                 gg[index, there] += both.T
     released = None
     # The times of images couple the points that they show.
-    if observations.shape.kind == "released" and state.moments is None:
+    if observations.shape.kind == "released" and state.exposures is None:
         released = layout.shape.start + observations.shape.basis.shape[-1]
     return replace(_joined(each), gg=gg, gp=gp, pp=pp, g=g, p=p, costs=costs, points_from=released)
 

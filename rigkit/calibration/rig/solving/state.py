@@ -6,7 +6,7 @@ whose frame is that of the first of them. Camera c sees board b of the target of
     cam_from_board = cam_from_rig[c] rig_from_target[f] target_from_board[b].
 
 Without a common trigger, rig_from_target is the pose when the first camera took its image, and each camera sees the
-target where it was at its own time (`rigkit.calibration.rig.solving.moments`).
+target where it was at its own time (`rigkit.calibration.rig.solving.exposure_times`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rigkit.calibration.rig.solving.exposure_times import ExposureTimes
 from rigkit.calibration.rig.solving.layout import Layout
-from rigkit.calibration.rig.solving.moments import Moments
 from rigkit.calibration.solving.normal_equations import SchurStep
 from rigkit.calibration.solving.shape import ShapeModel
 from rigkit.calibration.solving.state import State
@@ -90,7 +90,7 @@ class RigState:
     frame_rotation, frame_mm : (F, 3, 3) and (F, 3), rig_from_target of every key.
     board_rotation, board_mm : (B, 3, 3) and (B, 3), target_from_board of every board.
     unknowns : of the boards' shape.
-    moments : times of the images, if cameras have no common trigger.
+    exposures : times of the images, if cameras have no common trigger.
     """
 
     cameras: tuple[Camera, ...]
@@ -101,11 +101,11 @@ class RigState:
     board_rotation: Mat3
     board_mm: Points
     unknowns: FloatArray
-    moments: Moments | None = None
+    exposures: ExposureTimes | None = None
 
     def layout(self, observations: RigObservations) -> Layout:
         """Return the order of the unknowns."""
-        lags = 0 if self.moments is None else len(self.cameras) - 1
+        lags = 0 if self.exposures is None else len(self.cameras) - 1
         sizes = [c.parameters.size for c in self.cameras]
         return Layout.of(sizes, observations.places, observations.shape.count, lags)
 
@@ -113,7 +113,7 @@ class RigState:
         """Return rig_from_target of every view of camera `c` at the time of its image, (V, 3, 3) and (V, 3)."""
         f = observations.frame[c]
         poses = self.frame_rotation[f], self.frame_mm[f]
-        return poses if self.moments is None else self.moments.targets(c, f, poses)
+        return poses if self.exposures is None else self.exposures.targets(c, f, poses)
 
     def of_camera(self, c: int, observations: RigObservations) -> State:
         """Return the state of camera `c` alone, with the pose of every view in that camera."""
@@ -139,7 +139,7 @@ class RigState:
             board_rotation=exp_so3(boards[:, :3]) @ self.board_rotation,
             board_mm=self.board_mm + boards[:, 3:],
             unknowns=self.unknowns + step.globals[layout.shape],
-            moments=None if self.moments is None else self.moments.moved(step.globals[layout.lags]),
+            exposures=None if self.exposures is None else self.exposures.moved(step.globals[layout.lags]),
         )
 
     def with_frames(self, other: RigState) -> RigState:

@@ -13,7 +13,7 @@ from rigkit.calibration.rig import assemble
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.certainty.between_models import between_rig_models
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.rig.solving.moments import Lag
+from rigkit.calibration.rig.solving.exposure_times import Lag
 from rigkit.calibration.rig.verdicts import _worse
 
 LIKELY = 0.25

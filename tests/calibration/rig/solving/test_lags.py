@@ -158,14 +158,14 @@ def test_heldout_frames_do_not_choose_their_readouts() -> None:
     assert joint.timing == "readouts"
     found, _ = heldout_rms(joint, 5)
     state = joint.solution.state
-    assert state.moments is not None
+    assert state.exposures is not None
     # Corners, and the readouts known for them, that are wrong alike in all frames: the other frames set them right.
     wrong = np.full(2, 0.02)
-    moments = replace(state.moments, readouts=state.moments.readouts + wrong)
+    exposures = replace(state.exposures, readouts=state.exposures.readouts + wrong)
     moved = replace(
         joint,
         observations=with_longer_readouts(joint.observations, state, wrong),
-        solution=replace(joint.solution, state=replace(state, moments=moments)),
+        solution=replace(joint.solution, state=replace(state, exposures=exposures)),
     )
     again, _ = heldout_rms(moved, 5)
     assert found is not None and again is not None

@@ -39,7 +39,7 @@ class Lag:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Moments:
+class ExposureTimes:
     """The times of images.
 
     Attributes
@@ -57,11 +57,11 @@ class Moments:
     information: FloatArray
     readouts: FloatArray
 
-    def moved(self, step: FloatArray) -> Moments:
-        """Return the moments after a step (n - 1,) of the lags."""
+    def moved(self, step: FloatArray) -> ExposureTimes:
+        """Return the exposure times after a step (n - 1,) of the lags."""
         return replace(self, lags=self.lags + np.append(0.0, step))
 
-    def turned(self, turn: Mat3) -> Moments:
+    def turned(self, turn: Mat3) -> ExposureTimes:
         """Return the same in a rig rotated by `turn` (3, 3)."""
         return replace(self, trajectories=(self.trajectories.reshape(-1, 3) @ turn.T).reshape(self.trajectories.shape))
 
@@ -88,11 +88,11 @@ class Moments:
         times: FloatArray = self.lags[c] + self.own[c, key]
         return times[:, None]
 
-    def at_reference(self, part: PoseJacobians, c: int, meanwhile: Mat3, lag: int) -> PoseJacobians:
+    def at_reference(self, part: PoseJacobians, c: int, rotation_since: Mat3, lag: int) -> PoseJacobians:
         """Return the derivatives of views of camera `c` by the targets at the first camera's time, and by the `lag`
-        among the globals, from those by the targets at their own times, rotated by `meanwhile` (V, 3, 3) since."""
+        among the globals, from those by the targets at their own times, rotated by `rotation_since` (V, 3, 3)."""
         speed, since = self.speeds(c, part.poses)[:, :, None], np.zeros((len(part.views), 6, 6))
-        since[:, :3, :3], since[:, 3:, 3:] = meanwhile, np.eye(3)
+        since[:, :3, :3], since[:, 3:, 3:] = rotation_since, np.eye(3)
         index, follow = part.index, part.globals
         if c:
             index, follow = np.append(index, lag), np.concatenate([follow, part.target @ speed], axis=-1)
@@ -100,19 +100,19 @@ class Moments:
 
 
 def without_own_times(
-    normal: NormalEquations, gone: FloatArray, own: FloatArray, information: FloatArray
+    normal: NormalEquations, velocity: FloatArray, own: FloatArray, information: FloatArray
 ) -> NormalEquations:
     """Return the normal equations of a camera's views with the images' own times `own` (V,) eliminated. These have the
-    prior `information` (V,) and change the poses of the views by `gone` (V, 6) per unit of time."""
+    prior `information` (V,) and move the poses of the views with the `velocity` (V, 6) per unit of time."""
     (products,), free = normal.products, np.isfinite(information)
-    own, information, gone = (np.where(free, own, 0.0), np.where(free, information, 1.0), gone * free[:, None])
+    own, information, velocity = (np.where(free, own, 0.0), np.where(free, information, 1.0), velocity * free[:, None])
     pose = slice(-7, -1)
-    by_time = np.einsum("vij,vj->vi", products[:, :, pose], gone)
-    known = np.einsum("vi,vi->v", by_time[:, pose], gone) + information
+    by_time = np.einsum("vij,vj->vi", products[:, :, pose], velocity)
+    known = np.einsum("vi,vi->v", by_time[:, pose], velocity) + information
     by_time[:, -1] -= information * own
     left = products - by_time[:, :, None] * (by_time / known[:, None])[:, None]
     left[:, -1, -1] += information * own**2
-    by_globals = np.einsum("vgi,vi->vg", normal.gp, gone)
+    by_globals = np.einsum("vgi,vi->vg", normal.gp, velocity)
     part = by_globals / known[:, None]
     return replace(
         normal,
