@@ -20,17 +20,22 @@ OFF_SPACING = 0.01
 millimetre of 50. A REAL board of 88 mm tags shows 0.001 at most, however it is declared; the declaration of another
 print is wrong by 0.05."""
 
+MIN_WITHOUT_ROWS = 3
+"""Smallest number of images with a row of a board that is seen in none, from which that is reported: a cover or glare
+hides it in one or two."""
+
 
 def diagnose_boards(c: Calibration, provided: str, *, sure: bool) -> Iterator[Finding]:
-    """Yield findings about the boards whose shape was solved for.
+    """Yield findings about the boards: rows that are never seen and, where their shape was solved for, that.
 
     `provided` is the condition added to a finding about the squares' aspect ratio. That is omitted unless the lens is
     `sure`: otherwise it is correlated with the ratio of the focal lengths.
     """
     for board in c.boards:
+        name = f"board '{board.board_id}'"
+        yield from _unseen_rows(name, board, c)
         if board.kind == "flat":
             continue
-        name = f"board '{board.board_id}'"
         extent = float(np.linalg.norm(np.ptp(board.points_mm, axis=0)))
         if board.bow_mm > BOW * extent:
             yield Finding.look(
@@ -45,6 +50,33 @@ def diagnose_boards(c: Calibration, provided: str, *, sure: bool) -> Iterator[Fi
                 "measure square_x_mm and square_y_mm again",
             )
         yield from _spacing(name, board)
+
+
+def _unseen_rows(name: str, board: BoardShape, c: Calibration) -> Iterator[Finding]:
+    """Yield a finding where no image shows the first or last rows of a board with marks, though they would be in
+    several: fewer are printed than declared. Other numbers of columns, or of rows of a chessboard, fit no corners."""
+    declared = board.declared
+    views = [view for view in c.views if view.board_id == board.board_id]
+    if declared is None or not declared.identified or not views:
+        return
+    seen = np.concatenate([view.grid[:, 1] for view in views])
+    first, last = int(seen.min()), int(seen.max())
+    per = declared.pattern.points_per_count
+    unseen = declared.grid()[(declared.grid()[:, 1] < first) | (declared.grid()[:, 1] > last)]
+    if len(unseen) < per * declared.columns:
+        return
+    count = 0
+    for view in views:
+        pixels, valid = c.camera.project(view.cam_from_board.apply(declared.points(unseen)))
+        count += bool((valid & c.camera.on_image(pixels)).all())
+    if count < MIN_WITHOUT_ROWS:
+        return
+    size = f"{declared.columns // per} x {{}} {declared.pattern.count_word}"
+    yield Finding.look(
+        f"{name} is seen as {size.format((last - first + per) // per)} in {len(views)} images, "
+        f"{size.format(declared.rows // per)} are declared: {count} images would show the others",
+        f"count the rows on the board; correct rows = {declared.rows // per} unless something hides them",
+    )
 
 
 def _spacing(name: str, board: BoardShape) -> Iterator[Finding]:

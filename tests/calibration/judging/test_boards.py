@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +13,12 @@ from helpers.session_scenes import poses, seen
 
 from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.judging.boards import _spacing
-from rigkit.calibration.result import Calibration
+from rigkit.calibration.judging.boards import _spacing, _unseen_rows
+from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.core.boards import Board
 from rigkit.core.findings import Severity, worst
 from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.geometry.rigid3 import Rigid3
 
 
 def printed(result: Calibration, text: str) -> bool:
@@ -30,6 +33,34 @@ def test_tags_nearer_than_declared_are_told(declared: float, rng: np.random.Gene
     result = calibrate(views, SIZE, model="brown")
     assert printed(result, "has spacing = 0.30, 0.25 is declared") == (declared == 0.25)
     assert printed(result, "has spacing =") == (declared == 0.25)
+
+
+@pytest.mark.parametrize(("own", "count", "told"), [(4, 9, True), (8, 9, False), (4, 2, False)])
+def test_rows_that_no_image_shows_are_told(own: int, count: int, told: bool, rng: np.random.Generator) -> None:
+    """Of Kalibr's boards the last tags are in the first rows; `count` images would show them."""
+    board = Board("tags", 8, 8, 40.0, 40.0, pattern=AprilGrid(0.3))
+    views, rotations, translations = random_views(lens("reg"), 9, rng, reach_deg=33.0, board=board, noise_px=0.05)
+    results = []
+    for view, rotation, translation in zip(views, rotations, translations, strict=True):
+        kept = view.grid[:, 1] >= 8 - own
+        results.append(
+            ViewResult(
+                image=view.image,
+                board_id="tags",
+                cam_from_board=Rigid3(rotation, translation),
+                grid=view.grid[kept],
+                pixels=view.pixels[kept],
+                residuals_px=np.zeros((own * 8, 2)),
+                kept=np.ones(own * 8, bool),
+            )
+        )
+    calibration: Any = SimpleNamespace(views=results[:count], camera=lens("reg"))
+    found = _unseen_rows("board 'tags'", BoardShape("tags", "flat", board.points(), declared=board), calibration)
+    assert bool(found) == told
+    if told:
+        assert found[0].message == (
+            "board 'tags' is seen as 4 x 2 tags in 9 images, 4 x 4 tags are declared: 9 images would show the others"
+        )
 
 
 def test_one_tag_has_no_gap() -> None:
