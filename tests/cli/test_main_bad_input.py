@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,8 +13,11 @@ import cv2
 import numpy as np
 import pytest
 from helpers.data import REPOSITORY
+from helpers.trihedral_captures import BOARDS, pair_toml, write_manifest
 
 from rigkit.cli.main import main
+from rigkit.detection.detect import detect_boards
+from rigkit.synthetic.pairs import StereoScene
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "images" / "fisheye-general"
 CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
@@ -230,20 +234,21 @@ def test_a_failed_run_leaves_old_results(write: Write, tmp_path: Path, capsys: p
 
 
 def test_two_boards_are_reconstructed_and_the_missing_third_is_named(
-    write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trihedral: tuple[Path, dict[str, StereoScene]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from rigkit.detection.detect import detect_boards
-
-    image = np.asarray(cv2.imread(str(IMAGES / "view2.jpg"), cv2.IMREAD_GRAYSCALE))
+    source, scenes = trihedral
+    folder = Path(shutil.copytree(source, tmp_path / "two"))
+    image = np.asarray(cv2.imread(str(folder / "same2.png"), cv2.IMREAD_GRAYSCALE))
     lost = min(detect_boards(image), key=lambda d: d.pixels[:, 0].mean())
     hull = cv2.convexHull(lost.pixels.astype(np.float32)).astype(np.int32)
-    cv2.imwrite(str(tmp_path / "two.png"), cv2.fillConvexPoly(image.copy(), hull, 90))
-    folder = write(image2="two.png")
+    cv2.imwrite(str(folder / "same2.png"), cv2.fillConvexPoly(image.copy(), hull, 90))
+    write_manifest(folder, pair_toml(scenes["same"], "same", ("regular", "regular")))
     code = main(["reconstruct", str(folder), "-o", str(folder / "out"), "-j", "1"])
     printed = capsys.readouterr()
     assert code == 0
     assert len(list((folder / "out").rglob("*.png"))) == 3
-    assert "96 points, 2 boards" in printed.out
+    corners = sum(board.corner_count for board in BOARDS) - len(lost.pixels)
+    assert f"{corners} points, 2 boards" in printed.out
     assert "seen in image 1 only" in printed.err
 
 
