@@ -150,7 +150,7 @@ def _features(grey: NDArray[np.uint8], views: Sequence[tuple[float, float]], cou
 
     parts = []
     for tilt, roll in views:
-        image, scale = (grey, 1.0) if tilt == 1.0 else _shrunk(grey)
+        image, scale = (grey, 1.0) if tilt == 1.0 else _downscaled(grey)
         area = image.shape[0] * image.shape[1]
         most = int(np.clip(area / AREA_OF_FEATURE, *FEATURES_OF_VIEWS)) if tilt == 1.0 else FEATURES_OF_VIEWS[0]
         view, mask, view_from_image = _tilted_view(image, tilt, roll)
@@ -173,7 +173,7 @@ def _features(grey: NDArray[np.uint8], views: Sequence[tuple[float, float]], cou
     return _Features(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def _shrunk(grey: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
+def _downscaled(grey: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
     """Return the image shrunk to at most MAX_TILTED_AREA, and the size of its pixels in those of the original."""
     import cv2
 

@@ -25,7 +25,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.processes import SerialExecutor
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
-from rigkit.planning.goal import Goal, RemainingError, Requirement, projection_goal, px_words, turned_design
+from rigkit.planning.goal import Goal, RemainingError, Requirement, projection_goal, px_words, rotation_free_jacobian
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import Plan, Proposal, covariance_of, plan_views
@@ -246,7 +246,7 @@ class CaptureGuide:
             camera = plan.knowledge.camera
             pixels = grid_pixels(camera.size_px, LIVE_GRID).reshape(-1, 2)
             rays, valid = camera.unproject(pixels)
-            turned = turned_design(camera, rays[valid])
+            turned = rotation_free_jacobian(camera, rays[valid])
             p = camera.parameters.size
             covariance = covariance_of(plan.knowledge.information)[:p, :p]
             sigma = np.full(len(pixels), np.nan)

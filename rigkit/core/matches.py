@@ -176,7 +176,7 @@ class Matches:
             sigma_A=sigma_A,
         )
 
-    def through(self, camera1: CentralCamera, camera2: CentralCamera) -> Matches:
+    def with_cameras(self, camera1: CentralCamera, camera2: CentralCamera) -> Matches:
         """Return the matches of the same pixels in other cameras, without affinities."""
         return Matches.from_cameras(
             camera1,

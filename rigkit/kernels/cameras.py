@@ -22,7 +22,7 @@ def brown_pixels(
 
     `max_r` is the tangent of the largest angle of the field of view of the camera, which has 8, 9 or 12 `parameters`.
     """
-    camera = {"parameters": _of_twelve(parameters), "rational": int(parameters.size > 9), "max_r": max_r}
+    camera = {"parameters": _brown_parameters(parameters), "rational": int(parameters.size > 9), "max_r": max_r}
     kernel = kernels().differentiate_brown
     return _written(kernel, "brown_points_t", points, d_pixels_d_point, d_pixels_d_parameters, camera)
 
@@ -33,10 +33,10 @@ def brown_places(
     """Return the (x, y) (2, N) at unit depth that a camera distorts to m (2, N), by Newton's method from `start` (2, N)
     within the circle of radius `max_r`, and which converged (N,)."""
     plane = np.array(start, order="C")
-    return plane, kernels().undistort_brown(_of_twelve(parameters), max_r, parameters.size > 9, m, plane)
+    return plane, kernels().undistort_brown(_brown_parameters(parameters), max_r, parameters.size > 9, m, plane)
 
 
-def _of_twelve(parameters: FloatArray) -> FloatArray:
+def _brown_parameters(parameters: FloatArray) -> FloatArray:
     """Return the twelve parameters of Brown's model, zero where the camera has none."""
     return np.concatenate([parameters, np.zeros(12 - parameters.size)])
 

@@ -88,7 +88,7 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
         spot[moving] += push
         moving = moving[push.any(axis=1)]
     held, good = _placed(camera, board, spot, facing, square_px, middle)
-    good &= sees_held(camera, board, held, reach)
+    good &= board_in_view(camera, board, held, reach)
     distance = np.linalg.norm(held.rotation @ middle + held.translation_mm, axis=-1)
     good &= (distance >= reach.nearest_mm) & (distance <= reach.farthest_mm)
     if not good.any():
@@ -99,7 +99,7 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
     return held.chosen(np.flatnonzero(good)[:CANDIDATES_KEPT])
 
 
-def sees_held(camera: Camera, board: Board, held: HeldBoards, reach: Reach) -> BoolArray:
+def board_in_view(camera: Camera, board: Board, held: HeldBoards, reach: Reach) -> BoolArray:
     """Say for each of C poses whether the camera sees the whole board, large enough and not too slanted."""
     return _inside(camera, held.in_cam(outline_mm(board)), reach.field_deg) & _squares_visible(camera, board, held)
 

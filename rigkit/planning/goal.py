@@ -91,7 +91,7 @@ def projection_goal(camera: Camera, field_deg: float | None = None, pixels: Pixe
     if pixels is None:
         pixels = grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2)
     rays = rays_within(camera, pixels, field_deg)
-    left = turned_design(camera, rays).reshape(-1, camera.parameters.size)
+    left = rotation_free_jacobian(camera, rays).reshape(-1, camera.parameters.size)
     return Goal(left.T @ left / len(rays), "px", "rms error of the projection over the image")
 
 
@@ -106,7 +106,7 @@ def px_words(camera: Camera, error_px: float) -> str:
     return f"{error_px:.2g} px, {aside:.2g} mm at 1 m"
 
 
-def turned_design(camera: Camera, rays: Rays) -> FloatArray:
+def rotation_free_jacobian(camera: Camera, rays: Rays) -> FloatArray:
     """Return d pixel / d parameters along rays (N, 3) at infinity, (N, 2, P), after the rotation that compensates them
     best."""
     p = camera.parameters.size

@@ -27,7 +27,7 @@ class SharedViews:
     in_b: HeldBoards
     error: CornerError
 
-    def carried(self) -> tuple[FloatArray, FloatArray]:
+    def rotations_and_offsets(self) -> tuple[FloatArray, FloatArray]:
         """Return the rotations (C, 3, 3) of b_from_a, and the boards' origins in a rotated by them, (C, 3) mm."""
         turn = self.in_b.rotation @ np.swapaxes(self.in_a.rotation, -1, -2)
         return turn, np.einsum("cij,cj->ci", turn, self.in_a.translation_mm)
@@ -36,7 +36,7 @@ class SharedViews:
 def mount_information(shared: SharedViews) -> FloatArray:
     """Return the information of each of C shared boards about b_from_a, (C, 6, 6): about a rotation around the origin
     of b (rad) and a translation (mm)."""
-    turn, rotated = shared.carried()
+    turn, rotated = shared.rotations_and_offsets()
     by_a, by_b = np.zeros((len(turn), 6, 6)), np.zeros((len(turn), 6, 6))
     # With b_from_a = B A^-1, errors (w, v) of either pose, x -> exp(w) R x + t + v, make w = w_b - R_ba w_a and
     # v = v_b - R_ba v_a - w x (R_ba t_a).
@@ -52,7 +52,7 @@ def mount_information(shared: SharedViews) -> FloatArray:
 def mount_error_px(shared: SharedViews, information: FloatArray) -> FloatArray:
     """Return the rms error (...), px, of the boards' corners predicted in b from their poses in a, with the mount known
     from each of `information` (..., 6, 6)."""
-    turn, lever = shared.carried()
+    turn, lever = shared.rotations_and_offsets()
     # A rotation around the origin of b moves the board's origin, too.
     as_pose = np.tile(np.eye(6), (len(turn), 1, 1))
     as_pose[:, 3:, :3] = -skew(lever)

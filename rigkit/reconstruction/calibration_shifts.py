@@ -106,7 +106,7 @@ def _reestimated(
     """
     camera1, camera2, given = there
     captured = replace(r.matches.select(seen), pixels1=r.pixels1[seen], pixels2=r.pixels2[seen])
-    matches = captured.through(camera1, camera2)
+    matches = captured.with_cameras(camera1, camera2)
     scale = float(np.linalg.norm(given.translation_mm))
     pose = Rigid3(given.rotation, given.translation_mm / scale)
     if not pose_is_known:

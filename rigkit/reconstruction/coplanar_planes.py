@@ -198,7 +198,7 @@ def _result(
         (points_mm, cam2_from_cam1.apply(points_mm)),
     )
     for cameras in moved:
-        there = problem.through(cameras, moved_pixels(pixels, in_cameras, known, cameras))
+        there = problem.with_cameras(cameras, moved_pixels(pixels, in_cameras, known, cameras))
         change = there.corners(state)[0].ravel() - residuals
         step = -of_free @ here.jacobian[: 2 * count].T @ change / factor
         # At a fixed state only the points move, and with them the scale.

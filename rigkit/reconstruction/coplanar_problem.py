@@ -77,9 +77,9 @@ class CoplanarProblem:
     def select(self, which: BoolArray) -> CoplanarProblem:
         return replace(self, matches=self.matches.select(which), bases2=self.bases2[which])
 
-    def through(self, cameras: tuple[Camera, Camera], pixels: tuple[Pixels, Pixels]) -> CoplanarProblem:
+    def with_cameras(self, cameras: tuple[Camera, Camera], pixels: tuple[Pixels, Pixels]) -> CoplanarProblem:
         """Return the same corners, at new pixels, for other cameras."""
-        seen = replace(self.matches, pixels1=pixels[0], pixels2=pixels[1]).through(*cameras)
+        seen = replace(self.matches, pixels1=pixels[0], pixels2=pixels[1]).with_cameras(*cameras)
         seen = seen if self.frames is None else self.frames.matches(seen)
         return replace(self, matches=seen, bases2=np.asarray(np.linalg.pinv(seen.jacobians2)))
 

@@ -110,7 +110,7 @@ def lattice_planes(
     covariance[np.ix_(free, free)] = of_free
     known = known1, known1 if one_camera else known2
     for k, cameras in enumerate(moved):
-        change = problem.through(cameras, problem.moved_pixels(state, known, cameras)).residuals(state) - data
+        change = problem.with_cameras(cameras, problem.moved_pixels(state, known, cameras)).residuals(state) - data
         moves[k, free] = -of_free @ here.jacobian[: len(data)].T @ change / factor
     poses = [Rigid3.from_matrix(matrix) for matrix in (state[0], *state[1])]
     return LatticePlanes(
@@ -192,7 +192,7 @@ class LatticeProblem:
             points.append(p @ motion[:3, :3].T + motion[:3, 3] if second else p)
         return moved_pixels(self.pixels, (points[0], points[1]), known, moved)
 
-    def through(self, cameras: tuple[Camera, Camera], pixels: tuple[Pixels, Pixels]) -> LatticeProblem:
+    def with_cameras(self, cameras: tuple[Camera, Camera], pixels: tuple[Pixels, Pixels]) -> LatticeProblem:
         """Return the same corners, at new pixels, for other cameras."""
         first, second = (
             observed_corners(camera, at, c.sigma_px, c.points, c.board)

@@ -82,7 +82,7 @@ class KnownPose:
         squares = np.zeros(len(matches))
         for camera1, camera2, pose in self.moved:
             seen = visible_in_all([(camera1, camera2)], matches.pixels1, matches.pixels2)
-            there = matches.select(seen).through(camera1, camera2)
+            there = matches.select(seen).with_cameras(camera1, camera2)
             squares[seen] += (sampson_of_matches(essential_from_pose(pose), there) - here[seen]) ** 2
         return np.sqrt(squares)
 
@@ -148,12 +148,12 @@ def fit_scene_pose(
     Raises DegenerateError without a pose, or if the pose is not of the type `declared`.
     """
     try:
-        return _fitted(matches, declared, level_sigma_rad, rng, start)
+        return _estimate(matches, declared, level_sigma_rad, rng, start)
     except DegenerateError as error:
         if declared in (PoseType.AUTO, PoseType.GENERAL) or start is not None:
             raise
         try:
-            other = _fitted(matches, PoseType.GENERAL, None, rng, None)
+            other = _estimate(matches, PoseType.GENERAL, None, rng, None)
         except (InputError, DegenerateError):
             raise error from None
         pose = other.refined.cam2_from_cam1
@@ -166,7 +166,7 @@ def fit_scene_pose(
         ) from error
 
 
-def _fitted(
+def _estimate(
     matches: Matches, declared: PoseType, level_sigma_rad: float | None, rng: np.random.Generator, start: Rigid3 | None
 ) -> ScenePose:
     pose, pose_type = start, declared

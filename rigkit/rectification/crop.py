@@ -39,7 +39,7 @@ def largest_rectangle(seen: BoolArray) -> tuple[int, int, int, int]:
     step = max(-(-max(seen.shape) // COARSE), 1)
     rows, columns = (size // step for size in seen.shape)
     cells = seen[: rows * step, : columns * step].reshape(rows, step, columns, step)
-    left, top, right, bottom = (step * edge for edge in _of_cells(np.asarray(cells.all(axis=(1, 3)))))
+    left, top, right, bottom = (step * edge for edge in _largest_true_rectangle(np.asarray(cells.all(axis=(1, 3)))))
     if right == left:
         return 0, 0, 0, 0
     grown = True
@@ -56,7 +56,7 @@ def largest_rectangle(seen: BoolArray) -> tuple[int, int, int, int]:
     return left, top, right, bottom
 
 
-def _of_cells(whole: BoolArray) -> tuple[int, int, int, int]:
+def _largest_true_rectangle(whole: BoolArray) -> tuple[int, int, int, int]:
     """Return the largest rectangle of True cells: the largest one in each row's histogram of heights, by a stack."""
     best, found = 0, (0, 0, 0, 0)
     height = np.zeros(whole.shape[1], dtype=np.int64)

@@ -76,7 +76,7 @@ def scene_svg(scene: Mapping[str, Any]) -> str:
 
     height = zoom * (high[1] - low[1]) + 2.0 * SCENE_RIM
     shown = f'width="{SCENE_WIDTH:g}" style="background: #fff"'
-    out = [svg.opened("cameras and boards", f"0 0 {SCENE_WIDTH:g} {height:.0f}", size=11, more=shown)]
+    out = [svg.opening_tag("cameras and boards", f"0 0 {SCENE_WIDTH:g} {height:.0f}", size=11, more=shown)]
     for plane, corners in zip(scene["planes"], planes, strict=True):
         colour = SHADES[plane["board"] % len(SHADES)]
         outline = svg.line(drawn(corners))
@@ -91,7 +91,7 @@ def scene_svg(scene: Mapping[str, Any]) -> str:
         below = max(float(y) for _, y in (tip, *base)) + SCENE_RIM - 3.0
         wire = svg.line(np.array(base)) + "Z" + "".join(svg.line(np.array([tip, corner])) for corner in base)
         out.append(f'<path d="{wire}" fill="none" stroke="#333"/>')
-        out.append(svg.words(tip[0], below, camera["name"]))
+        out.append(svg.label(tip[0], below, camera["name"]))
     return "".join([*out, "</svg>"])
 
 

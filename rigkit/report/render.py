@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigkit.core.tables import Cell, Column, Table
-from rigkit.report.tables import below, column_label, measured_words, text_columns
+from rigkit.report.tables import column_label, measured_words, table_notes, text_columns
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -49,7 +49,7 @@ def table_context(table: Table, pictures: Sequence[str | None] = ()) -> dict[str
             [_cell_context(c, column) for c, column in zip(row, table.columns, strict=True)] for row in table.rows
         ],
         "pictures": list(pictures) if any(pictures) else [],
-        "below": below(table),
+        "below": table_notes(table),
     }
 
 

@@ -18,7 +18,7 @@ INK, MARK, WRONG, SOFT = "#1f4e8c", "#e6550d", "#b3261e", "#8a94a3"
 ROUND = (1.0, 2.0, 5.0, 10.0)
 
 
-def opened(title: str, box: str, *, size: float = 13, more: str = "") -> str:
+def opening_tag(title: str, box: str, *, size: float = 13, more: str = "") -> str:
     """Return the opening of a drawing with the viewBox `box`, the font `size` and `more` attributes."""
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" role="img" font-family="sans-serif" '
@@ -29,12 +29,12 @@ def opened(title: str, box: str, *, size: float = 13, more: str = "") -> str:
 def image_ground(title: str, width: float, height: float) -> str:
     """Return the opening of a drawing over an image, with the image's frame."""
     return (
-        opened(title, f"-1 -1 {width + 2:g} {height + 2:.1f}")
+        opening_tag(title, f"-1 -1 {width + 2:g} {height + 2:.1f}")
         + f'<rect width="{width:g}" height="{height:.1f}" fill="{GROUND_COLOUR}" stroke="{RIM_COLOUR}"/>'
     )
 
 
-def words(x: float, y: float, text: str, anchor: str = "start", colour: str = WORDS_COLOUR) -> str:
+def label(x: float, y: float, text: str, anchor: str = "start", colour: str = WORDS_COLOUR) -> str:
     """Return a line of text."""
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{colour}">{escape(text)}</text>'
 

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,12 +43,8 @@ def tables_to_markdown(tables: Sequence[Table]) -> str:
             _markdown_row([":--" if left else "--:" for left in text_columns(table)]),
         ]
         for row in table.rows:
-            cells = []
-            for cell, column in zip(row, table.columns, strict=True):
-                text = _escape_markdown(_text(cell, column))
-                cells.append(f"**{text}**" if text and (cell.best or cell.failed) else text)
-            lines.append(_markdown_row(cells))
-        lines += ["", *filter(None, [_escape_markdown(below(table))])]
+            lines.append(_markdown_row(_with_bold(row, table.columns, _escape_markdown, "**{}**")))
+        lines += ["", *filter(None, [_escape_markdown(table_notes(table))])]
         parts.append("\n".join(lines).rstrip() + "\n")
     return "\n".join(parts)
 
@@ -90,7 +86,7 @@ def tables_to_latex(tables: Sequence[Table]) -> str:
         lines = [
             r"\begin{table}",
             r"\centering",
-            rf"\caption{{{_escape_latex((table.title + '. ' + below(table)).strip())}}}",
+            rf"\caption{{{_escape_latex((table.title + '. ' + table_notes(table)).strip())}}}",
             rf"\label{{tab:{table.key}}}",
             r"\resizebox{\textwidth}{!}{%",
             rf"\begin{{tabular}}{{{''.join('l' if left else 'r' for left in text_columns(table))}}}",
@@ -104,11 +100,7 @@ def tables_to_latex(tables: Sequence[Table]) -> str:
             if table.key == "planes" and group and kind != group:
                 lines.append(r"\midrule")
             group = kind
-            cells = []
-            for cell, column in zip(row, table.columns, strict=True):
-                text = _escape_latex(_text(cell, column))
-                cells.append(rf"\textbf{{{text}}}" if text and (cell.best or cell.failed) else text)
-            lines.append(" & ".join(cells) + r" \\")
+            lines.append(" & ".join(_with_bold(row, table.columns, _escape_latex, r"\textbf{{{}}}")) + r" \\")
         lines += [r"\bottomrule", r"\end{tabular}}", r"\end{table}"]
         parts.append("\n".join(lines) + "\n")
     return "\n".join(parts)
@@ -143,7 +135,7 @@ def tables_to_text(tables: Sequence[Table]) -> str:
         widths = [max(len(line[j]) for line in grid) for j in range(len(table.columns))]
         pad = [str.ljust if left else str.rjust for left in text_columns(table)]
         lines = ["  ".join(p(t, w) for p, t, w in zip(pad, line, widths, strict=True)).rstrip() for line in grid]
-        parts.append("\n".join([table.title, *lines, *filter(None, [below(table)])]))
+        parts.append("\n".join([table.title, *lines, *filter(None, [table_notes(table)])]))
     return "\n\n".join(parts)
 
 
@@ -221,7 +213,7 @@ def text_columns(table: Table) -> list[bool]:
     return [any(isinstance(row[j].value, str) for row in table.rows) for j in range(len(table.columns))]
 
 
-def below(table: Table) -> str:
+def table_notes(table: Table) -> str:
     """Return the text below a table: its note, and the meaning of brackets if there are any."""
     printed = any(cell.paper is not None for row in table.rows for cell in row)
     return " ".join(filter(None, [table.note, "In brackets: the paper's." if printed else ""]))
@@ -240,6 +232,12 @@ def _csv_value(value: float | str | None) -> str:
     if isinstance(value, str):
         return _csv_text(value)
     return str(int(value)) if float(value).is_integer() else repr(float(value))
+
+
+def _with_bold(row: Sequence[Cell], columns: Sequence[Column], escape: Callable[[str], str], bold: str) -> list[str]:
+    """Return the cells as escaped text, the best and failed ones in the form `bold`."""
+    texts = [(cell, escape(_text(cell, column))) for cell, column in zip(row, columns, strict=True)]
+    return [bold.format(text) if text and (cell.best or cell.failed) else text for cell, text in texts]
 
 
 def _markdown_row(cells: Sequence[str]) -> str:

@@ -208,12 +208,12 @@ class _Scene:
     def _directions(self, pixels1: Pixels, pixels2: Pixels, support: str) -> DirectionPairs:
         board, trials = self.study.board, self.shape[0]
         lattices = [p.reshape(trials, STUDY_PLANES, board.rows, board.columns, 2) for p in (pixels1, pixels2)]
-        both = [self._along(lattice, support).reshape(-1, 3, 2) for lattice in lattices]
+        both = [self._lattice_directions(lattice, support).reshape(-1, 3, 2) for lattice in lattices]
         return DirectionPairs(
             image1=both[0], image2=both[1], valid=np.asarray(np.isfinite(np.stack(both)).all(axis=(0, -1)))
         )
 
-    def _along(self, lattices: Pixels, support: str) -> FloatArray:
+    def _lattice_directions(self, lattices: Pixels, support: str) -> FloatArray:
         """Return the directions of lattices (trials, planes, rows, columns, 2), in a batch if there is a formula."""
         if support == "chord":
             return chord_directions(lattices)

@@ -18,8 +18,8 @@ def chord_directions(lattice: Pixels) -> FloatArray:
     ----------
     lattice : (..., rows, columns, 2) corners of a perspective image, px; three rows and columns at least.
     """
-    horizontal = _ahead(lattice, -2)
-    vertical = _ahead(lattice, -3)
+    horizontal = _forward_differences(lattice, -2)
+    vertical = _forward_differences(lattice, -3)
     diagonal = np.empty_like(lattice)
     step = lattice[..., 1:, 1:, :] - lattice[..., :-1, :-1, :]
     diagonal[..., :-1, :-1, :] = step
@@ -44,7 +44,7 @@ def harmonic_directions(lattice: Pixels) -> FloatArray:
     return np.stack([horizontal, vertical, horizontal + vertical], axis=-2)
 
 
-def _ahead(lattice: Pixels, axis: int) -> FloatArray:
+def _forward_differences(lattice: Pixels, axis: int) -> FloatArray:
     step = np.diff(lattice, axis=axis)
     return np.concatenate([step, np.take(step, [-1], axis=axis)], axis=axis)
 

@@ -125,7 +125,7 @@ def _design(places: FloatArray) -> FloatArray:
     return np.concatenate([np.ones((len(places), 1)), places], axis=1)
 
 
-def place_moved(points_mm: Points, places: FloatArray, like: Plane) -> BoardPlace:
+def place_perturbed(points_mm: Points, places: FloatArray, like: Plane) -> BoardPlace:
     """Return plane and lattice for M perturbed copies (M, N, 3) of the points that `like` was fitted to.
 
     `places` (N, 2) are the points' places on the board, in squares.

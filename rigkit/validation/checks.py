@@ -126,8 +126,8 @@ class ValidationReport:
             "flatness_rms_mm": plane.rms_mm,
             "flatness_peak_mm": plane.peak_mm,
             "normal_errors": asdict(result.normal_errors),
-            "coplanar_normal_errors": _plain(self.coplanar_normal_errors.get(board_id)),
-            "lattice_normal_errors": _plain(self.lattice_normal_errors.get(board_id)),
+            "coplanar_normal_errors": _normal_errors_dict(self.coplanar_normal_errors.get(board_id)),
+            "lattice_normal_errors": _normal_errors_dict(self.lattice_normal_errors.get(board_id)),
             "square_x_ratio": result.square_x_ratio,
             "square_y_ratio": result.square_y_ratio,
             "skew_deg": result.skew_deg,
@@ -285,5 +285,5 @@ def _outlier_notes(boards: Iterable[BoardResult]) -> list[str]:
     ]
 
 
-def _plain(errors: NormalErrors | None) -> dict[str, Any] | None:
+def _normal_errors_dict(errors: NormalErrors | None) -> dict[str, Any] | None:
     return None if errors is None else asdict(errors)

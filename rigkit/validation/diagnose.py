@@ -103,7 +103,7 @@ def diagnose_cameras(
             aspect, left = _best_stretch(cameras[name], detections[number - 1], boards)
             cause = "; was the lens changed or refocused after the calibration?"
             if left * CLEARLY_BETTER < fit[name]:
-                cause = f", {left:.2f} px with squares {_stretch(aspect)}; {MEASURE_SIDES}{OR_ASPECT}"
+                cause = f", {left:.2f} px with squares {_aspect_words(aspect)}; {MEASURE_SIDES}{OR_ASPECT}"
             out.append(
                 f"pair '{pair_id}': image {number} does not fit the calibration of '{name}': poses of single boards "
                 f"leave a reprojection error of {fit[name]:.2f} px{cause}"
@@ -230,13 +230,13 @@ def _diagnose_boards(reports: Sequence[ValidationReport]) -> list[str]:
     measure_sides = f"{MEASURE_SIDES}{OR_ASPECT}" if all_alike else MEASURE_SIDES
     if all_alike and len(found) > 1:
         names = ", ".join(f"'{name}'" for name in found)
-        words = f"boards {names}: their squares are reconstructed {_stretch(float(np.median(aspects)))}"
+        words = f"boards {names}: their squares are reconstructed {_aspect_words(float(np.median(aspects)))}"
         return [*out, f"{words}; {measure_sides}"]
     for name, squares in found.items():
         if squares.stretched:
             out.append(
-                f"board '{name}': its squares are reconstructed {_stretch(squares.aspect)} ({squares.fitting_words}); "
-                f"{measure_sides}"
+                f"board '{name}': its squares are reconstructed {_aspect_words(squares.aspect)} "
+                f"({squares.fitting_words}); {measure_sides}"
             )
         elif abs(squares.size - 1.0) > ODD_BOARD and not squares.implausible:
             out.append(
@@ -271,7 +271,7 @@ def _squares(reports: Sequence[ValidationReport]) -> dict[str, _SquareSizes]:
     }
 
 
-def _stretch(aspect: float) -> str:
+def _aspect_words(aspect: float) -> str:
     longer, other = ("wider", "high") if aspect > 1.0 else ("higher", "wide")
     return f"{100.0 * (max(aspect, 1.0 / aspect) - 1.0):.1f} % {longer} than {other} relative to the declaration"
 

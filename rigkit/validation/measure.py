@@ -20,7 +20,7 @@ from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.triangulation import point_uncertainty
 from rigkit.reconstruction.calibration_shifts import CalibrationShifts
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.validation.boards import BoardPlace, BoardResult, measure_board, place_moved, places_on
+from rigkit.validation.boards import BoardPlace, BoardResult, measure_board, place_perturbed, places_on
 from rigkit.validation.planes import angle_jacobian, face_angle, normal_errors
 
 Boards = dict[str, BoardResult]
@@ -109,7 +109,7 @@ def measure(
             seen = (cloud.points_mm[on], cloud.normals[on], cloud.grid[on])
             found = measure_board(board, *seen, covariance[on] if usable else None, common[:, on])
             boards[board.board_id] = found
-            moved[board.board_id] = place_moved(points[:, on], places_on(board, cloud.grid[on]), found.plane)
+            moved[board.board_id] = place_perturbed(points[:, on], places_on(board, cloud.grid[on]), found.plane)
     return Measured(boards, moved)
 
 

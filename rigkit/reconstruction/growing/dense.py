@@ -33,7 +33,7 @@ from rigkit.reconstruction.growing.grow import (
     grow,
     grow_in_both_directions,
 )
-from rigkit.reconstruction.growing.propagate import kept, propagate_planes
+from rigkit.reconstruction.growing.propagate import at_best_depth, propagate_planes
 from rigkit.reconstruction.growing.surface import WINDOW_AREA_PX, GrownSurface, PairRays, fit_surface
 from rigkit.reconstruction.growing.sweep import fill_by_sweep
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_lens_errors
@@ -150,7 +150,7 @@ def grow_scene(
     measured = rays.measured(pose)
     surface = fit_surface(measured, step, even.pose.epipolar_rms_px)
     if sweep is not None:
-        surface = surface.where(kept(surface, grown, measured.slope, sweep, view1))
+        surface = surface.where(at_best_depth(surface, grown, measured.slope, sweep, view1))
         surface, grown = propagate_planes(surface, grown, measured.slope, sweep, view1, view2, pose)
         rays = PairRays.of(grown, r.camera1, r.camera2)
     by_pose = _planes_by_pose(rays, pose, covariance)
@@ -312,7 +312,7 @@ def _change_of_pose(even: _PoseOfPairs, r: Reconstruction, cameras: tuple[Camera
     t = pose.translation_mm
     seen = np.flatnonzero(visible_in_all([cameras], m.pixels1, m.pixels2))
     here = m.select(seen)
-    there = here.through(*cameras)
+    there = here.with_cameras(*cameras)
     before, after = (point_terms(each, pose.rotation, t, translation_basis(t))[0] for each in (here, there))
     return np.asarray(np.repeat([1.0, r.baseline_mm], 3) * (even.pose.by_distance[:, seen] @ (after - before)))
 

@@ -31,7 +31,9 @@ SAME_PLANE_PX = 0.5
 """Largest difference along the epipolar line of planes that agree: finer than the sweep's samples."""
 
 
-def kept(surface: GrownSurface, grown: GrownPatches, slope: FloatArray, sweep: Sweep, view1: GrowingView) -> BoolArray:
+def at_best_depth(
+    surface: GrownSurface, grown: GrownPatches, slope: FloatArray, sweep: Sweep, view1: GrowingView
+) -> BoolArray:
     """Return a mask (R, C) of the nodes whose plane fits the images better than any parallel one, both at the node and
     at the pixel that its patch measured, which may be beyond an edge."""
     out = surface.valid.copy()

@@ -138,10 +138,10 @@ class PairRays:
         covariance = to_z @ (self.grown.covariance[self.grown.valid] + self._model_error()) @ np.swapaxes(to_z, 1, 2)
         good &= np.isfinite(covariance).all(axis=(1, 2))
         return NodeMeasurements(
-            z=self._spread(z, good),
-            covariance=self._spread(covariance, good),
-            frame=self._spread(self._frames(), good),
-            slope=self._spread(slope, good),
+            z=self._on_grid(z, good),
+            covariance=self._on_grid(covariance, good),
+            frame=self._on_grid(self._frames(), good),
+            slope=self._on_grid(slope, good),
             swept=self.grown.swept,
         )
 
@@ -161,7 +161,7 @@ class PairRays:
         z, _, _, good = self._values(cam2_from_cam1)
         out = np.full(z.shape, np.nan)
         out[good] = np.linalg.solve(self._frames()[good], z[good][..., None])[..., 0]
-        return self._spread(out, good)
+        return self._on_grid(out, good)
 
     def _frames(self) -> FloatArray:
         """Return `frame` (K, 3, 3) of `NodeMeasurements`."""
@@ -181,7 +181,7 @@ class PairRays:
             z = np.concatenate([inverse[:, None], inverse[:, None] ** 2 * y], axis=1)
             return z, along, length / inverse**2, valid & self.seen & np.isfinite(z).all(axis=1)
 
-    def _spread(self, values: FloatArray, good: BoolArray) -> FloatArray:
+    def _on_grid(self, values: FloatArray, good: BoolArray) -> FloatArray:
         """Return values (K, ...) on the grid (R, C, ...), NaN if not `good`."""
         shape = self.grown.valid.shape
         out = np.full((shape[0] * shape[1], *values.shape[1:]), np.nan)

@@ -172,8 +172,8 @@ def fill_by_sweep(
     sweep = replace(sweep, winners=level, seen=good)
     good = (
         good
-        & (_at(_contrast(view1), sweep.pixels1) > MIN_SWEPT_CONTRAST)
-        & (_at(_image_circle(view1), sweep.pixels1) == 1.0)
+        & (_sampled(_contrast(view1), sweep.pixels1) > MIN_SWEPT_CONTRAST)
+        & (_sampled(_image_circle(view1), sweep.pixels1) == 1.0)
     )
     spacing = sweep.inverse[1] - sweep.inverse[0]
     at_nodes = (measured.z[..., 0] - sweep.inverse[0]) / spacing
@@ -206,12 +206,12 @@ def _sweep(
     shape = int((height - 1) // step) + 1, int((width - 1) // step) + 1
     coarse = [np.arange(0, n + TABLE_SPACING, TABLE_SPACING) * step for n in reversed(shape)]
     rays, seen = view1.camera.unproject(np.stack(np.meshgrid(*coarse), axis=-1))
-    places, valid = view2.camera.project(_turned(rays, levels[:, None, None], cam2_from_cam1))
+    places, valid = view2.camera.project(_directions_in_cam2(rays, levels[:, None, None], cam2_from_cam1))
     table = np.where((valid & seen)[..., None], places, np.nan).astype(np.float32)
     fine = np.stack(np.meshgrid(*(step * np.arange(n) for n in reversed(shape))), axis=-1)
     rays1, seen1 = view1.camera.unproject(fine)
     pixels1 = fine.astype(np.float32)
-    samples1 = _at(_smooth(view1, step), pixels1)
+    samples1 = _sampled(_smooth(view1, step), pixels1)
     return Sweep(
         inverse=levels,
         step_px=step,
@@ -224,12 +224,12 @@ def _sweep(
     )
 
 
-def _turned(rays: FloatArray, inverse: FloatArray, cam2_from_cam1: Rigid3) -> FloatArray:
+def _directions_in_cam2(rays: FloatArray, inverse: FloatArray, cam2_from_cam1: Rigid3) -> FloatArray:
     """Return the directions, in the frame of camera 2, of points at inverse ranges on rays (..., 3)."""
     return np.asarray(rays @ cam2_from_cam1.rotation.T + inverse[..., None] * cam2_from_cam1.translation_mm)
 
 
-def _at(image: NDArray[np.float32], places: NDArray[np.float32]) -> NDArray[np.float32]:
+def _sampled(image: NDArray[np.float32], places: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the image at pixels (R, C, 2), interpolated; NaN outside."""
     u, v = (np.ascontiguousarray(places[..., k]) for k in (0, 1))
     read = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
@@ -269,7 +269,7 @@ def _winners(
     level = np.asarray(np.clip(inner + part, 0.0, count - 1.0), np.float64)
     # At the first and last level the surface may be beyond the sweep.
     inside = (best > 0) & (best < count - 1)
-    place, seen = view2.camera.project(_turned(sweep.rays1, sweep.inverse[best], cam2_from_cam1))
+    place, seen = view2.camera.project(_directions_in_cam2(sweep.rays1, sweep.inverse[best], cam2_from_cam1))
     inside &= seen
     width, height = view2.size_px
     with np.errstate(invalid="ignore"):

@@ -97,7 +97,7 @@ def pose_with_lens_errors(
         change = np.zeros(5)
         change[free] = found.mean
         R, t = exp_so3(change[:3]) @ R, unit(t + change[3:] @ basis)
-    covariance = found.covariance + _of_frames(lenses, found.variances, R, t, basis)[np.ix_(free, free)]
+    covariance = found.covariance + _covariance_of_frames(lenses, found.variances, R, t, basis)[np.ix_(free, free)]
     spread = to_five[free].T
     by_row = -found.inverse @ (rows * weight[:, None]).T
     # Sampson's distance moves both pixels.
@@ -122,7 +122,7 @@ def _lens_rows(
     return np.concatenate(rows, axis=1)[:, order], families[order]
 
 
-def _of_frames(
+def _covariance_of_frames(
     lenses: tuple[ErrorModes, ErrorModes], variances: FloatArray, R: FloatArray, t: FloatArray, basis: FloatArray
 ) -> FloatArray:
     """Return the covariance (5, 5) of the pose by the rotations of the cameras that were removed from the modes, for

@@ -70,7 +70,7 @@ def solve_planar_batch(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
     G = np.asarray(gram, dtype=np.float64)
     size = np.trace(G, axis1=1, axis2=2)
     G = G / np.where(size > 0.0, size, 1.0)[:, None, None]
-    e = _polished(G, _unit_pairs(_dual_optimum(G)))
+    e = _newton_refined(G, _unit_pairs(_dual_optimum(G)))
     return e, np.einsum("bi,bij,bj->b", e, G, e) * size
 
 
@@ -150,7 +150,7 @@ def _unit_pairs(e: FloatArray) -> FloatArray:
     return np.asarray(e / np.where(J_SIGN > 0.0, outer[:, None], inner[:, None]))
 
 
-def _polished(G: FloatArray, e: FloatArray) -> FloatArray:
+def _newton_refined(G: FloatArray, e: FloatArray) -> FloatArray:
     """Return e after two Newton steps on its two angles, each accepted where the cost does not rise."""
     cost = np.einsum("bi,bij,bj->b", e, G, e)
     for _ in range(2):

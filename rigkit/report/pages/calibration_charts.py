@@ -52,7 +52,7 @@ class _Plot:
         bottom: float = BOTTOM,
     ) -> None:
         self._x, self._y, self.floor = x, y, HEIGHT - bottom
-        self.parts = [svg.opened(title, f"0 0 {WIDTH:g} {HEIGHT:g}")]
+        self.parts = [svg.opening_tag(title, f"0 0 {WIDTH:g} {HEIGHT:g}")]
         for value in _ticks(*y):
             at = self.v(value)
             self.parts.append(f'<path d="M{LEFT} {at:.1f}H{WIDTH - RIGHT}" stroke="{svg.GRID_COLOUR}"/>')
@@ -70,7 +70,7 @@ class _Plot:
         return self.floor - (y - self._y[0]) / (self._y[1] - self._y[0]) * (self.floor - TOP)
 
     def words(self, x: float, y: float, text: str, anchor: str = "start", colour: str = svg.WORDS_COLOUR) -> None:
-        self.parts.append(svg.words(x, y, text, anchor, colour))
+        self.parts.append(svg.label(x, y, text, anchor, colour))
 
     def below(self, values: Sequence[float]) -> None:
         for value in values:

@@ -180,7 +180,7 @@ def _scale(calibration: Calibration, times: float) -> str:
     y, x = _zoom(calibration) * calibration.camera.size_px[1] + 12.0, DRAWN_WIDTH - 4.0
     return (
         f'<path d="M{x - length * per_px:.1f} {y:.1f}H{x}m0 -4v8m{-length * per_px:.1f} 0v-8" stroke="#333"/>'
-        + svg.words(x - length * per_px - 6, y + 4, f"{length:g} px", "end")
+        + svg.label(x - length * per_px - 6, y + 4, f"{length:g} px", "end")
     )
 
 
@@ -203,7 +203,7 @@ def _colour_bar(y: float, low: float, high: float) -> str:
     strip = "".join(
         f'<rect x="{380 + 6 * k}" y="{y:.1f}" width="7" height="10" fill="{_colour(v)}"/>' for k, v in enumerate(levels)
     )
-    return svg.words(374, y + 10, f"{low:.3g}", "end") + strip + svg.words(530, y + 10, f"{high:.3g} px")
+    return svg.label(374, y + 10, f"{low:.3g}", "end") + strip + svg.label(530, y + 10, f"{high:.3g} px")
 
 
 def _numbers(calibration: Calibration) -> list[str]:
@@ -244,7 +244,7 @@ def _colour(level: float) -> str:
 def _opening(calibration: Calibration, title: str) -> str:
     height = _zoom(calibration) * calibration.camera.size_px[1]
     return (
-        svg.opened(title, f"-1 -1 {DRAWN_WIDTH + 2:g} {height + FOOT:.1f}")
+        svg.opening_tag(title, f"-1 -1 {DRAWN_WIDTH + 2:g} {height + FOOT:.1f}")
         + f'<rect width="{DRAWN_WIDTH:g}" height="{height:.1f}" fill="{svg.GROUND_COLOUR}"/>'
     )
 

@@ -47,7 +47,7 @@ def camera_facts(c: Calibration, plan: Plan | None = None) -> PageFacts:
         tables.append(plan_table(plan))
     severity = worst(c.verdicts)
     return PageFacts(
-        headline=_reach(c),
+        headline=_coverage_words(c),
         badge=BADGE_WORDS[severity],
         passed=PASSED[severity],
         sentences=tuple(sentences),
@@ -92,7 +92,7 @@ def _basis(c: Calibration) -> str:
     )
 
 
-def _reach(c: Calibration) -> str:
+def _coverage_words(c: Calibration) -> str:
     """Return the uncertainty of the projection where boards were and outside, in words."""
     far = FarProjection.of(c)
     if not np.isfinite(far.worst_px):

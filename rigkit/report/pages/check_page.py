@@ -172,10 +172,7 @@ def check_table(check: SentinelCheck) -> Table:
     """Return the table of possible changes, each as if it alone had happened."""
     rows = []
     for change in check.tried:
-        amounts = ", ".join(
-            f"{a:+.3g} ± {s:.2g} {unit}"
-            for a, s, unit in zip(change.amounts, change.sigmas, change.hypothesis.units, strict=True)
-        )
+        amounts = change.amounts_with_sigmas("±")
         named = check.change is not None and change.hypothesis is check.change.hypothesis
         rows.append(cells(change.hypothesis.words, f"{change.chance:.2g}", Cell(change.gain, best=named), amounts))
     none = cells("these images determine no change", "", None, "")

@@ -129,7 +129,7 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
     limit = CONTROL_SIGMAS * sigma
     top = _upper_limit(float(limit.max()), value, sigma)
     x = _x_coordinates(days)
-    out = [svg.opened(name, f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
+    out = [svg.opening_tag(name, f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
     # The limits depend on the number of pictures: every entry has its own, up to halfway to its neighbours.
     ends = np.concatenate([[LEFT_MARGIN], 0.5 * (x[1:] + x[:-1]), [DRAWN_WIDTH - 6.0]])
     for side, colour, dash in ((0.0, SOFT, ""), (1.0, WRONG, "5 4"), (-1.0, WRONG, "5 4")):
@@ -137,7 +137,7 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
         steps = svg.line(np.stack([np.repeat(ends, 2)[1:-1], height], axis=-1))
         out.append(
             f'<path d="{steps}" fill="none" stroke="{colour}" stroke-dasharray="{dash}"/>'
-            f"{svg.words(LEFT_MARGIN - 5, height[0] + 4, f'{side * limit[0]:.2g}', 'end')}"
+            f"{svg.label(LEFT_MARGIN - 5, height[0] + 4, f'{side * limit[0]:.2g}', 'end')}"
         )
     y = ZERO_HEIGHT * (1.0 - value / top)
     out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{INK}" stroke-opacity="0.4"/>')
@@ -150,13 +150,13 @@ def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str
     value, sigma = np.array([entry.amounts[name] for entry in entries]).T
     top = _upper_limit(0.0, value, sigma)
     x, y = _x_coordinates(celsius), ZERO_HEIGHT * (1.0 - heat.at(celsius) / top)
-    out = [svg.opened(f"{name} against temperature", f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
+    out = [svg.opening_tag(f"{name} against temperature", f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
     for amount in (-top / 1.1, 0.0, top / 1.1):
         height = ZERO_HEIGHT * (1.0 - amount / top)
         ends = svg.line([np.array([LEFT_MARGIN, height]), np.array([DRAWN_WIDTH - 6.0, height])])
         stroke = SOFT if amount == 0.0 else svg.RIM_COLOUR
         out.append(
-            f'<path d="{ends}" stroke="{stroke}"/>{svg.words(LEFT_MARGIN - 5, height + 4, f"{amount:.2g}", "end")}'
+            f'<path d="{ends}" stroke="{stroke}"/>{svg.label(LEFT_MARGIN - 5, height + 4, f"{amount:.2g}", "end")}'
         )
     out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{INK}" stroke-opacity="0.6"/>')
     labels = [f"{c:.3g} °C" for c in celsius]
@@ -177,8 +177,8 @@ def _x_coordinates(values: FloatArray) -> FloatArray:
 def _x_labels(x: FloatArray, labels: Sequence[str]) -> list[str]:
     """Return the labels below the first and the last point."""
     if len(labels) == 1:
-        return [svg.words(x[0], DRIFT_HEIGHT - 6, labels[0], "middle")]
-    return [svg.words(x[k], DRIFT_HEIGHT - 6, labels[k], anchor) for k, anchor in ((0, "start"), (-1, "end"))]
+        return [svg.label(x[0], DRIFT_HEIGHT - 6, labels[0], "middle")]
+    return [svg.label(x[k], DRIFT_HEIGHT - 6, labels[k], anchor) for k, anchor in ((0, "start"), (-1, "end"))]
 
 
 def _points(entries: Sequence[HistoryEntry], name: str, x: FloatArray, top: float) -> list[str]:

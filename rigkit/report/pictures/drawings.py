@@ -51,22 +51,22 @@ def boxplot_svg(groups: Sequence[tuple[str, Sequence[tuple[str, FloatArray]]]], 
     def y(value: float) -> float:
         return BOXES_TOP + plot * (1.0 - value / top)
 
-    out = [svg.opened(label, f"0 0 {BOXES_WIDTH:g} {BOXES_HEIGHT:g}", size=12)]
+    out = [svg.opening_tag(label, f"0 0 {BOXES_WIDTH:g} {BOXES_HEIGHT:g}", size=12)]
     for tick in np.linspace(0.0, top, 5):
         ends = f'x1="{BOXES_LEFT}" x2="{BOXES_WIDTH - 10}" y1="{y(tick):.1f}" y2="{y(tick):.1f}"'
         out.append(f'<line {ends} stroke="{svg.GRID_COLOUR}"/>')
-        out.append(svg.words(BOXES_LEFT - 6, y(tick) + 4, f"{tick:.3g}", "end"))
+        out.append(svg.label(BOXES_LEFT - 6, y(tick) + 4, f"{tick:.3g}", "end"))
     for g, (group, boxes) in enumerate(groups):
         start = BOXES_LEFT + g * step + 0.1 * step
-        out.append(svg.words(start + 0.4 * step, BOXES_HEIGHT - BOXES_BOTTOM + 18, group, "middle"))
+        out.append(svg.label(start + 0.4 * step, BOXES_HEIGHT - BOXES_BOTTOM + 18, group, "middle"))
         for name, values in boxes:
             index = names.index(name)
             out += _box(start + slot * (index + 0.5), 0.7 * slot, values, board_colour(index), y)
     for index, name in enumerate(names):
         x = BOXES_LEFT + 110.0 * index
         out.append(f'<rect x="{x}" y="{BOXES_HEIGHT - 18}" width="10" height="10" fill="{board_colour(index)}"/>')
-        out.append(svg.words(x + 15, BOXES_HEIGHT - 9, name, "start"))
-    out.append(svg.words(BOXES_LEFT, 14, label, "start"))
+        out.append(svg.label(x + 15, BOXES_HEIGHT - 9, name, "start"))
+    out.append(svg.label(BOXES_LEFT, 14, label, "start"))
     return "".join([*out, "</svg>"])
 
 
@@ -80,7 +80,7 @@ def residuals_svg(reconstruction: Reconstruction) -> str:
     height = max(width * c.size_px[1] / c.size_px[0] for c in (camera1, camera2))
     scale_of_arrows = RESIDUAL_LENGTH * width / max(rms, 1e-12)
     words = f"residuals, {rms:.4f} px rms, magnified {scale_of_arrows * camera1.size_px[0] / width:.0f} times"
-    out = [svg.opened(words, f"0 0 {2 * width + 20:g} {height + 30:g}", size=12)]
+    out = [svg.opening_tag(words, f"0 0 {2 * width + 20:g} {height + 30:g}", size=12)]
     for offset, camera, pixels, moved in (
         (0.0, camera1, reconstruction.pixels1, moved1),
         (width + 20, camera2, reconstruction.pixels2, moved2),
@@ -96,7 +96,7 @@ def residuals_svg(reconstruction: Reconstruction) -> str:
             colour = board_colour(int(board))
             out.append(f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{ex:.1f}" y2="{ey:.1f}" stroke="{colour}"/>')
             out.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.6" fill="{colour}"/>')
-    out.append(svg.words(0.0, height + 20, words, "start"))
+    out.append(svg.label(0.0, height + 20, words, "start"))
     return "".join([*out, "</svg>"])
 
 

@@ -230,11 +230,13 @@ def _robust_residuals(residual: FloatArray, jacobian: FloatArray, mount: slice) 
     weight = _weights(residual, sigma)
     for part in (mount, slice(None)):
         if jacobian[:, part].any():
-            left, weight, sigma = _fitted(residual, jacobian[:, part], weight)
+            left, weight, sigma = _fit_columns(residual, jacobian[:, part], weight)
     return left, weight, max(sigma, MIN_SIGMA_PX)
 
 
-def _fitted(residual: FloatArray, jacobian: FloatArray, before: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+def _fit_columns(
+    residual: FloatArray, jacobian: FloatArray, before: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
     """Return the residuals after the best step along all columns, the weights, at most `before`, and the standard
     deviation."""
     size = np.linalg.norm(jacobian, axis=0)

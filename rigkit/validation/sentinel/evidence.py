@@ -234,7 +234,7 @@ class _PosedBoards:
                 weights.append(np.zeros((0, 0)))
                 continue
             seen = Observations.from_views([v.view for v in own])
-            state, weight = _posed(monitored, c, seen)
+            state, weight = _fit_board_poses(monitored, c, seen)
             back = pose.inverse()
             for k, g in enumerate(group.tolist()):
                 if seen.present[k].sum() > most[g]:
@@ -284,7 +284,7 @@ class _PosedBoards:
         return total, max(kept, 1), left
 
 
-def _posed(monitored: Monitored, c: int, observations: Observations) -> tuple[State, FloatArray]:
+def _fit_board_poses(monitored: Monitored, c: int, observations: Observations) -> tuple[State, FloatArray]:
     """Return every board in the pose that fits its view by camera `c` best, and the weights of its corners, zero for
     outliers."""
     camera, poses = monitored.cameras[c], []

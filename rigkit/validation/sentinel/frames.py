@@ -11,7 +11,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.planning.candidates import CANDIDATES_KEPT, Reach, held_boards, sees_held
+from rigkit.planning.candidates import CANDIDATES_KEPT, Reach, board_in_view, held_boards
 from rigkit.planning.goal import Goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, Proposal, choose_views, covariance_of
@@ -62,7 +62,7 @@ class Frames:
         in_rig = held.transformed(monitored.cam_from_rig[c].inverse())
         seen = np.stack(
             [
-                sees_held(camera, board, in_rig.transformed(pose), reach)
+                board_in_view(camera, board, in_rig.transformed(pose), reach)
                 for camera, pose in zip(monitored.cameras, monitored.cam_from_rig, strict=True)
             ],
             axis=1,

@@ -81,11 +81,14 @@ class Change:
         if self.hypothesis.kind == "lens":
             # Its amounts are correlated and compensate each other: single ones would overstate the change.
             return f"{self.hypothesis.words}: by {self.size_px:.2g} px rms in all"
-        values = ", ".join(
-            f"{a:+.3g} +- {s:.2g} {unit}"
+        return f"{self.hypothesis.words}: {self.amounts_with_sigmas()}"
+
+    def amounts_with_sigmas(self, sign: str = "+-") -> str:
+        """Return all amounts with their standard deviations and units."""
+        return ", ".join(
+            f"{a:+.3g} {sign} {s:.2g} {unit}"
             for a, s, unit in zip(self.amounts, self.sigmas, self.hypothesis.units, strict=True)
         )
-        return f"{self.hypothesis.words}: {values}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +180,11 @@ def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = (
     expected_px, known, chance = unchanged_px(monitored, evidence), list[Change](), 1.0
     try:
         whitened = Whitened.of(monitored, evidence)
-        known = [c for c in (_fitted(whitened, hypothesis) for hypothesis in hypotheses_of(monitored)) if c is not None]
+        known = [
+            c
+            for c in (_fit_hypothesis(whitened, hypothesis) for hypothesis in hypotheses_of(monitored))
+            if c is not None
+        ]
     except DegenerateError:
         # Images of something else are beyond any linearisation: the calibration does not hold for them.
         if not exceeds_expected(evidence.rms_px, expected_px):
@@ -277,7 +284,7 @@ def _refined(monitored: Monitored, look: Look, change: Change) -> tuple[FloatArr
     after = look(fixed)
     for _ in range(FIX_ROUNDS):
         try:
-            again = _fitted(Whitened.of(fixed, after), change.hypothesis)
+            again = _fit_hypothesis(Whitened.of(fixed, after), change.hypothesis)
         except DegenerateError:
             again = None
         if again is None:
@@ -293,7 +300,7 @@ def _refined(monitored: Monitored, look: Look, change: Change) -> tuple[FloatArr
     return amounts, fixed, after
 
 
-def _fitted(whitened: Whitened, hypothesis: Hypothesis) -> Change | None:
+def _fit_hypothesis(whitened: Whitened, hypothesis: Hypothesis) -> Change | None:
     """Return the best fit of a hypothesis; None where it is not observable."""
     by_amount = whitened.by_theta @ hypothesis.directions
     weighed = np.linalg.solve(whitened.covariance, np.column_stack([by_amount, whitened.score]))

@@ -34,10 +34,10 @@ def corner() -> tuple[Corner, DenseScene, DenseScene]:
     whole = grow_scene(sparse, seeds, *images, pose_is_known=True)
 
     def with_holes(*args: Any) -> BoolArray:
-        return np.asarray(propagate.kept(*args) & ~HOLES)
+        return np.asarray(propagate.at_best_depth(*args) & ~HOLES)
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(dense_module, "kept", with_holes)
+        patched.setattr(dense_module, "at_best_depth", with_holes)
         return room, whole, grow_scene(sparse, seeds, *images, pose_is_known=True)
 
 

@@ -23,7 +23,7 @@ from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.planning.plan import plan_views
 from rigkit.report.pages.calibration_drawings import pattern_svg, residuals_svg, uncertainty_svg
-from rigkit.report.pages.calibration_facts import _reach, focal_words
+from rigkit.report.pages.calibration_facts import _coverage_words, focal_words
 from rigkit.report.pages.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
 from rigkit.report.pages.plan_page import plan_words
 
@@ -242,7 +242,8 @@ def test_what_a_bad_calibration_says_of_the_rest_of_the_image_is_no_advice(
 ) -> None:
     monkeypatch.setattr("rigkit.report.pages.calibration_facts.MAX_RATIO_BEYOND", most)
     printed = [
-        _reach(replace(calibration, verdicts=(finding,))) for finding in (Finding.good("well"), Finding.bad("ill"))
+        _coverage_words(replace(calibration, verdicts=(finding,)))
+        for finding in (Finding.good("well"), Finding.bad("ill"))
     ]
     assert "px elsewhere" in printed[1] and printed[0].startswith(printed[1].rstrip("."))
     assert advice in printed[0] and advice not in printed[1]

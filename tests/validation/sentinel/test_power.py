@@ -16,7 +16,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.planning.candidates import Reach, sees_held
+from rigkit.planning.candidates import Reach, board_in_view
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import Plan, plan_views
@@ -107,7 +107,7 @@ def test_pictures_for_a_rig_find_what_was_promised_and_more_than_those_for_one_l
     poses = [view.cam_from_board for view in for_left.views]
     rotation, shift = np.array([p.rotation for p in poses]), np.array([p.translation_mm for p in poses])
     held = HeldBoards(BOARD.points(), rotation, shift, np.ones((FRESH, BOARD.corner_count), bool))
-    whole = sees_held(rig.cameras[1], BOARD, held.transformed(MOUNT), Reach())
+    whole = board_in_view(rig.cameras[1], BOARD, held.transformed(MOUNT), Reach())
     seen = [held.seen, whole[:, None] & held.seen]
     others = _powers(rig, board_information(rig, BOARD, rotation, shift, seen))
     assert min(p.chance for p in others) < 0.9 * min(p.chance for p in promised)
