@@ -27,39 +27,53 @@ NUMBERS = (float("nan"), float("inf"), -float("inf"), 0, -1, 1e300, -1e300, 1e-3
 Call = tuple[Callable[..., object], dict[str, Any]]
 
 
+PARAMETERS = {
+    "pinhole": [400.0, 400.0, 320.0, 240.0],
+    "brown": [420.0, 421.0, 320.0, 240.0, -0.28, 0.07, 2e-4, 1.7e-5],
+    "kannala_brandt": [190.0, 190.0, 320.0, 240.0, 0.01, -0.005, 0.001, 0.0],
+    "ucm": [190.0, 190.0, 320.0, 240.0, 0.6],
+    "eucm": [190.0, 190.0, 320.0, 240.0, 0.6, 1.1],
+    "double_sphere": [190.0, 190.0, 320.0, 240.0, -0.2, 0.6],
+    "scaramuzza": [190.0, -1.2e-3, 4e-7, -1e-9, 320.0, 240.0, 1.0, 0.0],
+}
+"""A camera of each model, 640 x 480 px."""
+
+
 def _calls() -> list[Call]:
     """Return functions with good arguments; one of them is then spoilt."""
-    d, cloud = small_detection(), small_cloud()
-    cameras = [
-        rigkit.camera_model(name)((640, 480), np.array(p))
-        for name, p in (
-            ("pinhole", [400.0, 400.0, 320.0, 240.0]),
-            ("brown", [420.0, 421.0, 320.0, 240.0, -0.28, 0.07, 2e-4, 1.7e-5]),
-            ("kannala_brandt", [190.0, 190.0, 320.0, 240.0, 0.01, -0.005, 0.001, 0.0]),
-            ("ucm", [190.0, 190.0, 320.0, 240.0, 0.6]),
-            ("eucm", [190.0, 190.0, 320.0, 240.0, 0.6, 1.1]),
-            ("double_sphere", [190.0, 190.0, 320.0, 240.0, -0.2, 0.6]),
-            ("scaramuzza", [190.0, -1.2e-3, 4e-7, -1e-9, 320.0, 240.0, 1.0, 0.0]),
-        )
-    ]
+    d, cameras = small_detection(), [rigkit.camera_model(m)((640, 480), np.array(p)) for m, p in PARAMETERS.items()]
     n = len(d.pixels)
     points = np.column_stack([np.linspace(-1, 1, n), np.linspace(1, -1, n), np.linspace(1, 2, n)])
+    return [
+        *(call for camera in cameras for call in _calls_of_camera(camera, d, points)),
+        *_calls_of_objects(cameras, d),
+        *_calls_of_pairs(cameras, d, points),
+    ]
+
+
+def _calls_of_camera(c: rigkit.Camera, d: rigkit.BoardDetection, points: Any) -> list[Call]:
+    return [
+        (c.project, {"points": points}),
+        (c.unproject, {"pixels": d.pixels}),
+        (c.project_with_jacobians, {"points": points}),
+        (type(c), {"size_px": np.array([640, 480]), "parameters": c.parameters}),
+    ]
+
+
+def _directions(n: int) -> dict[str, Any]:
+    """Return the arguments of `DirectionPairs` for `n` points."""
+    axes = np.tile(np.eye(2), (n, 1, 1))
+    return {"image1": axes, "image2": axes, "valid": np.ones((n, 2), bool), "kinds": ("horizontal", "vertical")}
+
+
+def _calls_of_objects(cameras: list[rigkit.Camera], d: rigkit.BoardDetection) -> list[Call]:
+    """Return calls on boards, clouds, poses, cameras and images."""
+    cloud, n = small_cloud(), len(d.pixels)
     image = np.random.default_rng(0).integers(0, 255, SIZE_PX[::-1]).astype(float)
-    calls: list[Call] = []
-    for c in cameras:
-        calls += [
-            (c.project, {"points": points}),
-            (c.unproject, {"pixels": d.pixels}),
-            (c.project_with_jacobians, {"points": points}),
-            (type(c), {"size_px": np.array([640, 480]), "parameters": c.parameters}),
-        ]
-    directions = np.tile(np.eye(2), (n, 1, 1))
-    calls += [
+    of_detection = ("board_id", "columns", "rows", "grid", "pixels", "sigma_px")
+    return [
         (rigkit.Board, {"board_id": "a", "columns": 5, "rows": 4, "square_x_mm": 30.0, "square_y_mm": 30.0}),
-        (
-            rigkit.BoardDetection,
-            {k: getattr(d, k) for k in ("board_id", "columns", "rows", "grid", "pixels", "sigma_px")},
-        ),
+        (rigkit.BoardDetection, {k: getattr(d, k) for k in of_detection}),
         (rigkit.OrientedCloud, {k: getattr(cloud, k) for k in type(cloud).__slots__}),
         (rigkit.Rigid3, {"rotation": np.eye(3), "translation": np.array([1.0, 2.0, 3.0])}),
         (rigkit.Rigid3.from_matrix, {"matrix": np.eye(4)}),
@@ -67,57 +81,45 @@ def _calls() -> list[Call]:
         (rigkit.detect_boards, {"image": image, "boards": [SMALL], "min_corners": 12}),
         (rigkit.complete_boards, {"image": image, "detections": [d], "boards": [SMALL]}),
         (rigkit.rectify_map, {"camera": cameras[1], "target": cameras[0], "target_from_cam": np.eye(3)}),
+        (rigkit.DirectionPairs, _directions(n)),
         (
-            rigkit.DirectionPairs,
-            {
-                "image1": directions,
-                "image2": directions,
-                "valid": np.ones((n, 2), bool),
-                "kinds": ("horizontal", "vertical"),
-            },
+            rigkit.normals_from_affines,
+            {"J1": np.ones((n, 2, 3)), "J2": np.ones((n, 2, 3)), "A21": _directions(n)["image1"]},
         ),
-        (rigkit.normals_from_affines, {"J1": np.ones((n, 2, 3)), "J2": np.ones((n, 2, 3)), "A21": directions}),
     ]
-    matches = rigkit.Matches.from_cameras(
-        cameras[0], cameras[0], d.pixels, d.pixels * 1.1 + 2.0, sigma1_px=d.sigma_px, sigma2_px=d.sigma_px,
-        A21=directions, sigma_A=d.sigma_px,
-    )  # fmt: skip
+
+
+def _calls_of_pairs(cameras: list[rigkit.Camera], d: rigkit.BoardDetection, points: Any) -> list[Call]:
+    """Return calls on matches, affinities, views of a board and rectified images."""
+    n, A21 = len(d.pixels), _directions(len(d.pixels))["image1"]
+    sigmas: dict[str, Any] = {"sigma1_px": d.sigma_px, "sigma2_px": d.sigma_px}
+    affine = {"A21": A21, "sigma_A": d.sigma_px}
+    matches = rigkit.Matches.from_cameras(cameras[0], cameras[0], d.pixels, d.pixels * 1.1 + 2.0, **sigmas, **affine)
     remap, pose = rigkit.rectify_map(cameras[1], cameras[0]), rigkit.Rigid3(np.eye(3), np.array([1.0, 2.0, 3.0]))
-    pairs = rigkit.DirectionPairs(
-        image1=directions, image2=directions, valid=np.ones((n, 2), bool), kinds=("horizontal", "vertical"),
-        pixels1=d.pixels, pixels2=d.pixels,
-    )  # fmt: skip
-    given = {
-        "pixels1": d.pixels, "pixels2": d.pixels * 1.1, "sigma1_px": d.sigma_px, "sigma2_px": d.sigma_px,
-        "A21": directions, "sigma_A": d.sigma_px,
-    }  # fmt: skip
+    pairs = rigkit.DirectionPairs(**_directions(n), pixels1=d.pixels, pixels2=d.pixels)
+    given = {"pixels1": d.pixels, "pixels2": d.pixels * 1.1, **sigmas, **affine}
     view = {"image": "a", "board": SMALL, "grid": d.grid, "pixels": d.pixels, "sigma_px": d.sigma_px}
-    calls += [
+    plane = {"K1": np.eye(3), "K2": np.eye(3), "normal": np.array([0.0, 0.0, 1.0]), "offset_mm": 900.0}
+    compared = functools.partial(rigkit.compare_cameras, cameras[0], cameras[1], grid=(20, 15))
+    return [
         (functools.partial(rigkit.Matches.from_cameras, cameras[0], cameras[1]), given),
         (matches.select, {"which": np.arange(4)}),
-        (matches.with_affinities, {"A21": directions, "sigma_A": d.sigma_px}),
+        (matches.with_affinities, affine),
         (Correspondences, {k: given[k] for k in ("pixels1", "pixels2", "A21", "sigma_A")} | {"sigma_px": d.sigma_px}),
         (functools.partial(rigkit.affines_from_directions, pairs), {"method": "F2UDIR", "F21": np.eye(3)}),
         (functools.partial(rigkit.affines_from_mixed_directions, pairs), {"scaled": np.ones((n, 2), bool)}),
         (rigkit.affines_from_homography, {"H21": np.eye(3), "pixels1": d.pixels}),
-        (rigkit.homography_from_affines, {"pixels1": d.pixels, "pixels2": d.pixels, "A21": directions}),
-        (
-            functools.partial(rigkit.homography_from_plane, cam2_from_cam1=pose),
-            {"K1": np.eye(3), "K2": np.eye(3), "normal": np.array([0.0, 0.0, 1.0]), "offset_mm": 900.0},
-        ),
+        (rigkit.homography_from_affines, {"pixels1": d.pixels, "pixels2": d.pixels, "A21": A21}),
+        (functools.partial(rigkit.homography_from_plane, cam2_from_cam1=pose), plane),
         (_calibrated, {"model": "pinhole", **view}),
         (pose.apply, {"points": points}),
         (remap.pixels, {"pixels": d.pixels}),
         (remap.source_pixels, {"pixels": d.pixels}),
         (remap.image, {"image": np.zeros((480, 640)), "interpolation": "linear", "fill": 0.0}),
-        (
-            functools.partial(rigkit.compare_cameras, cameras[0], cameras[1], grid=(20, 15)),
-            {"mask": np.ones((15, 20), bool), "weights": np.ones((15, 20))},
-        ),
+        (compared, {"mask": np.ones((15, 20), bool), "weights": np.ones((15, 20))}),
         (functools.partial(_solved, matches), {"weights": np.ones(n)}),
         (rigkit.BoardView, view),
     ]
-    return calls
 
 
 def _calibrated(model: str, image: str, board: Board, grid: Any, pixels: Any, sigma_px: Any) -> None:
