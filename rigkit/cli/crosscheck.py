@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import argparse
 
-from rigkit.cli.console import print_json, progress_on_stderr
-from rigkit.cli.dataset_arguments import add_dataset_arguments, dataset_options, exit_code_of, failed_pairs
+from rigkit.cli.console import options_of, print_json, progress_on_stderr
+from rigkit.cli.dataset_arguments import add_dataset_arguments, exit_code_of, failed_pairs, results_folder
 from rigkit.cli.validation_words import note_skipped
 from rigkit.core.errors import ExitCode
 
@@ -24,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.validation.crosscheck import crosscheck_dataset
 
     dataset = load_dataset(args.dataset)
-    options = DatasetOptions(**dataset_options(args, dataset.name))
+    options = options_of(DatasetOptions, args, output=results_folder(args, dataset.name))
     done = crosscheck_dataset(dataset, options, progress=progress_on_stderr())
     if args.json:
         pairs = [report.to_dict() for report in done.reports]

@@ -1,11 +1,12 @@
-"""Common arguments of the verbs on a data set, the folder of results, and failed pairs."""
+"""Common arguments of the verbs on a data set, named like the options that they make; the folder of results, and failed
+pairs."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rigkit.cli.console import note
 
@@ -19,7 +20,9 @@ def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = F
     parser.add_argument(
         "dataset", metavar="DATASET", nargs=number, help="folder with a dataset.toml, or the file itself"
     )
-    parser.add_argument("-p", "--pair", action="append", default=[], metavar="ID", help="only this pair (repeatable)")
+    parser.add_argument(
+        "-p", "--pair", dest="pairs", action="append", default=[], metavar="ID", help="only this pair (repeatable)"
+    )
     parser.add_argument("-o", "--output", metavar="DIR", help="folder for results (default: a new one, out/<data set>)")
     parser.add_argument("--force", action="store_true", help="replace existing results")
     parser.add_argument("--recalibrate", action="store_true", help="calibrate from the images again")
@@ -37,15 +40,23 @@ def add_direction_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the choices of directions that normals are computed from."""
     parser.add_argument(
         "--directions",
+        dest="support",
+        default=argparse.SUPPRESS,
         choices=("chord", "neighbours", "line", "patch"),
         help="edge directions at a corner, from the next corner, both neighbours, a line of five or a patch of 5x5 "
         "corners (default)",
     )
     parser.add_argument(
         "--det-scale",
+        default=argparse.SUPPRESS,
         choices=("area", "ls", "sqmean", "diagonal"),
         help="scale of DET3UDIR: signed area (default), least squares, the paper's squared mean, diagonal",
     )
+
+
+def has_directions(args: argparse.Namespace) -> bool:
+    """Return whether directions or their scale are given."""
+    return "support" in args or "det_scale" in args
 
 
 def add_planes_argument(parser: argparse.ArgumentParser, what: str) -> None:
@@ -64,24 +75,6 @@ def results_folder(args: argparse.Namespace, name: str) -> Path:
     from rigkit.workflows.outputs.results import free_folder
 
     return Path(args.output) if args.output else free_folder(name, force=args.force)
-
-
-def dataset_options(args: argparse.Namespace, name: str) -> dict[str, Any]:
-    """Return the fields of `DatasetOptions` from the arguments, for the data set `name`."""
-    return {
-        "pairs": tuple(args.pair),
-        "output": results_folder(args, name),
-        "force": args.force,
-        "recalibrate": args.recalibrate,
-        "chain": args.chain,
-        "jobs": args.jobs,
-    }
-
-
-def direction_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the fields of `DatasetOptions` for the given direction arguments."""
-    given = {"support": args.directions, "det_scale": args.det_scale}
-    return {name: value for name, value in given.items() if value is not None}
 
 
 def failed_pairs(failures: Sequence[PairFailure]) -> dict[str, dict[str, str]]:

@@ -30,14 +30,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-p", "--pair", help="pair of the data set whose cloud is exported")
     parser.add_argument("--method", default="3SDIR", help="affine estimator of the normals (default 3SDIR)")
     add_planes_argument(parser, "points and normals of a pair")
-    parser.add_argument("--float", action="store_true", help="write a PLY in single precision (PCL reads no other)")
+    parser.add_argument(
+        "--float",
+        dest="single_precision",
+        action="store_true",
+        help="write a PLY in single precision (PCL reads no other)",
+    )
     parser.add_argument("--force", action="store_true", help="replace existing files")
 
 
 def run(args: argparse.Namespace) -> int:
     if args.source.is_dir() or args.source.suffix in (".toml", ".ply"):
         return _export_cloud(args)
-    if args.float:
+    if args.single_precision:
         raise InputError("export: --float is for PLY clouds; leave it out")
     import numpy as np
 
@@ -74,11 +79,11 @@ def _export_cloud(args: argparse.Namespace) -> int:
         what = "a PLY" if is_ply else "a cloud"
         raise InputError(f"export: {what} is written as {', '.join(known)}, not as '{kind}'; use --to")
     unused = {"--names": args.names, "--size": args.size, "--from": args.source_format}
-    unused |= {"--float": args.float and kind != "ply"}
+    unused |= {"--float": args.single_precision and kind != "ply"}
     unused |= {"--pair": is_ply and args.pair, "--planes": is_ply and args.planes}
     if (option := next((name for name, given in unused.items() if given), None)) is not None:
         raise InputError(f"export: {option} does not apply to {'a PLY' if is_ply else 'a cloud'}; leave it out")
-    options = options_of(ExportCloudOptions, args, kind=kind, single_precision=args.float)
+    options = options_of(ExportCloudOptions, args, kind=kind)
     if is_ply:
         print(f"{args.output}: {len(export_ply(args.source, options))} points")
         return 0

@@ -79,14 +79,8 @@ def _session(args: argparse.Namespace) -> int:
     from rigkit.io.disk.writing import write_together
     from rigkit.workflows.inputs.folder_session import session_of_folders
 
-    if (
-        args.square_mm is not None
-        or args.calibration
-        or args.cameras
-        or args.pose_type
-        or args.baseline_mm
-        or args.angle_deg
-    ):
+    of_manifests = ("calibration", "cameras", "pose_type", "baseline_mm", "angle_deg")
+    if args.square_mm is not None or any(getattr(args, name) for name in of_manifests):
         raise InputError("init --session: only --board and --model apply; leave the other options out")
     path = args.output or args.folder / "session.toml"
     made = session_of_folders([args.folder], args.board, path, model=args.model or "auto")

@@ -7,7 +7,6 @@ import argparse
 from rigkit.cli.console import note, progress_on_stderr
 from rigkit.cli.manifest_words import (
     POSE_TYPES,
-    angle_of,
     ask,
     cameras_of,
     parse_angles,
@@ -16,8 +15,8 @@ from rigkit.cli.manifest_words import (
     parse_calibrations,
     parse_length,
     parse_pose_types,
-    pose_type_of,
     require_answers,
+    value_of,
 )
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.io.disk.reading import usable_path
@@ -53,7 +52,7 @@ def run_manifest(args: argparse.Namespace) -> int:
     if not calibrations:
         calibrations = parse_calibrations([ask("path of calibration.json")], target.parent)
     cameras = cameras_of(names, calibrations, args.cameras)
-    poses = {name: pose_type_of(given_poses, name) or ask(f"pose type of '{name}'", POSE_TYPES) for name in names}
+    poses = {name: value_of(given_poses, name) or ask(f"pose type of '{name}'", POSE_TYPES) for name in names}
     new = NewManifest(
         name=args.name or name_of_folder(root),
         pairs=found.pairs,
@@ -62,7 +61,7 @@ def run_manifest(args: argparse.Namespace) -> int:
         cameras=cameras,
         pose_types=poses,
         baselines=parse_baselines(args.baseline_mm, names),
-        angles={name: angle for name in names if (angle := angle_of(given_angles, name)) is not None},
+        angles={name: angle for name in names if (angle := value_of(given_angles, name)) is not None},
     )
     incomplete = write_manifest(new, target, force=args.force)
     print(target)

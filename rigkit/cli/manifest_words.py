@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
@@ -20,6 +20,7 @@ from rigkit.io.disk.reading import usable_path
 if TYPE_CHECKING:
     from rigkit.io.manifests.manifest_writer import DeclaredBoard
 
+Value = TypeVar("Value")
 POSE_TYPES = tuple(map(str, PoseType))
 ONE_CAMERA, TWO_CAMERAS = ("camera",), ("camera1", "camera2")
 
@@ -106,7 +107,7 @@ def cameras_of(
     out = {}
     for pair in pairs:
         typical = (known[0], known[-1]) if len(known) <= len(TWO_CAMERAS) else None
-        found_cameras = next((cameras for pattern, cameras in patterns if fnmatch(pair, pattern)), typical)
+        found_cameras = value_of(patterns, pair) or typical
         if found_cameras is None:
             raise InputError(f"init: unknown which cameras took pair '{pair}'; add --cameras {pair}=ONE,TWO")
         out[pair] = found_cameras
@@ -124,8 +125,8 @@ def parse_pose_types(declared: Sequence[str]) -> list[tuple[str, str]]:
     return out
 
 
-def pose_type_of(declared: Sequence[tuple[str, str]], name: str) -> str | None:
-    """Return the first pose type whose pattern matches the pair `name`, or None."""
+def value_of(declared: Sequence[tuple[str, Value]], name: str) -> Value | None:
+    """Return the first value whose pattern matches the pair `name`, or None."""
     return next((value for pattern, value in declared if fnmatch(name, pattern)), None)
 
 
@@ -144,8 +145,8 @@ def parse_baselines(declared: Sequence[str], pairs: Sequence[str]) -> dict[str, 
     return out
 
 
-def parse_angles(declared: Sequence[str]) -> list[tuple[str, float, float]]:
-    """Return (pattern of pairs, degrees, sigma) from [PAIRS=]DEG+-SIGMA; raises InputError for invalid angles."""
+def parse_angles(declared: Sequence[str]) -> list[tuple[str, tuple[float, float]]]:
+    """Return (pattern of pairs, (degrees, sigma)) from [PAIRS=]DEG+-SIGMA; raises InputError for invalid angles."""
     out = []
     for text in declared:
         pattern, _, value = text.rpartition("=")
@@ -156,13 +157,8 @@ def parse_angles(declared: Sequence[str]) -> list[tuple[str, float, float]]:
             degrees = sigma_deg = math.nan
         if not (0.0 <= degrees <= 180.0 and 0.0 < sigma_deg <= 180.0):
             raise InputError(f"--angle-deg '{text}': write [PAIRS=]DEG+-SIGMA, such as 90+-0.3")
-        out.append((pattern or "*", degrees, sigma_deg))
+        out.append((pattern or "*", (degrees, sigma_deg)))
     return out
-
-
-def angle_of(declared: Sequence[tuple[str, float, float]], name: str) -> tuple[float, float] | None:
-    """Return the first (angle, sigma) whose pattern matches the pair `name`, or None."""
-    return next(((value, sigma) for pattern, value, sigma in declared if fnmatch(name, pattern)), None)
 
 
 def parse_length(what: str, value: str | float) -> float:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from rigkit.cli.console import note, print_json, progress_on_stderr
+from rigkit.cli.console import note, options_of, print_json, progress_on_stderr
 from rigkit.cli.dataset_arguments import (
     add_dataset_arguments,
     add_direction_arguments,
     add_planes_argument,
-    dataset_options,
-    direction_options,
     exit_code_of,
     failed_pairs,
+    has_directions,
+    results_folder,
 )
 from rigkit.cli.reconstruct_scene import add_scene_arguments, is_scene, run_scene
 from rigkit.core.errors import ExitCode, InputError
@@ -30,14 +30,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_scene_arguments(parser)
     parser.add_argument("--method", choices=METHODS, default="3SDIR", help="affine estimator (default 3SDIR)")
     add_planes_argument(parser, "points and normals")
-    parser.add_argument("--no-pictures", action="store_true", help="leave out PNG pictures")
+    parser.add_argument("--no-pictures", dest="pictures", action="store_false", help="leave out PNG pictures")
 
 
 def run(args: argparse.Namespace) -> int:
     if is_scene(args):
         if args.planes is not None:
             raise InputError("reconstruct: --planes needs boards, and a scene has none; leave it out")
-        if direction_options(args):
+        if has_directions(args):
             raise InputError(
                 "reconstruct: --directions and --det-scale need boards, and a scene has none; leave them out"
             )
@@ -47,10 +47,8 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.reconstruction.reconstruct import ReconstructOptions, reconstruct_dataset
 
     dataset = load_dataset(args.dataset)
-    common = dataset_options(args, dataset.name)
-    options = ReconstructOptions(
-        **common, **direction_options(args), method=args.method, planes=args.planes, pictures=not args.no_pictures
-    )
+    out = results_folder(args, dataset.name)
+    options = options_of(ReconstructOptions, args, output=out)
     done = reconstruct_dataset(dataset, options, progress=progress_on_stderr())
     results = [_summary(pair) for pair in done.pairs]
     for r in results:
@@ -61,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         for r in results:
             print(
-                f"{common['output'] / r['ply']}: {r['points']} points, {len(r['boards'])} boards, baseline "
+                f"{out / r['ply']}: {r['points']} points, {len(r['boards'])} boards, baseline "
                 f"{measured_words(r['baseline_mm'], r['baseline_sigma_mm'], 3)} mm, Sampson rms "
                 f"{r['sampson_rms_px']:.3f} px, {r['pose_type']}"
             )

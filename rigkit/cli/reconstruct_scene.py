@@ -55,8 +55,10 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         choices=tuple(map(str, PoseType)),
         help="motion between the images (default: general, or that of a rectified pair)",
     )
-    group.add_argument("--sparse", action="store_true", help="keep matched features only; no dense cloud")
-    group.add_argument("--float", action="store_true", help="write the cloud in single precision")
+    group.add_argument("--sparse", dest="grow", action="store_false", help="keep matched features only; no dense cloud")
+    group.add_argument(
+        "--float", dest="single_precision", action="store_true", help="write the cloud in single precision"
+    )
     group.add_argument("--confidence", action="store_true", help="scale normals by their confidence")
     group.add_argument(
         "--level-sigma-deg", type=float, metavar="DEG", help="standard deviation of the angles that the pose type fixes"
@@ -86,19 +88,13 @@ def run_scene(args: argparse.Namespace) -> int:
             raise InputError(f"reconstruct: {option} names two, or with --rig three and more; got {len(given)}")
     name = (args.correspondences or args.images[0]).stem
     out = results_folder(args, name)
-    passed_on = {"output": out, "rig_names": tuple(args.names) if args.names else None, "grow": not args.sparse}
-    options = options_of(SceneOptions, args, **passed_on, **_written(args))
-    done = reconstruct_views(options, progress=progress_on_stderr())
+    done = reconstruct_views(options_of(SceneOptions, args, output=out), progress=progress_on_stderr())
     scene, r = done.scene, done.scene.reconstruction
     summary = (
         f"{len(r.cloud)} points ({scene.unit}) of {len(done.correspondences)} correspondences, {scene.inliers.sum()} "
         f"inliers, Sampson rms {r.sampson_rms_px:.3f} px, {r.pose_type}"
     )
     return _show(name, out / CLOUD, summary, done.figures(), json=args.json)
-
-
-def _written(args: argparse.Namespace) -> dict[str, bool]:
-    return {"pictures": not args.no_pictures, "single_precision": args.float}
 
 
 def _show(name: str, cloud: Path, summary: str, figures: dict[str, Any], *, json: bool) -> int:
@@ -121,15 +117,12 @@ def _run_rig(args: argparse.Namespace) -> int:
             f"reconstruct: {len(args.images)} images need --rig RIG, a file that says where their cameras stand; or "
             "give two of them with --camera"
         )
-    for option in ("correspondences", "camera", "camera2", "pose", "baseline_mm", "pose_type", "sparse"):
-        if getattr(args, option):
-            word = option.replace("_", "-")
-            raise InputError(
-                f"reconstruct: --{word} applies to two images only; leave it out, the rig's file states it"
-            )
+    of_two = ("correspondences", "camera", "camera2", "pose", "baseline_mm", "pose_type")
+    given = [option.replace("_", "-") for option in of_two if getattr(args, option)]
+    for word in given or ["sparse"] * (not args.grow):
+        raise InputError(f"reconstruct: --{word} applies to two images only; leave it out, the rig's file states it")
     name = args.rig.stem
     out = results_folder(args, name)
-    options = options_of(RigSceneOptions, args, output=out, **_written(args))
-    done = reconstruct_rig_views(options, progress=progress_on_stderr())
+    done = reconstruct_rig_views(options_of(RigSceneOptions, args, output=out), progress=progress_on_stderr())
     summary = f"{len(done.cloud)} points (mm) of {len(done.pairs)} pairs, {done.merged} seen in more than one of them"
     return _show(name, out / CLOUD, summary, done.figures(), json=args.json)

@@ -6,15 +6,16 @@ Exit code 1 if a check fails.
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rigkit.cli.console import note, progress_on_stderr
+from rigkit.cli.console import note, options_of, progress_on_stderr
 from rigkit.cli.dataset_arguments import (
     add_dataset_arguments,
     add_direction_arguments,
     add_planes_argument,
-    dataset_options,
-    direction_options,
+    has_directions,
+    results_folder,
 )
 from rigkit.cli.validation_words import show, show_paper
 from rigkit.core.errors import InputError
@@ -30,11 +31,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_direction_arguments(parser)
     add_planes_argument(parser, "planes used to check angles, normals and the baseline")
-    parser.add_argument("--no-pictures", action="store_true", help="leave out PNG pictures and the HTML report")
+    parser.add_argument(
+        "--no-pictures", dest="pictures", action="store_false", help="leave out PNG pictures and the HTML report"
+    )
     parser.add_argument(
         "--figures", choices=("png", "pdf"), default="png", help="pdf: also write the pictures as vector graphics"
     )
-    parser.add_argument("--no-crosscheck", action="store_true", help="leave out the comparison with pycolmap")
+    parser.add_argument(
+        "--no-crosscheck", dest="crosscheck", action="store_false", help="leave out the comparison with pycolmap"
+    )
     parser.add_argument(
         "--paper",
         action="store_true",
@@ -58,31 +63,24 @@ def run(args: argparse.Namespace) -> int:
     if args.cluster is not None:
         raise InputError("--cluster needs several data sets; for one use -j, the processors of this machine")
     dataset = load_dataset(args.dataset[0])
-    common = dataset_options(args, dataset.name)
-    if args.paper and direction_options(args):
+    out = results_folder(args, dataset.name)
+    if args.paper and has_directions(args):
         raise InputError("--paper fixes directions and scale itself; leave --directions and --det-scale out")
     if args.paper and args.planes is not None:
         raise InputError("--paper fits planes by principal components; leave --planes out")
     if args.paper:
-        options = PaperOptions(**common, own_solvers=args.own_solvers, pictures=not args.no_pictures)
+        options = options_of(PaperOptions, args, output=out)
         return show_paper(validate_as_paper(dataset, options, progress=progress_on_stderr()), options, json=args.json)
     if args.own_solvers:
         raise InputError("--own-solvers needs --paper; add that, or leave it out")
-    done = validate_dataset(dataset, _options(args, common), progress=progress_on_stderr())
-    return show(done, common["output"], json=args.json)
+    done = validate_dataset(dataset, _options(args, out), progress=progress_on_stderr())
+    return show(done, out, json=args.json)
 
 
-def _options(args: argparse.Namespace, common: dict[str, Any]) -> ValidateOptions:
+def _options(args: argparse.Namespace, output: Path) -> ValidateOptions:
     from rigkit.workflows.validation.validate import ValidateOptions
 
-    return ValidateOptions(
-        **common,
-        **direction_options(args),
-        planes=args.planes,
-        pictures=not args.no_pictures,
-        pdf=args.figures == "pdf",
-        crosscheck=not args.no_crosscheck,
-    )
+    return options_of(ValidateOptions, args, output=output, pdf=args.figures == "pdf")
 
 
 def _validate_several(args: argparse.Namespace) -> int:
@@ -95,15 +93,15 @@ def _validate_several(args: argparse.Namespace) -> int:
 
     if args.paper or args.own_solvers:
         raise InputError("--paper is for one data set at a time")
-    common = dataset_options(args, "datasets")
+    out = results_folder(args, "datasets")
     jobs = process_count(args.jobs)
     progress = progress_on_stderr()
-    done = validate_datasets(args.dataset, _options(args, common), jobs=jobs, cluster=args.cluster, progress=progress)
+    done = validate_datasets(args.dataset, _options(args, out), jobs=jobs, cluster=args.cluster, progress=progress)
     # Sentences stand below the table, not in it.
     short = replace(done.table, columns=done.table.columns[:-1], rows=tuple(row[:-1] for row in done.table.rows))
     print(tables_to_json([done.table]) if args.json else tables_to_text([short]))
     for path, outcome in zip(args.dataset, done.outcomes, strict=True):
         if outcome.error:
             note(f"'{path}': {outcome.error}")
-    note(f"{common['output'] / 'summary.html'}")
+    note(f"{out / 'summary.html'}")
     return done.code

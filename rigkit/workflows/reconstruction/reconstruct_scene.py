@@ -82,7 +82,7 @@ class SceneOptions(CloudOptions):
     """Calibration of the second image's camera; None: the same as the first."""
     rig: Path | None = None
     """Calibrated rig that took both images; its relative pose is not estimated anew."""
-    rig_names: tuple[str, str] | None = None
+    names: tuple[str, str] | None = None
     """Cameras of the two images; None: the rig's first two."""
     pose: Path | None = None
     """Measured cam2_from_cam1, 3 x 4 or 4 x 4 numbers, mm; it is not estimated."""
@@ -209,7 +209,7 @@ def _cameras(options: SceneOptions) -> tuple[tuple[Camera, Camera], KnownPose | 
     if options.rig is not None:
         if options.camera or options.camera2 or options.pose:
             raise InputError("a scene of a rig: the rig's file has the cameras and their pose; leave the others out")
-        _, cameras, cam2_from_cam1 = import_pair(options.rig, options.rig_names, near=near)
+        _, cameras, cam2_from_cam1 = import_pair(options.rig, options.names, near=near)
         return cameras, KnownPose(cam2_from_cam1), []
     if options.camera is None:
         raise InputError("a scene needs a calibration: of its camera, or of the rig that took both images")
@@ -228,7 +228,7 @@ def _calibrations(options: SceneOptions, cameras: tuple[Camera, Camera]) -> Cali
     if options.rig is not None:
         rig = saved_rig(options.rig)
         names = list(rig.cameras)
-        chosen = options.rig_names or names[:2]
+        chosen = options.names or names[:2]
         known_rig = rig.quoted
         return None if known_rig is None else known_rig.pair(*(names.index(name) for name in chosen))
     found = [
