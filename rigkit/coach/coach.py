@@ -94,7 +94,7 @@ class Coach:
                 observe_frame(image, options.boards, name, camera=camera)
                 for image, camera in zip(images, self._called, strict=True)
             ]
-            if any(frame_observation.view is not None for frame_observation in seen):
+            if any(observation.view is not None for observation in seen):
                 self._add(name, seen, images)
 
     def look(
@@ -117,44 +117,42 @@ class Coach:
             raise InputError(f"coach: {len(images)} images of {len(names)} cameras ({', '.join(names)})")
         with self._lock:
             whole = photo or take is Take.YES
-            frame_observations = self._observe(images, whole=whole, photo=photo)
-            advice = self.guide.advise(frame_observations, photo=photo)
+            observations = self._observe(images, whole=whole, photo=photo)
+            advice = self.guide.advise(observations, photo=photo)
             # When the coach is restarted, a folder is read from its beginning again.
             again = self._marks.get(_mark(images)) if photo else None
             kept = take is Take.YES or (take is Take.IF_USEFUL and advice.take and again is None)
             taken = None
-            if kept and any(frame_observation.view is not None for frame_observation in frame_observations):
+            if kept and any(observation.view is not None for observation in observations):
                 if not whole:
-                    frame_observations = self._observe(images, whole=True, photo=photo)
-                taken = self._keep(images, frame_observations, source)
-                advice = self.guide.advise(frame_observations)
-            self._last = list(frame_observations)
+                    observations = self._observe(images, whole=True, photo=photo)
+                taken = self._keep(images, observations, source)
+                advice = self.guide.advise(observations)
+            self._last = list(observations)
             self._offered = None if taken else (images, photo)
             show(images)
-            self._show(frame_observations, advice, taken=taken)
+            self._show(observations, advice, taken=taken)
             if photo and not taken:
-                reason = f"it is {again} already" if again else _reason(frame_observations, advice)
+                reason = f"it is {again} already" if again else _reason(observations, advice)
                 self._report(f"{source or 'photo'}: not taken, as {reason}")
                 self.say(f"Not taken, as {reason}. {self._shown['words']}")
             return self._shown
 
-    def _keep(self, images: Sequence[Image], frame_observations: Sequence[FrameObservation], source: str) -> str:
+    def _keep(self, images: Sequence[Image], observations: Sequence[FrameObservation], source: str) -> str:
         """Write a frame and add it to the guide; return its name."""
         name = self.keeper.keep(images)
-        self._add(name, frame_observations, images)
+        self._add(name, observations, images)
         self._report(f"{source}: taken as {name}" if source else f"{name} taken")
         return name
 
-    def _add(self, name: str, frame_observations: Sequence[FrameObservation], images: Sequence[Image]) -> None:
+    def _add(self, name: str, observations: Sequence[FrameObservation], images: Sequence[Image]) -> None:
         self._names.append(name)
         self._marks[_mark(images)] = name
-        self.guide.add(frame_observations)
+        self.guide.add(observations)
 
-    def _show(
-        self, frame_observations: Sequence[FrameObservation] | None, advice: RigAdvice | None, **more: Any
-    ) -> None:
+    def _show(self, observations: Sequence[FrameObservation] | None, advice: RigAdvice | None, **more: Any) -> None:
         looks = self._shown["looks"] + (advice is not None)
-        self._shown = self.guide.state(frame_observations, advice) | {"looks": looks, "finished": self.finished, **more}
+        self._shown = self.guide.state(observations, advice) | {"looks": looks, "finished": self.finished, **more}
 
     def _observe(self, images: Sequence[Image], *, whole: bool, photo: bool) -> list[FrameObservation]:
         """Return what all cameras show; unless `whole`, by quick detection, in a reduced image where that is slow."""
@@ -164,16 +162,16 @@ class Coach:
         for c, (image, name, lens) in enumerate(zip(images, self.keeper.names, self.guide.lenses, strict=True)):
             shrink = 1 if whole else self._shrink[c]
             began = time.thread_time()
-            frame_observation = observe_frame(
+            observation = observe_frame(
                 image, boards, frame, self._last[c], shrink=shrink, quick=not whole, camera=self._called[c]
             )
             if not whole:
                 # Detection time is proportional to the image's area.
                 spent = (time.thread_time() - began) * shrink**2
                 self._shrink[c] = int(np.clip(np.ceil(np.sqrt(spent / LOOK_S)), 1, MAX_SHRINK))
-            if lens.size_px not in (None, frame_observation.size_px):
-                raise InputError(f"coach: frames of {frame_observation.size_px} px; '{name}' has {lens.size_px} so far")
-            out.append(frame_observation.as_photo() if photo else frame_observation)
+            if lens.size_px not in (None, observation.size_px):
+                raise InputError(f"coach: frames of {observation.size_px} px; '{name}' has {lens.size_px} so far")
+            out.append(observation.as_photo() if photo else observation)
         return out
 
     def say(self, words: str) -> None:
@@ -185,8 +183,7 @@ class Coach:
         if self._shown.get("waits"):
             with self._lock:
                 none = [
-                    FrameObservation(size_px=frame_observation.size_px, view=None)
-                    for frame_observation in self.guide.frames[-1]
+                    FrameObservation(size_px=observation.size_px, view=None) for observation in self.guide.frames[-1]
                 ]
                 advice = self.guide.advise(none)
                 if not advice.waits:
@@ -204,21 +201,21 @@ class Coach:
     def choose(self, frames: Sequence[Sequence[Image]], show: Callable[[Sequence[Image]], None]) -> None:
         """Take the frames with the largest gain from a recording, the best first, and show each, until there are enough
         or none of the rest has a gain."""
-        frame_observations: list[list[FrameObservation]] = []
+        observations: list[list[FrameObservation]] = []
         left = list(range(len(frames)))
         for images in frames:
-            self.say(f"Looking closely: {len(frame_observations) + 1} of {len(frames)}")
-            frame_observations.append(self._observe(images, whole=True, photo=True))
+            self.say(f"Looking closely: {len(observations) + 1} of {len(frames)}")
+            observations.append(self._observe(images, whole=True, photo=True))
         while left:
-            advice = [self.guide.advise(frame_observations[k]) for k in left]
+            advice = [self.guide.advise(observations[k]) for k in left]
             if advice[0].enough or max(a.frame_gain for a in advice) < MIN_FRAME_GAIN:
                 return
             best = left.pop(int(np.argmax([a.frame_gain for a in advice])))
             with self._lock:
-                self._keep(frames[best], frame_observations[best], "")
+                self._keep(frames[best], observations[best], "")
                 show(frames[best])
                 chosen = f"Choosing frames: {len(self.guide.frames)} so far"
-                self._show(frame_observations[best], self.guide.advise(frame_observations[best]), words=chosen)
+                self._show(observations[best], self.guide.advise(observations[best]), words=chosen)
 
     def undo(self) -> dict[str, Any]:
         """Remove the last frame from the session; raises InputError where there is none."""
@@ -231,8 +228,8 @@ class Coach:
             self._marks = {mark: name for mark, name in self._marks.items() if name != dropped}
             frames = self.guide.frames[:-1]
             self.guide = RigGuide(self.keeper.names, self.guide.options, self._executor)
-            for frame_observations in frames:
-                self.guide.add(frame_observations)
+            for observations in frames:
+                self.guide.add(observations)
             self._show(None, None)
             return self._shown
 
@@ -249,10 +246,10 @@ def _mark(images: Sequence[Image]) -> bytes:
     return sha256(b"".join(np.ascontiguousarray(image).tobytes() for image in images)).digest()
 
 
-def _reason(frame_observations: Sequence[FrameObservation], advice: RigAdvice) -> str:
+def _reason(observations: Sequence[FrameObservation], advice: RigAdvice) -> str:
     """Return why an image is not taken."""
-    seeing = [frame_observation for frame_observation in frame_observations if frame_observation.view is not None]
-    wrong = next((frame_observation.complaint for frame_observation in seeing if frame_observation.complaint), "")
+    seeing = [observation for observation in observations if observation.view is not None]
+    wrong = next((observation.complaint for observation in seeing if observation.complaint), "")
     if not seeing:
         return "no board is seen"
     if wrong:

@@ -175,13 +175,13 @@ class CaptureGuide:
         if self._whole.go_on(self.views, self.size_px):
             self._plan = self._map = None
 
-    def advise(self, frame_observation: FrameObservation, *, photo: bool = False) -> Advice:
+    def advise(self, observation: FrameObservation, *, photo: bool = False) -> Advice:
         """Return what to do, and whether to take this frame, or `photo`."""
         self._go_on()
-        plan = self._planned(frame_observation.size_px)
-        target = self.asked(frame_observation.size_px)
+        plan = self._planned(observation.size_px)
+        target = self.asked(observation.size_px)
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
-        frame_gain, min_gain = self._gain(frame_observation.view, plan, photo=photo), min_gain_of(photo=photo)
+        frame_gain, min_gain = self._gain(observation.view, plan, photo=photo), min_gain_of(photo=photo)
         left = () if self.calibration is None else self._left_now
         would_do = bool(left) and self.has_many
         would_do = would_do and (all(own.reached for own in left) or plan.gain < MIN_GAIN_TO_CONTINUE)
@@ -191,15 +191,15 @@ class CaptureGuide:
             words = CHECKING
         elif steady:
             words = enough_words(left, plan.gain, plan.knowledge.camera)
-        elif frame_observation.view is not None and frame_gain >= min_gain and frame_observation.complaint:
-            words = frame_observation.complaint.capitalize()
+        elif observation.view is not None and frame_gain >= min_gain and observation.complaint:
+            words = observation.complaint.capitalize()
         elif would_do:
             words = f"One more as confirmation: {where}"
         return Advice(
             words=words,
             target_px=where.outline_px,
             frame_gain=frame_gain,
-            take=not frame_observation.complaint and frame_gain >= min_gain and steady is False,
+            take=not observation.complaint and frame_gain >= min_gain and steady is False,
             enough=steady is True,
             waits=steady is None,
             left=left,

@@ -96,20 +96,19 @@ class RigGuide:
         self._shared: dict[int, SharedViews | None] = {}
         self._asked: dict[int, tuple[str, list[Pixels | None]]] = {}
 
-    def add(self, frame_observations: Sequence[FrameObservation]) -> None:
+    def add(self, observations: Sequence[FrameObservation]) -> None:
         """Add a frame of every camera."""
-        self.frames.append(tuple(frame_observations))
+        self.frames.append(tuple(observations))
         self._shared.clear()
         self._asked.clear()
-        for lens, frame_observation in zip(self.lenses, frame_observations, strict=True):
-            if frame_observation.view is not None:
-                lens.add(frame_observation.view, frame_observation.size_px)
+        for lens, observation in zip(self.lenses, observations, strict=True):
+            if observation.view is not None:
+                lens.add(observation.view, observation.size_px)
 
-    def advise(self, frame_observations: Sequence[FrameObservation], *, photo: bool = False) -> RigAdvice:
+    def advise(self, observations: Sequence[FrameObservation], *, photo: bool = False) -> RigAdvice:
         """Return what to do, and whether to take these frames, or photos."""
         lenses = tuple(
-            lens.advise(frame_observation, photo=photo)
-            for lens, frame_observation in zip(self.lenses, frame_observations, strict=True)
+            lens.advise(observation, photo=photo) for lens, observation in zip(self.lenses, observations, strict=True)
         )
         mounts = {c: self._mount_px(c) for c in range(1, len(lenses))}
         open_mounts = [c for c, px in mounts.items() if px is None or px > self.options.goal_px]
@@ -118,19 +117,19 @@ class RigGuide:
         advice = RigAdvice(lenses=lenses, mount_px=mount_px, targets=(None,) * len(lenses))
         alone = all(lens.enough for lens in lenses)
         if len(lenses) > 1 and not open_mounts and (alone or self._rig_is_enough(lenses)):
-            advice = self._of_rig(advice, frame_observations, photo=photo)
+            advice = self._of_rig(advice, observations, photo=photo)
         elif len(lenses) == 1 or not alone:
-            advice = self._of_lenses(advice, frame_observations)
+            advice = self._of_lenses(advice, observations)
         else:
             advised_camera = max(open_mounts, key=lambda c: np.inf if mounts[c] is None else float(mounts[c] or 0.0))
-            advice = self._of_mount(replace(advice, advised_camera=advised_camera), frame_observations)
-        seeing, min_gain = [g for g in frame_observations if g.view is not None], min_gain_of(photo=photo)
+            advice = self._of_mount(replace(advice, advised_camera=advised_camera), observations)
+        seeing, min_gain = [g for g in observations if g.view is not None], min_gain_of(photo=photo)
         complaint = next((g.complaint for g in seeing if g.complaint), "")
         if advice.enough or advice.waits or not seeing or advice.frame_gain < min_gain:
             return advice
         return replace(advice, take=not complaint, words=complaint.capitalize() or TAKING)
 
-    def _of_lenses(self, advice: RigAdvice, frame_observations: Sequence[FrameObservation]) -> RigAdvice:
+    def _of_lenses(self, advice: RigAdvice, observations: Sequence[FrameObservation]) -> RigAdvice:
         """Return the advice for the lens with the largest error; without errors, for that with the fewest frames."""
         lenses = advice.lenses
         badly = [(a.enough, a.waits, -a.share, len(lens.views)) for lens, a in zip(self.lenses, lenses, strict=True)]
@@ -142,7 +141,7 @@ class RigGuide:
             frame_gain=max(
                 [
                     a.frame_gain
-                    for a, g in zip(lenses, frame_observations, strict=True)
+                    for a, g in zip(lenses, observations, strict=True)
                     if not (a.enough or a.waits) and g.view
                 ],
                 default=0.0,
@@ -153,22 +152,22 @@ class RigGuide:
             targets=tuple(a.target_px if c == advised_camera and not a.waits else None for c, a in enumerate(lenses)),
         )
 
-    def _of_mount(self, advice: RigAdvice, frame_observations: Sequence[FrameObservation]) -> RigAdvice:
+    def _of_mount(self, advice: RigAdvice, observations: Sequence[FrameObservation]) -> RigAdvice:
         """Return the advice for the camera with the least certain mount."""
         c = advice.advised_camera
         if c not in self._asked:
             self._asked[c] = self._shared_target(c)
         words, targets = self._asked[c]
-        return replace(advice, words=words, targets=tuple(targets), frame_gain=self._mount_gain(c, frame_observations))
+        return replace(advice, words=words, targets=tuple(targets), frame_gain=self._mount_gain(c, observations))
 
-    def _of_rig(self, advice: RigAdvice, frame_observations: Sequence[FrameObservation], *, photo: bool) -> RigAdvice:
+    def _of_rig(self, advice: RigAdvice, observations: Sequence[FrameObservation], *, photo: bool) -> RigAdvice:
         """Return the advice by the rig's calibration, once lenses and mounts seem good enough."""
         self._go_on()
         steady = self._whole.steady(len(self.frames))
         if steady is None:
             return replace(advice, words=CHECKING, waits=True)
         if self._whole.latest is None:
-            return self._of_mount(replace(advice, advised_camera=1), frame_observations)
+            return self._of_mount(replace(advice, advised_camera=1), observations)
         try:
             known = self._known_by(self._whole.latest)
         except DegenerateError as error:
@@ -180,7 +179,7 @@ class RigGuide:
         words, targets = known.target()
         if would_do:
             words = f"One more as confirmation: {words[0].lower()}{words[1:]}"
-        frame = [frame_observation.view for frame_observation in frame_observations]
+        frame = [observation.view for observation in observations]
         new = any(view is not None and not lens.repeats(view) for lens, view in zip(self.lenses, frame, strict=True))
         frame_gain = known.gain_of(frame, photo=photo) if new else 0.0
         return replace(advice, words=words, targets=tuple(targets), frame_gain=frame_gain)
@@ -203,7 +202,7 @@ class RigGuide:
         """Use finished calibrations, and start one of new frames once each lens has its own: the rig reuses them."""
         if not all(lens.is_calibrated for lens in self.lenses):
             return
-        frames = [[frame_observation.view for frame_observation in frame] for frame in self.frames]
+        frames = [[observation.view for observation in frame] for frame in self.frames]
         begun = [lens.begun for lens in self.lenses if lens.begun is not None]
         if self._whole.go_on(frames, self.names, [lens.size_px for lens in self.lenses], begun):
             self._known = None
@@ -251,9 +250,9 @@ class RigGuide:
             return None
         return float(mount_error_px(shared, mount_information(shared).sum(axis=0)))
 
-    def _mount_gain(self, c: int, frame_observations: Sequence[FrameObservation]) -> float:
+    def _mount_gain(self, c: int, observations: Sequence[FrameObservation]) -> float:
         """Return the gain of this frame for the mount of camera `c`, relative to that of one more typical frame."""
-        pair, shared = self._held_by(self._partner(c), c, frame_observations), self._shared_of(c)
+        pair, shared = self._held_by(self._partner(c), c, observations), self._shared_of(c)
         if pair is None:
             return 0.0
         if shared is None or len(shared.in_a) < 2:
@@ -288,7 +287,7 @@ class RigGuide:
         targets[a], targets[c] = where.outline_px, placement(shared.b, board, in_b.pose(best)).outline_px
         return f"{words}: {where} of {self.names[a]}", targets
 
-    def state(self, frame_observations: Sequence[FrameObservation] | None, advice: RigAdvice | None) -> dict[str, Any]:
+    def state(self, observations: Sequence[FrameObservation] | None, advice: RigAdvice | None) -> dict[str, Any]:
         """Return the state for the page."""
         out: dict[str, Any] = {"frames": len(self.frames), "least_frames": ENOUGH_FRAMES}
         if advice is not None:
@@ -312,8 +311,8 @@ class RigGuide:
             target = None if advice is None else advice.targets[c]
             if target is not None:
                 own["target"] = np.round(target[np.isfinite(target).all(axis=1)], 1).tolist()
-            if frame_observations is not None:
-                own |= frame_observations[c].shown()
+            if observations is not None:
+                own |= observations[c].shown()
             cameras.append(own)
         return out | {"cameras": cameras}
 
