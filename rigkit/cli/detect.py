@@ -72,11 +72,7 @@ def _words(found: BoardDetection) -> str:
 
 
 def _summary(found: BoardDetection) -> dict[str, Any]:
-    return {
-        "board": found.board_id,
-        "columns": found.columns,
-        "rows": found.rows,
-        "grid": found.grid.tolist(),
-        "pixels": found.pixels.tolist(),
-        "sigma_px": found.sigma_px.tolist(),
-    }
+    from rigkit.io.corners.corner_cache import detection_to_json
+
+    known = detection_to_json(found)
+    return {"board": known.pop("board_id"), **known}

@@ -55,6 +55,9 @@ FURTHER = {
 }  # fmt: skip
 """Parameters of COLMAP's models that rigkit lacks."""
 
+OWN = {"pinhole": "PINHOLE", "brown": "OPENCV", "kannala_brandt": "OPENCV_FISHEYE", "eucm": "EUCM"}
+"""rigkit's model -> COLMAP's; FULL_OPENCV for more than four terms of a Brown camera."""
+
 COUNT, HEAD = struct.Struct("<Q"), struct.Struct("<iiQQ")
 MODELS_BY_ID = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
@@ -75,9 +78,7 @@ def write_colmap_cameras(
     for camera_id, camera in cameras.items():
         chosen = best_accepted(camera, COLMAP_ACCEPTS, "COLMAP", (outlines or {}).get(camera_id))
         c = chosen.camera
-        name = {"pinhole": "PINHOLE", "kannala_brandt": "OPENCV_FISHEYE", "eucm": "EUCM"}.get(c.model)
-        if name is None:
-            name = "OPENCV" if c.parameters.size == 8 else "FULL_OPENCV"
+        name = "FULL_OPENCV" if c.model == "brown" and c.parameters.size > 8 else OWN[c.model]
         ours = c.named(c.parameters)
         ours["cx"] += HALF_PIXEL
         ours["cy"] += HALF_PIXEL
@@ -189,14 +190,9 @@ def _camera(kind: str, size_px: tuple[int, int], theirs: dict[str, float], name:
 
 
 def _parameters(model: str, theirs: dict[str, float]) -> FloatArray:
-    names = {
-        "pinhole": ("fx", "fy", "cx", "cy"),
-        "brown": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-        "kannala_brandt": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-        "eucm": ("fx", "fy", "cx", "cy", "alpha", "beta"),
-    }[model]
+    names = LAYOUTS[OWN[model]][1]
     if model == "brown" and any(theirs.get(k, 0.0) != 0.0 for k in ("k4", "k5", "k6")):
-        names = (*names, "k3", "k4", "k5", "k6")
+        names = LAYOUTS["FULL_OPENCV"][1]
     elif model == "brown" and "k3" in theirs:
         names = (*names, "k3")
     return np.array([theirs.get(key, 0.0) for key in names])

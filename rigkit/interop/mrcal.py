@@ -203,12 +203,8 @@ def _basis(u: FloatArray, lens: str) -> tuple[Any, BoolArray]:
     inside = ((cell >= 1) & (cell + 2 <= count - 1)).all(axis=-1)
     cell = np.clip(np.nan_to_num(cell), 1, count - 3).astype(np.int64)
     t = position - cell
-    weights = (
-        np.stack(
-            [(1.0 - t) ** 3, 3.0 * t**3 - 6.0 * t**2 + 4.0, -3.0 * t**3 + 3.0 * t**2 + 3.0 * t + 1.0, t**3], axis=-1
-        )
-        / 6.0
-    )
+    cubics = [(1.0 - t) ** 3, 3.0 * t**3 - 6.0 * t**2 + 4.0, -3.0 * t**3 + 3.0 * t**2 + 3.0 * t + 1.0, t**3]
+    weights = np.stack(cubics, axis=-1) / 6.0
     step = np.arange(4)
     columns = (cell[:, 1, None, None] + step[:, None] - 1) * count[0] + cell[:, 0, None, None] + step - 1
     values = weights[:, 1, :, None] * weights[:, 0, None, :]

@@ -109,7 +109,13 @@ def calibrate_hand_eye(
     missing = [path.name for path in paths if path.name not in robot]
     if missing:
         raise InputError(f"'{poses}': no pose of image '{missing[0]}' ({len(missing)} in all); add the rows")
-    board, camera = _with_unique_orientation(board_of_words(str(options.board))), import_near_camera(options.camera)
+    board = board_of_words(str(options.board))
+    if board.looks_same_turned:
+        raise InputError(
+            f"board '{board.board_id}' looks the same turned by 180 degrees: take {board.pattern.unambiguous}, or one "
+            "with markers"
+        )
+    camera = import_near_camera(options.camera)
     views, stands, unreadable = [], [], []
     for done, path in enumerate(paths, start=1):
         try:
@@ -190,15 +196,6 @@ def _uncertain_camera(camera: str | Path) -> UncertainCamera | None:
         return uncertain_camera(load_calibration(camera))
     except InputError:
         return None
-
-
-def _with_unique_orientation(board: Board) -> Board:
-    if board.looks_same_turned:
-        raise InputError(
-            f"board '{board.board_id}' looks the same turned by 180 degrees: take {board.pattern.unambiguous}, or one "
-            "with markers"
-        )
-    return board
 
 
 def _boards_in(path: Path, board: Board, camera: Camera, calibration: str | Path) -> Sequence[BoardDetection]:

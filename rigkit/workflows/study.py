@@ -84,9 +84,8 @@ def run_studies(
     for path, study in zip(paths, studies, strict=True):
         parts = None if options.output is None else options.output / f".{study.name}.parts"
         with about(path):
-            table = tabulate(
-                study, run_study(study, jobs=options.jobs, dask=options.dask, parts=parts, progress=progress)
-            )
+            errors = run_study(study, jobs=options.jobs, dask=options.dask, parts=parts, progress=progress)
+            table = tabulate(study, errors)
             places = _files_of(study, options)
             if places:
                 figure = study_figure(table, options.figure)
@@ -130,32 +129,24 @@ def run_study(
     parts : folder for finished chunks. Chunks of an earlier run of the same study are used; they are removed when the
         study is complete.
     """
-    total = chunk_count(study)
-    key = study_key(study)
-    done: dict[int, Errors] = {}
-    for index in range(total) if parts is not None else ():
-        earlier = _read_chunk(_chunk_path(parts, key, index))
-        if earlier is not None:
-            done[index] = earlier
+    total, key = chunk_count(study), study_key(study)
+    places = [] if parts is None else [parts / f"{key}-{index:05d}.npy" for index in range(total)]
+    earlier = {index: _read_chunk(place) for index, place in enumerate(places)}
+    done = {index: errors for index, errors in earlier.items() if errors is not None}
     progress(study.name, len(done), total)
     missing = [index for index in range(total) if index not in done]
     for place, errors in over_items(partial(run_chunk, study), missing, jobs=jobs, cluster=dask):
         index = missing[place]
         done[index] = errors
-        if parts is not None:
-            write_atomic(_chunk_path(parts, key, index), _npy(errors), force=True)
+        if places:
+            write_atomic(places[index], _npy(errors), force=True)
         progress(study.name, len(done), total)
+    for path in places:
+        path.unlink(missing_ok=True)
     if parts is not None:
-        for index in range(total):
-            _chunk_path(parts, key, index).unlink(missing_ok=True)
         with suppress(OSError):
             parts.rmdir()
     return [done[index] for index in range(total)]
-
-
-def _chunk_path(parts: Path | None, key: str, index: int) -> Path:
-    assert parts is not None
-    return parts / f"{key}-{index:05d}.npy"
 
 
 def _read_chunk(path: Path) -> Errors | None:

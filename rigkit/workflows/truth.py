@@ -87,7 +87,9 @@ def fetch_public_set(described: PublicSet, root: Path | None = None, *, progress
         progress(f"fetch {described.name}", k, len(described.sha256))
         url, _, member = described.urls.get(name, "").partition("#")
         if (folder / name).is_file():
-            _require(folder / name, expected)
+            _require_hash(
+                (folder / name).read_bytes(), str(folder / name), expected, "remove the file and fetch it anew"
+            )
         elif member:
             packed.setdefault(url, {}).setdefault(member, []).append(name)
             fetched.append(name)
@@ -108,12 +110,8 @@ def fetch_public_set(described: PublicSet, root: Path | None = None, *, progress
     )
 
 
-def _require(path: Path, expected: str) -> None:
-    """Raise InputError if the file has another hash."""
-    _require_hash(path.read_bytes(), str(path), expected, "remove the file and fetch it anew")
-
-
 def _require_hash(data: bytes, source: str, expected: str, remedy: str) -> None:
+    """Raise InputError if the content of a file has another hash."""
     found = hashlib.sha256(data).hexdigest()
     if found != expected:
         raise InputError(f"{source}: its SHA-256 is {found[:12]}..., the description says {expected[:12]}...; {remedy}")

@@ -66,14 +66,7 @@ def _kalibr(values: Mapping[str, Any]) -> Values:
         }
         return {**size, **sides}
     if kind == "circlegrid":
-        if values.get("asymmetricGrid"):
-            return {
-                "type": "circles",
-                **size,
-                "distance_mm": 2.0 * _mm(values["spacingMeters"]),
-                "layout": "asymmetric",
-            }
-        return {"type": "circles", **size, "distance_mm": _mm(values["spacingMeters"])}
+        return _circles(size, _mm(values["spacingMeters"]), asymmetric=bool(values.get("asymmetricGrid")))
     raise ValueError(f"target_type {kind}")
 
 
@@ -105,11 +98,16 @@ def _opencv(values: Mapping[str, Any]) -> Values:
         inner = {"columns": size["columns"] - 1, "rows": size["rows"] - 1}
         marker = {"dictionary": values["ArUco_Dict_Name"], "marker_mm": float(values["Marker_Size"])}
         return {"type": "charuco", **inner, "square_mm": square, **marker}
-    if kind == "CIRCLES_GRID":
-        return {"type": "circles", **size, "distance_mm": square}
-    if kind == "ASYMMETRIC_CIRCLES_GRID":
-        return {"type": "circles", **size, "distance_mm": 2.0 * square, "layout": "asymmetric"}
+    if kind in ("CIRCLES_GRID", "ASYMMETRIC_CIRCLES_GRID"):
+        return _circles(size, square, asymmetric=kind.startswith("ASYMMETRIC"))
     return {**size, "square_mm": square}
+
+
+def _circles(size: Values, spacing_mm: float, *, asymmetric: bool) -> Values:
+    """Return a grid of circles; the spacing of an asymmetric one is half the distance of two circles in a row."""
+    if asymmetric:
+        return {"type": "circles", **size, "distance_mm": 2.0 * spacing_mm, "layout": "asymmetric"}
+    return {"type": "circles", **size, "distance_mm": spacing_mm}
 
 
 def _caliscope(source: Path) -> Values | None:

@@ -202,28 +202,19 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         for pupil in pupils.values():
             require_of_frame(pupil, size)
         beyond = tuple(_modes(departures.get(name, _NO_MODES), size) for name in cameras) if departures else ()
-        covariance = None
-        if "covariance" in data:
-            covariance = as_covariance(data["covariance"], "covariance", size)
-        sigma_px = None if "sigma_px" not in data else positive(data["sigma_px"])
-        scale_sigma = real(data.get("scale_sigma", 0.0))
-        of_freedom = freedom(data.get("freedom"))
-        overdispersion = positive(data.get("overdispersion", data.get("spread", 1.0)))
-        boards = tuple(board_of_values(entry["target"], entry["board_id"]) for entry in data.get("boards", ()))
-        verdicts = findings_from_json(data.get("verdicts", ()))
-    return SavedRig(
-        cameras=cameras,
-        covariance=covariance,
-        sigma_px=sigma_px,
-        scale_sigma=scale_sigma,
-        freedom=of_freedom,
-        overdispersion=overdispersion,
-        boards=boards,
-        outlines=outlines,
-        departures=beyond,
-        pupils=pupils,
-        verdicts=verdicts,
-    )
+        return SavedRig(
+            cameras=cameras,
+            covariance=as_covariance(data["covariance"], "covariance", size) if "covariance" in data else None,
+            sigma_px=positive(data["sigma_px"]) if "sigma_px" in data else None,
+            scale_sigma=real(data.get("scale_sigma", 0.0)),
+            freedom=freedom(data.get("freedom")),
+            overdispersion=positive(data.get("overdispersion", data.get("spread", 1.0))),
+            boards=tuple(board_of_values(entry["target"], entry["board_id"]) for entry in data.get("boards", ())),
+            outlines=outlines,
+            departures=beyond,
+            pupils=pupils,
+            verdicts=findings_from_json(data.get("verdicts", ())),
+        )
 
 
 def _modes_to_json(own: LensModes) -> dict[str, Any]:

@@ -101,7 +101,7 @@ class CornerCache:
 
     def put(self, name: str, digest: str, found: FoundCorners, lens: str | None = None) -> None:
         """Store the corners of an image; those detected with a `lens` beside those detected without one."""
-        boards = [_detection_out(d) for d in found.detections]
+        boards = [detection_to_json(d) for d in found.detections]
         if not self.current:
             self._entries, self.current = {}, True
         if lens is None:
@@ -149,7 +149,8 @@ def image_hash(path: Path) -> str:
     return hashlib.sha256(read_bytes(path, "image")).hexdigest()
 
 
-def _detection_out(d: BoardDetection) -> dict[str, Any]:
+def detection_to_json(d: BoardDetection) -> dict[str, Any]:
+    """Return the JSON of a detection; the board's key is "board_id"."""
     return {
         "board_id": d.board_id,
         "columns": d.columns,

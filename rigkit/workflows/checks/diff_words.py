@@ -108,19 +108,15 @@ def _chance(value: float | None) -> str:
 def _camera_figures(pair: CameraPair) -> dict[str, Any]:
     """Return the figures for machine-readable output; `same` is None where a file has no covariance."""
     judged, difference = pair.judged, pair.difference
-    return {
-        "rms_px": difference.rms_px,
-        "max_px": difference.max_px,
-        "rotation_deg": difference.rotation_deg,
-        "coverage": difference.coverage,
-        "predicted_px": None if judged is None else judged.predicted_px,
-        "usual_px": None if judged is None else list(judged.interval_px),
-        "ratio": None if judged is None else judged.ratio,
-        "chance": None if judged is None else judged.chance,
-        "verdict": None if judged is None else str(judged.verdict),
-        "same": pair.same,
-        "same_model": None if judged is None else judged.same_model,
+    of_both = {
+        "predicted_px": judged and judged.predicted_px,
+        "usual_px": judged and list(judged.interval_px),
+        "ratio": judged and judged.ratio,
+        "chance": judged and judged.chance,
+        "verdict": judged and str(judged.verdict),
     }
+    own = {name: getattr(difference, name) for name in ("rms_px", "max_px", "rotation_deg", "coverage")}
+    return own | of_both | {"same": pair.same, "same_model": judged and judged.same_model}
 
 
 def _camera_in_words(figures: dict[str, Any]) -> str:
