@@ -35,7 +35,7 @@ from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.coach.guide import Advice, CaptureGuide, GuideOptions
 from rigkit.coach.look import FrameObservation
 from rigkit.coach.rig import RigGuide
-from rigkit.coach.rig_whole import left_of_rig, whole_rig
+from rigkit.coach.rig_whole import full_rig_calibration, remaining_errors_of_rig
 from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
@@ -126,7 +126,7 @@ def guided(name: str, goal_px: float, rng: np.random.Generator) -> Iterator[tupl
         began = time.process_time()
         advice = guide.advise(nothing)
         yield guide, advice, time.process_time() - began
-        asked = guide.asked(SIZE)
+        asked = guide.requested_view(SIZE)
         held = (see(by_hand(asked.cam_from_board, BOARD, rng), lens, f"{k:03d}", rng) for _ in range(TRIES))
         view = next((one for one in held if one is not None), None)
         if view is not None:
@@ -179,11 +179,11 @@ def simulated_rig(name: str, goal_px: float, rng: np.random.Generator) -> Sessio
             if any(view is not None for view in views):
                 guide.add([FrameObservation(size_px=SIZE, view=view) for view in views])
                 break
-    whole = whole_rig(
+    whole = full_rig_calibration(
         [[frame_observation.view for frame_observation in frame] for frame in guide.frames], NAMES, [SIZE, SIZE]
     )
     assert whole is not None
-    left = left_of_rig(whole, options)
+    left = remaining_errors_of_rig(whole, options)
     return Session(
         frames=len(guide.frames),
         words=advice.words,

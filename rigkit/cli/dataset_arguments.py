@@ -72,9 +72,9 @@ def add_planes_argument(parser: argparse.ArgumentParser, what: str) -> None:
 
 def results_folder(args: argparse.Namespace, name: str) -> Path:
     """Return the folder of `--output`, or a new one of that name."""
-    from rigkit.workflows.outputs.results import free_folder
+    from rigkit.workflows.outputs.results import new_results_folder
 
-    return Path(args.output) if args.output else free_folder(name, force=args.force)
+    return Path(args.output) if args.output else new_results_folder(name, force=args.force)
 
 
 def failed_pairs(failures: Sequence[PairFailure]) -> dict[str, dict[str, str]]:

@@ -18,7 +18,7 @@ from typing import Any
 
 from rigkit.cli.examples import EXAMPLES, FIRST_STEPS
 from rigkit.cli.log import add_log_arguments, logged_run, logging_to
-from rigkit.cli.surroundings import SURROUNDINGS, Terminated, open_streams, say, settle_stderr, signals_interrupt
+from rigkit.cli.surroundings import SURROUNDINGS, Terminated, flush_stderr, open_streams, say, signals_interrupt
 from rigkit.core.errors import ExitCode, InputError, RigkitError, interruption, printable
 
 VERBS: dict[str, str] = {
@@ -143,7 +143,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         say("this is a bug in rigkit; please report the lines above", before=traceback.format_exc())
         return ExitCode.BUG
     finally:
-        settle_stderr()
+        flush_stderr()
 
 
 if __name__ == "__main__":

@@ -62,12 +62,12 @@ def parse_calibrations(declared: Sequence[str], folder: Path) -> dict[str, str]:
 def _of_rigs(declared: Sequence[str]) -> list[str]:
     """Return `declared` with every rig's file replaced by NAME=FILE of its cameras."""
     from rigkit.io.calibrations.rig_file import is_rig_file
-    from rigkit.workflows.inputs.camera_files import own_files
+    from rigkit.workflows.inputs.camera_files import files_of_cameras
 
     out: list[str] = []
     for words in declared:
         path = usable_path(words)
-        of_rig = own_files(path) if is_rig_file(path) else None
+        of_rig = files_of_cameras(path) if is_rig_file(path) else None
         out += [words] if of_rig is None else [f"{name}={own}" for name, own in of_rig.items()]
     return out
 

@@ -24,7 +24,7 @@ def image_to_dict(one: RectifiedImage, projection: str) -> dict[str, Any]:
     }
 
 
-def alike(images: Sequence[RectifiedImage], projection: str) -> list[tuple[str, list[Path]]]:
+def grouped_by_description(images: Sequence[RectifiedImage], projection: str) -> list[tuple[str, list[Path]]]:
     """Return descriptions of images, each with the images of one folder that share it."""
     out: dict[tuple[Path, str], list[Path]] = {}
     for one in images:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from rigkit.cli.console import size_of_words
-from rigkit.cli.rectification_words import alike, image_to_dict
+from rigkit.cli.rectification_words import grouped_by_description, image_to_dict
 from rigkit.core.errors import ExitCode, InputError
 
 
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(result)
     else:
-        for words, images in alike(done.images, args.projection):
+        for words, images in grouped_by_description(done.images, args.projection):
             place = images[0] if len(images) == 1 else f"{images[0].parent}, {len(images)} images"
             print(f"{place}: {words}")
         if done.pair is not None:

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 def page(rig: RigCalibration, checks: Sequence[Check], session: RigSession) -> PageFacts:
     """Return the facts on the page of a rig and of its cameras."""
     from rigkit.report.pages.calibration_facts import rig_facts
-    from rigkit.workflows.calibration.calibrate_rig import shown_cameras
+    from rigkit.workflows.calibration.calibrate_rig import cameras_on_page
 
-    shown = shown_cameras(rig, session)
+    shown = cameras_on_page(rig, session)
     cameras = {name: calibration_words.page(c, session.cameras[name].boards) for name, c in shown.items()}
     return rig_facts(rig, checks, cameras)
 

@@ -40,7 +40,7 @@ def say(words: str, *, before: str = "") -> None:
         print(f"{before}rigkit: {words}", file=sys.stderr, flush=True)
 
 
-def settle_stderr() -> None:
+def flush_stderr() -> None:
     """Flush stderr, or replace it if that fails: Python (up to 3.11.2) would otherwise exit with code 120."""
     try:
         sys.stderr.flush()

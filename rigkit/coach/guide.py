@@ -17,7 +17,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.cameras.compare import grid_pixels
 from rigkit.coach.look import FrameObservation
-from rigkit.coach.whole import WholeCalibrations, whole_calibration
+from rigkit.coach.whole import FullCalibrations, full_calibration
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
@@ -85,7 +85,7 @@ class GuideOptions:
     def stated(self, calibration: Calibration) -> str:
         """Return in words the errors of a calibration, and whether they meet the requirements."""
         known = uncertain_camera(calibration)
-        return stated_words(
+        return errors_in_words(
             [requirement.remaining(known.covariance) for requirement in self.requirements(known.camera)]
         )
 
@@ -131,7 +131,7 @@ class CaptureGuide:
         self.size_px: tuple[int, int] | None = None
         self._quick: Calibration | None = None
         self._stale = False
-        self._whole = WholeCalibrations(executor or SerialExecutor(), whole_calibration)
+        self._whole = FullCalibrations(executor or SerialExecutor(), full_calibration)
         self._plan: Plan | None = None
         self._left_now: tuple[RemainingError, ...] = ()
         self._map: list[list[float | None]] | None = None
@@ -179,7 +179,7 @@ class CaptureGuide:
         """Return what to do, and whether to take this frame, or `photo`."""
         self._go_on()
         plan = self._planned(observation.size_px)
-        target = self.asked(observation.size_px)
+        target = self.requested_view(observation.size_px)
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
         frame_gain, min_gain = self._gain(observation.view, plan, photo=photo), min_gain_of(photo=photo)
         left = () if self.calibration is None else self._left_now
@@ -206,7 +206,7 @@ class CaptureGuide:
             more_percent=100.0 * plan.gain if left else None,
         )
 
-    def asked(self, size_px: tuple[int, int]) -> Proposal:
+    def requested_view(self, size_px: tuple[int, int]) -> Proposal:
         """Return the view that is asked for."""
         return self._planned(size_px).views[0]
 
@@ -308,7 +308,7 @@ def relative_gain(plan: Plan, after: float, *, photo: bool) -> float:
     return max(brings, MIN_GAIN_OF_PHOTO / MIN_GAIN_TO_CONTINUE * (1.0 - after / plan.error)) if photo else brings
 
 
-def stated_words(left: Sequence[RemainingError]) -> str:
+def errors_in_words(left: Sequence[RemainingError]) -> str:
     """Return errors in words, and whether they meet their requirements."""
     each = (f"{own} ({'as wanted' if own.reached else f'wanted {own.requirement.wanted:g}'})" for own in left)
     return f"error {', '.join(each)}"

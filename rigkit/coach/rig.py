@@ -27,8 +27,8 @@ from rigkit.coach.guide import (
     min_gain_of,
 )
 from rigkit.coach.look import FrameObservation
-from rigkit.coach.rig_whole import RigKnown, whole_rig
-from rigkit.coach.whole import WholeCalibrations
+from rigkit.coach.rig_whole import RigKnown, full_rig_calibration
+from rigkit.coach.whole import FullCalibrations
 from rigkit.core.arrays import Pixels
 from rigkit.core.errors import DegenerateError
 from rigkit.core.processes import SerialExecutor
@@ -90,7 +90,7 @@ class RigGuide:
         # A requirement on what is measured is one on the rig, not on single cameras.
         alone = options if len(names) == 1 else replace(options, goal_mm=None)
         self.lenses = tuple(CaptureGuide(alone, executor) for _ in names)
-        self._whole = WholeCalibrations(executor or SerialExecutor(), whole_rig)
+        self._whole = FullCalibrations(executor or SerialExecutor(), full_rig_calibration)
         self._known: RigKnown | None = None
         self.frames: list[tuple[FrameObservation, ...]] = []
         self._shared: dict[int, SharedViews | None] = {}

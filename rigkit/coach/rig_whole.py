@@ -34,14 +34,14 @@ Views = Sequence[BoardView | None]
 """What the cameras saw at one moment, one entry per camera."""
 
 
-def whole_rig(
+def full_rig_calibration(
     frames: Sequence[Views],
     names: Sequence[str],
     sizes_px: Sequence[tuple[int, int]],
     begun: Sequence[BegunCalibration] = (),
 ) -> RigCalibration | None:
     """Return the full calibration from frames of the cameras `names`; None where they do not determine the rig. `begun`
-    are intermediate results of `whole_calibration` for single cameras, which save most of the time."""
+    are intermediate results of `full_calibration` for single cameras, which save most of the time."""
     views: dict[str, list[tuple[str, BoardView]]] = {name: [] for name in names}
     for k, frame in enumerate(frames):
         for name, view in zip(names, frame, strict=True):
@@ -54,7 +54,7 @@ def whole_rig(
         return None
 
 
-def left_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple[RemainingError, ...]:
+def remaining_errors_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple[RemainingError, ...]:
     """Return the errors of a rig's calibration with their requirements: of each lens alone; of all projections, mounts
     included, at the distance of the boards; and of what is measured.
 
@@ -85,7 +85,7 @@ class RigKnown:
     @classmethod
     def of(cls, rig: RigCalibration, options: GuideOptions) -> Self:
         """Raises DegenerateError where what is measured is outside all fields of view."""
-        return cls(monitored_rig(rig), left_of_rig(rig, options), options)
+        return cls(monitored_rig(rig), remaining_errors_of_rig(rig, options), options)
 
     @cached_property
     def plan(self) -> Plan:

@@ -159,7 +159,7 @@ def _done(coach: Coach, what: str, parts: list[bytes]) -> dict[str, Any] | None:
     return coach.state() if what == "state" else None
 
 
-def own_address() -> str:
+def address_in_network() -> str:
     """Return the address of this machine in its network, without sending anything; raises InputError without one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:

@@ -41,7 +41,7 @@ Found = TypeVar("Found", bound=WithHeldOut)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class WholeCalibration:
+class FullCalibration:
     """A full calibration, the knowledge of the camera for planning, the camera with its covariance as stated to users,
     and intermediate results that the rig's calibration reuses."""
 
@@ -55,7 +55,7 @@ class WholeCalibration:
         return self.calibration.heldout_rms_px
 
 
-def whole_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> WholeCalibration | None:
+def full_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> FullCalibration | None:
     """Return the full calibration from frames, one image each; None where they do not determine the lens."""
     named = [replace(view, image=f"{k:04d}") for k, view in enumerate(views)]
     request = Request(
@@ -64,12 +64,12 @@ def whole_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> W
     try:
         begun = begin("", named, request)
         (found,) = calibrate_together([("", named, request)], known=[begun])
-        return WholeCalibration(found, Knowledge.beyond_model(found), uncertain_camera(found), begun)
+        return FullCalibration(found, Knowledge.beyond_model(found), uncertain_camera(found), begun)
     except (InputError, DegenerateError):
         return None
 
 
-class WholeCalibrations(Generic[Found]):
+class FullCalibrations(Generic[Found]):
     """Calibrations of the first frames of a capture, one at a time, in another process, by `calibrated`, called with
     the frames and further arguments. `latest` is that of the most frames, of which there are `count`."""
 

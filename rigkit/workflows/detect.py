@@ -30,15 +30,15 @@ from rigkit.io.media.images import (
     Image,
     folder_of_images,
     images_of_folder,
-    name_unread,
     read_image,
     read_image_of,
+    warn_of_unread_formats,
 )
 from rigkit.io.media.video import is_video, videos_inside
 from rigkit.report.pictures.overlay import draw_boards
 from rigkit.workflows.inputs.camera_files import import_camera
 from rigkit.workflows.inputs.frames import VideoFrames, frames_folder, frames_of_videos
-from rigkit.workflows.inputs.identify_board import explained, suggestion
+from rigkit.workflows.inputs.identify_board import suggestion, why_not_detected
 from rigkit.workflows.inputs.paths import NamesFiles
 
 
@@ -144,7 +144,7 @@ def _nothing_found(images: Sequence[Path], boards: Sequence[Board], doubtful: Ma
     looked_for = " or ".join(f"'{board.board_id}'" for board in boards) if boards else "chessboard"
     lead = f"no {'board ' if boards else ''}{looked_for} found in {counted(len(images), 'image')}"
     shown = None if boards else suggestion(images).words
-    why = explained(images, boards) if boards else shown and f"they show --board {shown}"
+    why = why_not_detected(images, boards) if boards else shown and f"they show --board {shown}"
     if why:
         return f"{lead}; {why}"
     seen = next((f"; in '{name}' {words}" for name, words in doubtful.items()), "")
@@ -174,7 +174,7 @@ def images_in(paths: Sequence[Path]) -> Iterator[Path]:
         inside = [path]
         if path.is_dir():
             inside = images_of_folder(folder := folder_of_images(path))
-            name_unread(folder)
+            warn_of_unread_formats(folder)
         elif not path.exists():
             raise InputError(f"image '{path}' does not exist; check the path")
         for image in inside:

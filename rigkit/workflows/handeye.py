@@ -31,7 +31,7 @@ from rigkit.io.manifests.robot_poses import read_robot_poses
 from rigkit.io.media.images import read_image_of
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_near_camera
-from rigkit.workflows.inputs.identify_board import explained
+from rigkit.workflows.inputs.identify_board import why_not_detected
 from rigkit.workflows.inputs.paths import NamesFiles
 
 HAND_EYE_SCHEMA = "rigkit.hand_eye/1"
@@ -158,7 +158,7 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
                 f"'{image}' shows {alike} grids of the size of board '{known.board_id}', and which one is the "
                 "board is unknown; cover the other pattern"
             )
-        why = explained([Path(image)], [known]) or "check focus and the board's file"
+        why = why_not_detected([Path(image)], [known]) or "check focus and the board's file"
         raise CheckFailed(f"'{image}' does not show board '{known.board_id}'; {why}")
     view = _with_fixed_pupil(near, view)
     rays, valid = lens.unproject(view.pixels)

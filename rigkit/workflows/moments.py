@@ -37,10 +37,10 @@ def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[ImagesByM
         raise InputError(
             f"a rig of {len(names)} cameras ({', '.join(names)}) needs a folder of images for each, got {len(found)}"
         )
-    return together([found[name] for name in names] if set(found) == set(names) else list(found.values()))
+    return grouped_by_moment([found[name] for name in names] if set(found) == set(names) else list(found.values()))
 
 
-def together(columns: Sequence[Sequence[Path]]) -> tuple[ImagesByMoment, list[Path]]:
+def grouped_by_moment(columns: Sequence[Sequence[Path]]) -> tuple[ImagesByMoment, list[Path]]:
     """Return the moments of which every camera has an image of the same name or number, and the images without a
     partner; images are paired in order where names give no pairs.
 

@@ -29,7 +29,7 @@ from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_camera, import_pair
 from rigkit.workflows.inputs.folder_session import cameras_in, images_of_camera
 from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.moments import together
+from rigkit.workflows.moments import grouped_by_moment
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -228,7 +228,7 @@ def _pairs(
         return [sources[:count] for sources in own], {}
     else:
         found = [list(images_in([Path(image)])) for image in images]
-    moments, single = together(found)
+    moments, single = grouped_by_moment(found)
     alone = {str(path): InputError(f"'{path}': the other camera has no image of its name or number") for path in single}
     return list(zip(*moments, strict=True)), alone
 
@@ -242,7 +242,7 @@ def _sources(source: Path, stack: ExitStack) -> Sequence[Path | _VideoFrame]:
     with Video(source) as video:
         if video.live:
             raise InputError(f"rectify: '{source}' is a live camera, which has no end; record a video of it")
-        count = video.passed_over()
+        count = video.skip_to_end()
     if count == 0:
         raise InputError(f"rectify: no frame of video '{source}' can be decoded; convert it to MP4")
     opened = stack.enter_context(Video(source, colour=True))

@@ -30,7 +30,7 @@ from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.inputs.camera_files import import_rig
 from rigkit.workflows.inputs.corners import first_camera
 from rigkit.workflows.inputs.folder_session import Known, cameras_in, session_of_folders
-from rigkit.workflows.inputs.known_cameras import known_cameras, with_known_first
+from rigkit.workflows.inputs.known_cameras import known_cameras, known_cameras_first
 
 SAME_LENS_PX = 0.1
 """Projections of the camera found against the true one, where boards were: corners of JPEGs to about 0.03 px, 9 images;
@@ -323,11 +323,11 @@ def test_known_cameras_are_written_to_the_session(
     reported = known_cameras(replace(session, lenses={"right": lens}))
     assert reported is not None and list(reported.cameras) == ["left", "right"] and reported.covariance is None
     # A camera of the rig that has no images is not lost without a word.
-    with_known_first(session)
+    known_cameras_first(session)
     assert "without images here, top will not be in the new rig" in caplog.text
     caplog.clear()
     known.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": [{**cameras[0], "name": "right"}]}))
-    assert list(with_known_first(session).cameras) == ["right", "left"] and not caplog.text
+    assert list(known_cameras_first(session).cameras) == ["right", "left"] and not caplog.text
     with pytest.raises(InputError, match="3 lenses for 2 cameras"):
         Known(lenses=(lens, lens, lens)).of_cameras(["left", "right"])
     one = of_one_camera(pictures, tmp_path / "one")

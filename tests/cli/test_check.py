@@ -36,7 +36,7 @@ from rigkit.synthetic.scene import PlacedBoard
 from rigkit.validation.sentinel.hypotheses import hypotheses_of
 from rigkit.validation.sentinel.judge import Change, SentinelCheck
 from rigkit.validation.sentinel.power import Power
-from rigkit.workflows.checks.check import CheckOptions, _as_known, _require_right_order, check_pictures
+from rigkit.workflows.checks.check import CheckOptions, _replaced_by_known, _require_right_order, check_pictures
 
 BOARD = Board("board", 9, 6, 25.0, 25.0)
 CAMERA = Brown((640, 480), np.array([620.0, 621.0, 322.0, 236.0, -0.12, 0.05, 0.0, 0.0, 0.0]))
@@ -349,16 +349,16 @@ def test_a_board_is_known_by_whatever_name_and_way_up(caplog: pytest.LogCaptureF
         board_of_words(f"charuco:5x7x30,{MARKS}"),
     ]
     for words, expected in (("9x6x30", "ours"), ("6x9x30", "ours"), (f"charuco:5x7x30,{MARKS}", known[2].board_id)):
-        (board,) = _as_known([board_of_words(words)], known)
+        (board,) = _replaced_by_known([board_of_words(words)], known)
         assert board.board_id == expected
     # By its own name first; each but once.
-    assert [b.board_id for b in _as_known([Board("copy", 9, 6, 30.0, 30.0)], known)] == ["copy"]
-    assert [b.board_id for b in _as_known([board_of_words("9x6x30"), board_of_words("6x9x30")], known)] == [
+    assert [b.board_id for b in _replaced_by_known([Board("copy", 9, 6, 30.0, 30.0)], known)] == ["copy"]
+    assert [b.board_id for b in _replaced_by_known([board_of_words("9x6x30"), board_of_words("6x9x30")], known)] == [
         "ours",
         "copy",
     ]
     assert not caplog.records
     for words in ("9x6x31", "8x6x30", f"charuco:7x5x30,{MARKS}", "circles:9x6x30"):
-        (board,) = _as_known([board_of_words(words)], known)
+        (board,) = _replaced_by_known([board_of_words(words)], known)
         assert board.board_id == board_of_words(words).board_id
         assert f"board '{board.board_id}' is not one of the calibration" in caplog.text

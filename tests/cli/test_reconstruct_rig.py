@@ -16,7 +16,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibrations.calibration_file import camera_to_json
 from rigkit.io.ply import read_ply
-from rigkit.workflows.reconstruction.reconstruct_rig import near_pairs
+from rigkit.workflows.reconstruction.reconstruct_rig import neighbouring_pairs
 
 CAMERA = Pinhole((240, 180), np.array([210.0, 210.0, 119.5, 89.5]))
 TURNS = ((0.0, 0.0, 0.0), (0.02, -0.12, 0.05), (0.03, -0.2, 0.02))
@@ -97,12 +97,12 @@ def test_views_are_paired_with_their_neighbours_that_look_the_same_way() -> None
         )
 
     row = [at(100.0 * k, 0.0) for k in range(6)]
-    pairs = near_pairs(row)
+    pairs = neighbouring_pairs(row)
     assert (0, 1) in pairs
     assert (0, 5) not in pairs
     assert all(i < j for i, j in pairs)
     # Two places are one: no baseline.
-    assert near_pairs([at(0.0, 0.0), at(0.0, 0.0), at(100.0, 0.0)]) == [(0, 2), (1, 2)]
+    assert neighbouring_pairs([at(0.0, 0.0), at(0.0, 0.0), at(100.0, 0.0)]) == [(0, 2), (1, 2)]
 
 
 def test_exchanged_images_of_a_rig_are_named(

@@ -20,8 +20,8 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.coach.guide import CHECKING, GuideOptions
 from rigkit.coach.look import FrameObservation
 from rigkit.coach.rig import MAX_HELP, RigGuide
-from rigkit.coach.rig_whole import RigKnown, left_of_rig, whole_rig
-from rigkit.coach.whole import STEADY, WholeCalibration
+from rigkit.coach.rig_whole import RigKnown, full_rig_calibration, remaining_errors_of_rig
+from rigkit.coach.whole import STEADY, FullCalibration
 from rigkit.core.errors import DegenerateError
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.planning.goal import projection_goal
@@ -72,13 +72,13 @@ class Later(Executor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
-        if fn is whole_rig:
+        if fn is full_rig_calibration:
             self.asked.append((len(args[0]), future))
             self.begun.append(args[3])
         else:
             own = self.rig.single[NAMES.index(OTHER if args[0][0].image.startswith(OTHER) else NAMES[0])]
             known = f"begun {len(args[0])}"
-            found = WholeCalibration(own, Knowledge.beyond_model(own), uncertain_camera(own), known)  # type: ignore[arg-type]
+            found = FullCalibration(own, Knowledge.beyond_model(own), uncertain_camera(own), known)  # type: ignore[arg-type]
             self.lenses.append(partial(future.set_result, found))
             if len(self.lenses) > self.slow:
                 self.lenses.pop()()
@@ -177,7 +177,7 @@ def test_a_length_that_both_measure_is_required(frames: list[list[FrameObservati
         return length_goals(cameras, cam_from_rig, LENGTH)
 
     options = GuideOptions(boards=(BOARD,), goal_px=3.0, goal_mm=1.0, measured=measured, reach=REACH)
-    in_mm = left_of_rig(rig, options)[-1]
+    in_mm = remaining_errors_of_rig(rig, options)[-1]
     assert in_mm.requirement.goal.unit == "mm" and in_mm.error > 0.0
     for part, enough in ((2.0, True), (0.5, False)):
         later = Later(rig)
@@ -225,11 +225,11 @@ def test_frames_of_a_rig_are_calibrated_by_their_moments(
         lambda views, sizes, model, board, begun: calibrate_rig(views, sizes, model="brown", degree=5, folds=0),
     )
     views = [[frame_observation.view for frame_observation in seen] for seen in frames]
-    found = whole_rig([*views[:-1], [views[-1][0], None]], NAMES, [SIZE, SIZE])
+    found = full_rig_calibration([*views[:-1], [views[-1][0], None]], NAMES, [SIZE, SIZE])
     assert found is not None and found.shared_count == FRAMES - 1
     assert found.baseline_mm(*NAMES)[0] == pytest.approx(rig.baseline_mm(*NAMES)[0], rel=0.02)
     never_both = [[left, None] if k % 2 else [None, right] for k, (left, right) in enumerate(views)]
-    assert whole_rig(never_both, NAMES, [SIZE, SIZE]) is None
+    assert full_rig_calibration(never_both, NAMES, [SIZE, SIZE]) is None
     known = RigKnown.of(found, GuideOptions(boards=(BOARD,), reach=REACH))
     assert known.plan.views[-1].error < known.plan.error
 
@@ -237,7 +237,7 @@ def test_frames_of_a_rig_are_calibrated_by_their_moments(
 def test_cameras_that_help_each_other_are_enough_before_each_is_alone(
     frames: list[list[FrameObservation]], rig: RigCalibration
 ) -> None:
-    goal_px = max(own.error for own in left_of_rig(rig, GuideOptions(boards=(BOARD,), reach=REACH)))
+    goal_px = max(own.error for own in remaining_errors_of_rig(rig, GuideOptions(boards=(BOARD,), reach=REACH)))
     for factor, enough in ((0.7 * MAX_HELP, True), (1.5 * MAX_HELP, False)):
         # Each alone is less sure than what is wanted.
         single = [

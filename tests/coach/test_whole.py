@@ -20,7 +20,7 @@ from rigkit.coach.coach import Coach
 from rigkit.coach.guide import CHECKING, MIN_GAIN_TO_CONTINUE, CaptureGuide, GuideOptions
 from rigkit.coach.keeper import Keeper
 from rigkit.coach.look import FrameObservation
-from rigkit.coach.whole import STEADY, WholeCalibration, WholeCalibrations, whole_calibration
+from rigkit.coach.whole import STEADY, FullCalibration, FullCalibrations, full_calibration
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.manifests.session import Session
@@ -40,8 +40,8 @@ def views() -> list[BoardView]:
 
 
 @pytest.fixture(scope="module")
-def whole(views: list[BoardView]) -> WholeCalibration:
-    found = whole_calibration(views, SIZE)
+def whole(views: list[BoardView]) -> FullCalibration:
+    found = full_calibration(views, SIZE)
     assert found is not None
     return found
 
@@ -56,7 +56,7 @@ class Later(Executor):
         self.asked.append((len(args[0]), Future()))
         return self.asked[-1][1]
 
-    def tell(self, found: WholeCalibration | None) -> int:
+    def tell(self, found: FullCalibration | None) -> int:
         """Answer what was asked last; return of how many frames it was."""
         count, future = self.asked[-1]
         future.set_result(found)
@@ -70,7 +70,7 @@ def guide_of(views: Sequence[BoardView], executor: Executor, goal_px: float) -> 
     return guide
 
 
-def test_a_capture_ends_only_after_a_whole_calibration(views: list[BoardView], whole: WholeCalibration) -> None:
+def test_a_capture_ends_only_after_a_whole_calibration(views: list[BoardView], whole: FullCalibration) -> None:
     later = Later()
     guide = guide_of(views, later, goal_px=10.0)
     seen = FrameObservation(size_px=SIZE, view=views[0], edge_px=2.0, moved_px=0.0, contrast=150.0)
@@ -90,7 +90,7 @@ def test_a_capture_ends_only_after_a_whole_calibration(views: list[BoardView], w
 
 
 def test_a_larger_uncertainty_of_the_whole_calibration_asks_for_more(
-    views: list[BoardView], whole: WholeCalibration
+    views: list[BoardView], whole: FullCalibration
 ) -> None:
     stated = float(projection_goal(whole.stated.camera).error(whole.stated.covariance))
     # As with a rival that nobody has told apart yet.
@@ -107,7 +107,7 @@ def test_a_larger_uncertainty_of_the_whole_calibration_asks_for_more(
     assert not now.enough or f"not {2.0 * stated:g} px" in now.words
 
 
-def test_a_held_out_error_that_changes_asks_for_one_more(views: list[BoardView], whole: WholeCalibration) -> None:
+def test_a_held_out_error_that_changes_asks_for_one_more(views: list[BoardView], whole: FullCalibration) -> None:
     typical = whole.calibration.heldout_rms_px
     assert typical is not None
     worse = replace(whole.calibration, heldout_rms_px=(1.0 + 2.0 * STEADY) * typical)
@@ -121,8 +121,8 @@ def test_a_held_out_error_that_changes_asks_for_one_more(views: list[BoardView],
     assert not now.enough and not now.waits and now.words.startswith("One more as confirmation: ")
 
 
-def test_without_its_process_the_capture_goes_on(views: list[BoardView], whole: WholeCalibration) -> None:
-    def calibrated(*_: object) -> WholeCalibration:
+def test_without_its_process_the_capture_goes_on(views: list[BoardView], whole: FullCalibration) -> None:
+    def calibrated(*_: object) -> FullCalibration:
         return whole
 
     class Ended(Executor):
@@ -130,7 +130,7 @@ def test_without_its_process_the_capture_goes_on(views: list[BoardView], whole: 
             raise BrokenProcessPool
 
     later = Later()
-    at_once, meanwhile = (WholeCalibrations(executor, calibrated) for executor in (Ended(), later))
+    at_once, meanwhile = (FullCalibrations(executor, calibrated) for executor in (Ended(), later))
     at_once.ask(views, SIZE)
     meanwhile.ask(views, SIZE)
     later.asked[0][1].set_exception(BrokenProcessPool())
@@ -140,7 +140,7 @@ def test_without_its_process_the_capture_goes_on(views: list[BoardView], whole: 
 
 
 def test_asking_for_the_state_takes_in_a_finished_calibration(
-    views: list[BoardView], whole: WholeCalibration, tmp_path: Path
+    views: list[BoardView], whole: FullCalibration, tmp_path: Path
 ) -> None:
     """Photos come one by one: no look follows the last."""
     later = Later()
@@ -158,7 +158,7 @@ def test_asking_for_the_state_takes_in_a_finished_calibration(
 
 @pytest.mark.parametrize(("px", "mm"), [(2.0, 2.0), (0.5, 2.0), (2.0, 0.5)])
 def test_there_are_enough_only_where_the_projection_and_the_length_are_as_wanted(
-    views: list[BoardView], whole: WholeCalibration, px: float, mm: float
+    views: list[BoardView], whole: FullCalibration, px: float, mm: float
 ) -> None:
     def measured(cameras: Sequence[Camera], _: Sequence[Rigid3]) -> Sequence[Goal]:
         return [replace(projection_goal(cameras[0]), unit="mm")]
@@ -180,7 +180,7 @@ def test_there_are_enough_only_where_the_projection_and_the_length_are_as_wanted
 
 
 def test_what_came_of_one_camera_is_said_as_its_calibration_states_it(
-    whole: WholeCalibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: FullCalibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     session = Session(
         path=tmp_path / "session.toml", images=(), boards=(BOARD,), model="auto", degree=None, board_shape="auto"

@@ -29,8 +29,8 @@ from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.boards.board_file import board_of_values, board_values
 from rigkit.io.calibrations.schema_calibration import CALIBRATION_FILE, keys_of
-from rigkit.io.disk.json_reader import freedom, json_schema, positive, read_json, real, reals, whole
-from rigkit.io.disk.reading import damage, usable_path
+from rigkit.io.disk.json_reader import freedom, integer, json_schema, positive, read_json, real, reals
+from rigkit.io.disk.reading import on_one_line, usable_path
 from rigkit.io.disk.writing import write_atomic
 
 CALIBRATION_SCHEMA = "rigkit.calibration/1"
@@ -124,7 +124,7 @@ def _calibration_in(data: dict[str, Any], path: str | Path) -> Calibration:
         )
     if missing:
         raise InputError(f"'{path}': no {', '.join(missing)}; calibrate again")
-    with damage_named(path):
+    with damage_reported(path):
         camera = camera_from_json(data["camera"], path)
         size = camera.parameters.size
         boards = tuple(_shape_in(v) for v in data["boards"])
@@ -153,13 +153,13 @@ def _calibration_in(data: dict[str, Any], path: str | Path) -> Calibration:
 
 
 @contextmanager
-def damage_named(path: str | Path) -> Iterator[None]:
+def damage_reported(path: str | Path) -> Iterator[None]:
     """Turn any error that a damaged file causes in the block into an InputError that names the file."""
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:
         # Messages of an InputError are not truncated: they end with the remedy.
-        words = " ".join(str(error).split()) if isinstance(error, InputError) else damage(error)
+        words = " ".join(str(error).split()) if isinstance(error, InputError) else on_one_line(error)
         if str(path) not in words:
             # The remedy must not be repeated.
             damage_words = (
@@ -190,7 +190,7 @@ def camera_from_json(data: Any, path: str | Path) -> Camera:
     if not isinstance(data, dict) or set(data) != CAMERA_KEYS or not isinstance(data["parameters"], dict):
         raise InputError(f"'{path}': 'camera' must have the keys {', '.join(sorted(CAMERA_KEYS))}, and no others")
     try:
-        width, height = (whole(v) for v in data["size_px"])
+        width, height = (integer(v) for v in data["size_px"])
         values = np.array([real(v) for v in data["parameters"].values()])
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"'{path}': camera: {error}; size_px must be [width, height], parameters numbers") from error

@@ -14,7 +14,7 @@ from typing import Any
 
 from rigkit.core.errors import InputError, printable
 from rigkit.core.printing import brief
-from rigkit.io.disk.json_reader import parse_json, real, whole
+from rigkit.io.disk.json_reader import integer, parse_json, real
 from rigkit.io.disk.reading import MAX_NUMBER, read_text
 from rigkit.io.disk.writing import ensure_writable
 from rigkit.validation.sentinel.judge import SentinelCheck
@@ -170,7 +170,7 @@ def editions(entries: Iterable[HistoryEntry]) -> tuple[Edition, ...]:
     )
 
 
-def as_seen_from(register: Path, source: Path) -> Path:
+def path_from_register(register: Path, source: Path) -> Path:
     """Return the path of `source` relative to the folder of a register, so that both can be moved together."""
     try:
         return Path(os.path.relpath(source.resolve(), register.resolve().parent))
@@ -249,7 +249,7 @@ def _entry(data: Any) -> HistoryEntry:
         raise ValueError("date, kind, source, reference, digest, baseline and verdict are words")
     if not datetime.fromisoformat(texts["date"]).year > 1:
         raise ValueError("its date is of the year 1")
-    frames, rms_px = whole(data.pop("frames")), real(data.pop("rms_px"))
+    frames, rms_px = integer(data.pop("frames")), real(data.pop("rms_px"))
     if frames < 0 or rms_px < 0.0:
         raise ValueError("frames and rms_px are not negative")
     if temperature is not None and real(temperature) < ABSOLUTE_ZERO_C:

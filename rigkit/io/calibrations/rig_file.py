@@ -33,14 +33,14 @@ from rigkit.io.calibrations.calibration_file import (
     Made,
     camera_from_json,
     camera_to_json,
-    damage_named,
+    damage_reported,
     findings_from_json,
     findings_to_json,
     pupil_from_json,
     pupil_to_json,
 )
 from rigkit.io.calibrations.schema_calibration import BOARD_RIG_FILE, RIG_FILE, keys_of
-from rigkit.io.disk.json_reader import freedom, json_schema, json_text, positive, read_json, real, reals, whole
+from rigkit.io.disk.json_reader import freedom, integer, json_schema, json_text, positive, read_json, real, reals
 from rigkit.kernels.departures import DISPLACEMENTS
 
 RIG_SCHEMA = "rigkit.rig/1"
@@ -179,7 +179,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
     outlines: dict[str, Pixels] = {}
     departures: dict[str, Any] = {}
     pupils: dict[str, SolvedPupil] = {}
-    with damage_named(path):
+    with damage_reported(path):
         for entry in data["cameras"]:
             if set(entry) | {"outline_px", "departures", "pupil", "lag", "readout"} != RIG_CAMERA_KEYS:
                 raise InputError(
@@ -279,7 +279,7 @@ def board_rigs_text(rigs: Sequence[BoardRig]) -> str:
 def load_board_rigs(path: str | Path) -> tuple[BoardRig, ...]:
     """Return the boards on one mount; raises InputError like `load_saved_rig`."""
     data = _read(path, BOARDS_SCHEMA, keys_of(BOARD_RIG_FILE))
-    with damage_named(path):
+    with damage_reported(path):
         return tuple(_mount(rig, path) for rig in data["rigs"])
 
 
@@ -289,7 +289,7 @@ def _mount(rig: dict[str, Any], path: str | Path) -> BoardRig:
     if len(set(names)) < max(len(names), 2):
         raise ValueError(f"a mount has two boards or more, each with another name, here {', '.join(names)}")
     covariance = as_covariance(rig["covariance"], "covariance", 6 * (len(boards) - 1))
-    images = whole(rig["image_count"])
+    images = integer(rig["image_count"])
     known = freedom(rig["freedom"]) if "freedom" in rig else float(max(images - 1, 1))
     return BoardRig(boards, covariance, images, real(rig["scale_sigma"]), known)
 
@@ -303,7 +303,7 @@ def _placed(entry: dict[str, Any], path: str | Path) -> MountedBoard:
     else:
         (columns, rows), (along_x, along_y), sigma = entry["size"], entry["square_mm"], entry["square_sigma_mm"]
         known = None if sigma is None else real(sigma)
-        size = whole(columns), whole(rows)
+        size = integer(columns), integer(rows)
         board = Board(name, *size, real(along_x), real(along_y), square_sigma_mm=known)
     return MountedBoard(board, reals(entry["points_mm"]), Rigid3.from_matrix(reals(entry["target_from_board"])))
 

@@ -26,7 +26,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.io.corners.corner_cache import kept_corners
 from rigkit.io.disk.json_reader import parse_json
-from rigkit.io.disk.reading import csv_rows, damage, read_text
+from rigkit.io.disk.reading import csv_rows, on_one_line, read_text
 from rigkit.io.disk.writing import write_atomic
 
 COLUMNS = ("image", "board", "column", "row", "u_px", "v_px", "sigma_px")
@@ -106,7 +106,9 @@ def _from_json(source: Path, text: str) -> dict[str, tuple[BoardDetection, ...]]
     try:
         return {image: found.detections for image, found in kept_corners(parse_json(text)).items()}
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, InputError) as error:
-        raise InputError(f"corners file '{source}': damaged ({damage(error)}); detect the corners again") from error
+        raise InputError(
+            f"corners file '{source}': damaged ({on_one_line(error)}); detect the corners again"
+        ) from error
 
 
 def _from_vnl(source: Path, text: str, boards: Sequence[Board]) -> dict[str, tuple[BoardDetection, ...]]:

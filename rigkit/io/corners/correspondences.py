@@ -32,7 +32,7 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.interop.colmap_database import affinities_of_frames, is_colmap_database, read_colmap_matches
-from rigkit.io.disk.reading import MAX_NUMBER, csv_table, damage, is_number, read_bytes
+from rigkit.io.disk.reading import MAX_NUMBER, csv_table, is_number, on_one_line, read_bytes
 
 POINT_COLUMNS = ("u1_px", "v1_px", "u2_px", "v2_px")
 AFFINE = ("a11", "a12", "a21", "a22")
@@ -178,7 +178,7 @@ def _from_npz(source: Path, payload: bytes) -> Correspondences:
     except (ValueError, TypeError, OSError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError,
             RuntimeError, SyntaxError, struct.error) as error:  # fmt: skip
         raise InputError(
-            f"correspondences '{source}': damaged NPZ, or not of numbers ({damage(error)}); write it again"
+            f"correspondences '{source}': damaged NPZ, or not of numbers ({on_one_line(error)}); write it again"
         ) from error
     try:
         matched = _from_matcher(table)

@@ -116,7 +116,7 @@ def reals(value: Any, *, nullable: bool = False) -> FloatArray:
     return array
 
 
-def whole(value: Any) -> int:
+def integer(value: Any) -> int:
     """Return an integer; raises ValueError for anything else, such as 640.5 and true."""
     number = real(value)
     if number != math.floor(number):

@@ -28,7 +28,7 @@ MIN_POSITIVE = 1e-9
 """A picometre in mm; a measurement with a smaller sigma would outweigh all else."""
 
 
-def is_file_or_lost_link(path: Path) -> bool:
+def is_file_or_broken_link(path: Path) -> bool:
     """Return whether a folder's entry is a file or a broken link, which its reader reports."""
     return path.is_file() or (path.is_symlink() and not path.exists())
 
@@ -154,7 +154,7 @@ def about(*paths: str | Path) -> Iterator[None]:
         raise type(error)(" and ".join(f"'{path}'" for path in paths) + f": {error}") from error
 
 
-def damage(error: Exception) -> str:
+def on_one_line(error: Exception) -> str:
     """Return a parser's error on one line of at most 200 characters."""
     return " ".join(str(error).split())[:200]
 

@@ -18,7 +18,7 @@ from typing import Any
 
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
-from rigkit.io.disk.reading import damage, fault_of_number, read_text, usable_path
+from rigkit.io.disk.reading import fault_of_number, on_one_line, read_text, usable_path
 from rigkit.io.disk.schema_words import ANY_OF, Schema
 
 MAX_TOML_BYTES = 4_000_000
@@ -241,7 +241,7 @@ def read_toml(path: str | Path, schema: Schema) -> TomlTable:
     except tomllib.TOMLDecodeError as error:
         if text.lstrip().startswith("{"):
             raise InputError(f'{source}: JSON; a TOML file with schema = "{wanted}" is needed here') from error
-        raise InputError(f"{source}: not valid TOML: {damage(error)}; correct that line") from error
+        raise InputError(f"{source}: not valid TOML: {on_one_line(error)}; correct that line") from error
     except (ValueError, RecursionError) as error:
         fault = "nested too deep" if isinstance(error, RecursionError) else "a number of thousands of digits"
         raise InputError(f"{source}: not readable TOML: {fault}; correct the file") from error

@@ -26,7 +26,7 @@ from rigkit.core.boards import Board
 from rigkit.core.printing import brief
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.boards.board_file import load_board
-from rigkit.io.disk.reading import is_file_or_lost_link
+from rigkit.io.disk.reading import is_file_or_broken_link
 from rigkit.io.disk.schema_words import (
     ANY_OF,
     COUNT,
@@ -183,7 +183,7 @@ def images_of(table: TomlTable) -> tuple[Path, ...]:
         matches = [root / m for m in sorted(glob.glob(pattern, root_dir=root))]
         if not matches and (root / pattern).is_file():
             matches = [root / pattern]
-        for match in filter(is_file_or_lost_link, matches):
+        for match in filter(is_file_or_broken_link, matches):
             # A file found twice is one image, under its first name.
             found.setdefault(match.resolve(), named_path(match))
         absent += [pattern] if not matches else []

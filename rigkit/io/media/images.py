@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.io.disk.reading import is_file_or_lost_link, read_bytes, refuse_archive
+from rigkit.io.disk.reading import is_file_or_broken_link, read_bytes, refuse_archive
 from rigkit.io.media.tiff import TIFF_STARTS, as_stored, page_sizes
 
 _log = logging.getLogger(__name__)
@@ -145,7 +145,7 @@ def is_image(path: Path) -> bool:
 
 def images_of_folder(folder: Path, pattern: str = "*") -> list[Path]:
     """Return the images of a folder whose names match `pattern`, sorted by name."""
-    return sorted(p for p in folder.iterdir() if is_image(p) and fnmatch(p.name, pattern) and is_file_or_lost_link(p))
+    return sorted(p for p in folder.iterdir() if is_image(p) and fnmatch(p.name, pattern) and is_file_or_broken_link(p))
 
 
 def images_below(folder: Path) -> list[Path]:
@@ -199,7 +199,7 @@ def no_images(folder: Path) -> str:
     return f"{words}, but '{first}' and {others} more below it have; give one folder a camera, or a session: {every}"
 
 
-def name_unread(folder: Path) -> None:
+def warn_of_unread_formats(folder: Path) -> None:
     """Warn of images of unsupported formats in a folder, except where a readable one has the same name."""
     read = {path.stem for path in images_of_folder(folder)}
     lost = [name for name in _unread(folder) if Path(name).stem not in read]

@@ -118,7 +118,7 @@ class Video:
             picture = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB if self._colour else cv2.COLOR_BGR2GRAY)
         return cast(Image, picture)
 
-    def passed_over(self) -> int:
+    def skip_to_end(self) -> int:
         """Return the true number of remaining frames, by skipping to the end of the video."""
         first = self.next_number
         with quiet_opencv():

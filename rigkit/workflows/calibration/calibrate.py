@@ -29,7 +29,7 @@ from rigkit.workflows.inputs.corners import (
     session_views,
 )
 from rigkit.workflows.inputs.folder_session import Known
-from rigkit.workflows.inputs.identify_board import misread
+from rigkit.workflows.inputs.identify_board import why_misplaced
 from rigkit.workflows.inputs.interlaced import interlaced
 from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths
@@ -149,14 +149,14 @@ def calibration_from(
                 progress=progress,
             )
         except DegenerateError as error:
-            shown = misread(session.images, session.boards)
+            shown = why_misplaced(session.images, session.boards)
             if shown is None:
                 raise
             raise InputError(f"{shown} ({error})") from error
     also = [*suggest_rigid_boards(views, result), *interlaced(result, named_images(session))]
     verdicts = diagnose_session(result, dropped, also)
     if verdicts[0].severity is Severity.BAD:
-        shown = misread(session.images, session.boards)
+        shown = why_misplaced(session.images, session.boards)
         if shown is not None and 2 * len(views) < len(session.images):
             # The few views of the declared board are misread.
             raise InputError(f"{session.path}: {shown}")

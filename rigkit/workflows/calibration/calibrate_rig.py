@@ -27,10 +27,10 @@ from rigkit.validation.checks import COVERAGE
 from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibration_from, corners_of, session_inputs
 from rigkit.workflows.calibration.rigid_boards import named_as_listed, named_by_rule, require_distinct
 from rigkit.workflows.calibration.session_page import rig_page
-from rigkit.workflows.inputs.camera_files import own_file
+from rigkit.workflows.inputs.camera_files import file_of_camera
 from rigkit.workflows.inputs.corners import SessionCorners, session_corners, session_views
-from rigkit.workflows.inputs.identify_board import misread
-from rigkit.workflows.inputs.known_cameras import known_cameras, with_known, with_known_first
+from rigkit.workflows.inputs.identify_board import why_misplaced
+from rigkit.workflows.inputs.known_cameras import known_cameras, known_cameras_first, with_known
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
 from rigkit.workflows.outputs.provenance import provenance_of
 
@@ -77,7 +77,7 @@ def calibrate_rig_session(
     if not isinstance(session, RigSession):
         session = load_rig_session(session)
     with about(session.path):
-        session = with_known_first(with_known(session, options.known))
+        session = known_cameras_first(with_known(session, options.known))
         known_cameras(session)  # complaints before the work
         images = {name: [str(image) for image in own.images] for name, own in session.cameras.items()}
         # Without images, the corners that were kept are used.
@@ -100,12 +100,12 @@ def calibrate_rig_session(
             files |= foreign_rig_files(mounted, options.output, options.exports, outlines)
         for camera in rig.cameras:
             own = _camera_file(session, options.output, camera.name)
-            files[own] = calibration_text(judged(camera.calibration, session.cameras[camera.name]), origin)
+            files[own] = calibration_text(with_new_verdicts(camera.calibration, session.cameras[camera.name]), origin)
             files |= foreign_files(camera.calibration, own, _camera_exports(session, options))
         if session.rigid_boards:
             files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)
     if options.report is not None:
-        files[options.report] = rig_page(session, rig, shown_cameras(rig, session), checks, corners, files)
+        files[options.report] = rig_page(session, rig, cameras_on_page(rig, session), checks, corners, files)
     write_together(files, force=options.force)
     unreadable = {image: reason for one in corners.values() for image, reason in one.unreadable.items()}
     return RigSessionCalibration(
@@ -140,7 +140,7 @@ def _camera_exports(session: RigSession, options: CalibrateOptions) -> list[str]
 
 def _camera_file(session: RigSession, target: Path, name: str) -> Path:
     """Return the path of one camera's calibration."""
-    return own_file(target, name) if len(session.cameras) > 1 else target
+    return file_of_camera(target, name) if len(session.cameras) > 1 else target
 
 
 def _boards_file(target: Path) -> Path:
@@ -159,19 +159,19 @@ def calibrate_camera(path: Path, *, progress: Progress = silent) -> Calibration:
     require_distinct(session)
     corners = {name: session_corners(own, progress=progress) for name, own in session.cameras.items()}
     (camera,) = rig_from(session, corners, progress=progress).cameras
-    return judged(camera.calibration, session.cameras[camera.name])
+    return with_new_verdicts(camera.calibration, session.cameras[camera.name])
 
 
-def shown_cameras(rig: RigCalibration, session: RigSession) -> dict[str, Calibration]:
+def cameras_on_page(rig: RigCalibration, session: RigSession) -> dict[str, Calibration]:
     """Return the calibrations that the page shows: each camera calibrated alone; a single camera as solved jointly with
     its boards on one mount, which is what its file has."""
     if len(rig.cameras) == 1:
         (camera,) = rig.cameras
-        return {camera.name: judged(camera.calibration, session.cameras[camera.name])}
+        return {camera.name: with_new_verdicts(camera.calibration, session.cameras[camera.name])}
     return {camera.name: alone for camera, alone in zip(rig.cameras, rig.single, strict=True)}
 
 
-def judged(calibration: Calibration, session: Session) -> Calibration:
+def with_new_verdicts(calibration: Calibration, session: Session) -> Calibration:
     """Return a rig camera's calibration with new verdicts, for its held-out error and covariance in the rig.
 
     Choices that the `session` leaves automatic are not proposed as remedies.
@@ -239,7 +239,7 @@ def rig_from(
 
 def _misread(session: RigSession) -> list[str]:
     """Return in words why corners of boards with marks are misplaced, each reason once."""
-    shown = (misread(own.images, own.boards) for own in session.cameras.values())
+    shown = (why_misplaced(own.images, own.boards) for own in session.cameras.values())
     return list(dict.fromkeys(words for words in shown if words is not None))
 
 

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from rigkit.cameras.base import Camera
 from rigkit.coach.coach import Coach, Image, Take, ignored
-from rigkit.coach.guide import GuideOptions, stated_words
+from rigkit.coach.guide import GuideOptions, errors_in_words
 from rigkit.coach.keeper import Keeper, folder_of
 from rigkit.coach.look import FrameObservation
-from rigkit.coach.rig_whole import left_of_rig
-from rigkit.coach.server import LOCAL, coach_app, new_token, own_address, serve
+from rigkit.coach.rig_whole import remaining_errors_of_rig
+from rigkit.coach.server import LOCAL, address_in_network, coach_app, new_token, serve
 from rigkit.coach.sources import Frame, device_frames, frames_of_folders
 from rigkit.core.errors import DegenerateError, InputError, RigkitError
 from rigkit.core.findings import Severity, worst
@@ -40,7 +40,7 @@ from rigkit.workflows.calibration.calibrate import CalibrateOptions, SessionCali
 from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.corners import Cache
-from rigkit.workflows.inputs.folder_session import session_to_come
+from rigkit.workflows.inputs.folder_session import session_of_future_images
 from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos, timestamps_next_to
 from rigkit.workflows.inputs.paths import NamesFiles
 
@@ -88,7 +88,7 @@ def open_coach(
     options.folder.mkdir(parents=True, exist_ok=True)
     names = _names(options)
     patterns = {name: f"{folder_of(name, len(names))}/*.png" for name in names}
-    wanted = session_to_come(patterns, options.boards, options.folder)
+    wanted = session_of_future_images(patterns, options.boards, options.folder)
     keeper = Keeper(options.folder, dict(wanted.files), names)
     guide, length = options.guide, options.length
     if length is not None:
@@ -125,7 +125,7 @@ def finished_words(folder: Path, guide: GuideOptions) -> str:
         return _finished(what, c.rms_px, c.heldout_rms_px, worst(c.verdicts), done.written)
     rig = done.rig
     try:
-        what = stated_words(left_of_rig(rig, guide))
+        what = errors_in_words(remaining_errors_of_rig(rig, guide))
     except DegenerateError as error:
         what = str(error)
     return _finished(what, rig.rms_px, rig.heldout_rms_px, worst(rig.verdicts), done.written)
@@ -216,7 +216,7 @@ def _run(
     progress: Progress,
 ) -> None:
     token = new_token()
-    host = own_address() if options.lan else LOCALHOST
+    host = address_in_network() if options.lan else LOCALHOST
     of_server = bool(options.video) or frames is not None
     app = coach_app(coach, token, (host, *LOCAL), camera=_where(options))
     preview: dict[int, bytes] = app.state.preview

@@ -32,7 +32,7 @@ from rigkit.validation.sentinel.watch import monitored_camera
 from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibrate_session, session_inputs
 from rigkit.workflows.calibration.next_pictures import NEXT_VIEWS, goal_of, next_frames, next_views
 from rigkit.workflows.checks.check import load_monitored
-from rigkit.workflows.inputs.camera_files import require_sure, warn_if_bad, warn_of_pupil
+from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad, warn_of_pupil
 from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
@@ -102,7 +102,7 @@ def plan_session(
         raise InputError(f"plan: '{source}' is a session of a rig; give the rig that it was calibrated to, rig.json")
     ensure_writable(options.report, force=options.force, inputs=[source])
     if source.suffix != ".toml":
-        require_sure(source)
+        require_covariance(source)
         warn_if_bad(source)
     if rig:
         monitored, boards = load_monitored(source)

@@ -19,7 +19,7 @@ from rigkit.report.pages.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task
 from rigkit.workflows.checks.check import load_monitored
-from rigkit.workflows.inputs.camera_files import called_bad
+from rigkit.workflows.inputs.camera_files import bad_verdict_in_file
 from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
 
@@ -65,7 +65,7 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
         raise InputError(f"certificate: the limit must be positive, got {options.limit}")
     with about(path):
         certificate = certify(load_instrument(path, options.cameras, options.sigma_px), task)
-    if (bad := called_bad(path)) is not None:
+    if (bad := bad_verdict_in_file(path)) is not None:
         certificate = replace(certificate, findings=(bad, *certificate.findings))
     if any(isinstance(camera, NearCamera) for camera in certificate.instrument.cameras):
         message = Finding.good("the lens is not central: its moving entrance pupil is included")

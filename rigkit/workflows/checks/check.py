@@ -33,7 +33,7 @@ from rigkit.io.calibrations.calibration_file import (
     pupil_from_json,
     pupil_to_json,
 )
-from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register
+from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, ensure_register, path_from_register
 from rigkit.io.calibrations.rig_file import SavedRig, is_rig_file, load_saved_rig
 from rigkit.io.disk.json_reader import json_text
 from rigkit.io.disk.reading import about
@@ -49,8 +49,8 @@ from rigkit.validation.sentinel.flipped import consistently_numbered, flipped_pi
 from rigkit.validation.sentinel.judge import Look, SentinelCheck, check_views, evaluate_evidence
 from rigkit.validation.sentinel.watch import monitored_camera, with_moving_pupils
 from rigkit.workflows.calibration.next_pictures import length_goals
-from rigkit.workflows.inputs.camera_files import require_sure, warn_if_bad
-from rigkit.workflows.inputs.identify_board import explained
+from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad
+from rigkit.workflows.inputs.identify_board import why_not_detected
 from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.moments import moments_of
 from rigkit.workflows.outputs.provenance import digest_line, digest_of, digest_of_images, software_facts
@@ -124,7 +124,7 @@ def check_pictures(
     if both:
         raise InputError(f"check: '{min(both)}' is given both as a new image and with --before")
     goals = [] if options.length is None else length_goals(monitored.cameras, monitored.cam_from_rig, options.length)
-    boards = _as_known(options.boards, known) or known
+    boards = _replaced_by_known(options.boards, known) or known
     pictures = _Pictures(source=source, monitored=monitored, boards=boards, known=known, progress=progress)
     pictures.left_out.extend((f"{path}", NO_PARTNER) for path in (*single, *alone))
     with about(source):
@@ -168,7 +168,7 @@ def _register(
 ) -> None:
     # Only the digest, without the words on how it was computed.
     since = (digest_of_images([image for frame in before for image in frame]) or "").rpartition(": ")[2]
-    place = as_seen_from(register, source)
+    place = path_from_register(register, source)
     entry = HistoryEntry.of_check(check, place, digest=digest_of(source), baseline=since, temperature_c=temperature_c)
     add_entry(register, entry)
 
@@ -178,7 +178,7 @@ def load_monitored(source: Path) -> tuple[Monitored, tuple[Board, ...]]:
 
     Raises InputError for another file, or one without a covariance.
     """
-    require_sure(source)
+    require_covariance(source)
     if not is_rig_file(source):
         known = load_calibration(source)
         with about(source):
@@ -204,11 +204,13 @@ def _monitored_rig(known: SavedRig, source: Path) -> Monitored:
     return with_moving_pupils(central, known.pupils)
 
 
-def _as_known(boards: Sequence[Board], known: Sequence[Board]) -> tuple[Board, ...]:
+def _replaced_by_known(boards: Sequence[Board], known: Sequence[Board]) -> tuple[Board, ...]:
     """Return the boards, replaced by the calibration's own where it has them, under any name and orientation."""
     out: list[Board] = []
     for board in boards:
-        alike = [own for own in known if difference(own, board) is None and _as_large(own, board) and own not in out]
+        alike = [
+            own for own in known if difference(own, board) is None and _same_square_size(own, board) and own not in out
+        ]
         named = [own for own in alike if own.board_id == board.board_id]
         out.append((named or alike or [board])[0])
         if known and not alike:
@@ -220,7 +222,7 @@ def _as_known(boards: Sequence[Board], known: Sequence[Board]) -> tuple[Board, .
     return tuple(out)
 
 
-def _as_large(one: Board, other: Board) -> bool:
+def _same_square_size(one: Board, other: Board) -> bool:
     sides = np.array([sorted(one.squares_mm), sorted(other.squares_mm)])
     return bool((np.abs(sides[0] / sides[1] - 1.0) < SAME_BOARD).all())
 
@@ -313,7 +315,7 @@ def _nothing_to_check(left_out: Sequence[tuple[str, str]], unreadable: Sequence[
         return unreadable[0]
     total = len(left_out) + len(unreadable)
     where = "the image" if total == 1 else f"any of {total} images"
-    shown = explained([Path(name) for name, _ in left_out], boards)
+    shown = why_not_detected([Path(name) for name, _ in left_out], boards)
     why = f"; {shown}" if shown else f": {left_out[0][1]}; take sharp pictures of the whole board"
     return f"no board was found in {where}{why}"
 

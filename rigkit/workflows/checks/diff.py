@@ -16,7 +16,7 @@ from rigkit.io.calibrations.rig_file import SavedRig, is_board_rigs_file, is_rig
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.report.pictures.figures import difference_png
-from rigkit.workflows.inputs.camera_files import import_camera, is_rig, own_calibration, saved_rig, warn_if_bad
+from rigkit.workflows.inputs.camera_files import calibration_of_file, import_camera, is_rig, rig_of_file, warn_if_bad
 from rigkit.workflows.inputs.paths import NamesFiles
 
 _log = logging.getLogger(__name__)
@@ -140,7 +140,7 @@ def _boards(a: Path, b: Path) -> BoardsPair:
 
 
 def _cameras(a: Path, b: Path) -> CameraPair:
-    first, second = own_calibration(a), own_calibration(b)
+    first, second = calibration_of_file(a), calibration_of_file(b)
     if first is None or second is None:
         return CameraPair(compare_cameras(import_camera(a), import_camera(b)), None)
     warn_if_bad(a, first.verdicts)
@@ -156,7 +156,7 @@ def _cameras(a: Path, b: Path) -> CameraPair:
 
 
 def _rigs(a: Path, b: Path) -> RigPair:
-    first, second = saved_rig(a), saved_rig(b)
+    first, second = rig_of_file(a), rig_of_file(b)
     warn_if_bad(a, first.verdicts)
     warn_if_bad(b, second.verdicts)
     first, second = _named_like(first, second, a), _named_like(second, first, b)

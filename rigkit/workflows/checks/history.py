@@ -19,10 +19,10 @@ from rigkit.io.calibrations.calibration_file import load_calibration
 from rigkit.io.calibrations.history_file import (
     HistoryEntry,
     add_entry,
-    as_seen_from,
     editions,
     ensure_register,
     load_history,
+    path_from_register,
 )
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic
@@ -106,7 +106,7 @@ def add_to_history(register: Path, new: Path, reference: Path, *, temperature_c:
         central = replace(before, pupil=None)
         watched = monitored_camera(central, reference.stem, beyond_model=False)
         check = evaluate_evidence(watched, lambda watched: _as_evidence(watched, now))
-    places = as_seen_from(register, new), as_seen_from(register, reference)
+    places = path_from_register(register, new), path_from_register(register, reference)
     entry = HistoryEntry.of_check(
         check, places[0], reference=places[1], digest=digest_of(reference), temperature_c=temperature_c
     )

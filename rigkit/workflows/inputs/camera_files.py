@@ -85,7 +85,7 @@ def camera_format(text: str) -> str | None:
     return "rigkit" if OURS.search(text) and found not in JSON_TOO else found
 
 
-def own_calibration(path: str | Path) -> Calibration | None:
+def calibration_of_file(path: str | Path) -> Calibration | None:
     """Return the calibration in a file of rigkit's, None for any other; raises InputError if it cannot be read."""
     if camera_format(camera_text(path)) != "rigkit":
         return None
@@ -93,7 +93,7 @@ def own_calibration(path: str | Path) -> Calibration | None:
     return known if isinstance(known, Calibration) else None
 
 
-def require_sure(source: Path) -> None:
+def require_covariance(source: Path) -> None:
     """Raise InputError for another program's camera file, which has no covariance."""
     if source.is_file() and camera_format(camera_text(source)) not in (None, "rigkit"):
         raise InputError(
@@ -102,17 +102,17 @@ def require_sure(source: Path) -> None:
         )
 
 
-def called_bad(path: str | Path) -> Finding | None:
+def bad_verdict_in_file(path: str | Path) -> Finding | None:
     """Return the verdict BAD on a calibration or rig of rigkit's; None if it has none."""
     if is_rig_file(path):
         verdicts = load_saved_rig(path).verdicts
     else:
-        known = own_calibration(path)
+        known = calibration_of_file(path)
         verdicts = () if known is None else known.verdicts
-    return bad_of(verdicts)
+    return bad_verdict(verdicts)
 
 
-def bad_of(verdicts: Iterable[Finding]) -> Finding | None:
+def bad_verdict(verdicts: Iterable[Finding]) -> Finding | None:
     """Return the first verdict of severity BAD, reworded as said of a calibration in use; None if there is none."""
     bad = next((finding for finding in verdicts if finding.severity is Severity.BAD), None)
     return None if bad is None else replace(bad, message=f"the calibration's verdict is bad: {bad.message}")
@@ -120,7 +120,7 @@ def bad_of(verdicts: Iterable[Finding]) -> Finding | None:
 
 def warn_if_bad(path: str | Path, verdicts: Iterable[Finding] | None = None) -> None:
     """Warn if the file has a verdict BAD; `verdicts` are its own, or None to read them."""
-    bad = called_bad(path) if verdicts is None else bad_of(verdicts)
+    bad = bad_verdict_in_file(path) if verdicts is None else bad_verdict(verdicts)
     if bad is not None:
         _log.warning("'%s': %s", path, bad.message)
 
@@ -164,7 +164,7 @@ def is_rig(path: str | Path) -> bool:
     return (kind == "kalibr" and "T_cn_cnm1" in text) or (kind == "opencv" and STEREO.search(text) is not None)
 
 
-def saved_rig(path: str | Path) -> SavedRig:
+def rig_of_file(path: str | Path) -> SavedRig:
     """Return the rig in a file of rigkit or, without a covariance, of another tool; raises as `import_rig`."""
     return load_saved_rig(path) if is_rig_file(path) else SavedRig(cameras=import_rig(path), covariance=None)
 
@@ -196,17 +196,17 @@ def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
     )
 
 
-def own_file(rig: Path, camera: str) -> Path:
+def file_of_camera(rig: Path, camera: str) -> Path:
     """Return the path of one camera's calibration, in the folder of the rig's file."""
     return rig.with_name(f"{rig.stem}-{camera}.json")
 
 
-def own_files(rig: Path) -> dict[str, Path]:
+def files_of_cameras(rig: Path) -> dict[str, Path]:
     """Return the calibration files of a rig's cameras by name.
 
     Raises InputError if one is not in the folder of the rig's file.
     """
-    files = {name: own_file(rig, name) for name in load_saved_rig(rig).cameras}
+    files = {name: file_of_camera(rig, name) for name in load_saved_rig(rig).cameras}
     if missing := [f"'{path.name}'" for path in files.values() if not path.is_file()]:
         raise InputError(
             f"'{rig}': the calibrations of its cameras are needed, and {', '.join(missing)} "
@@ -223,7 +223,7 @@ def import_pair(
     With `near`, cameras are those for points in mm: a `NearCamera` if a pupil moves. Raises InputError as `import_rig`,
     and for an unknown camera.
     """
-    rig = saved_rig(path).near_cameras if near else import_rig(path)
+    rig = rig_of_file(path).near_cameras if near else import_rig(path)
     chosen = names or tuple(rig)[:2]
     missing = [name for name in chosen if name not in rig]
     if missing or len(chosen) != 2:

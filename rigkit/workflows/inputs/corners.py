@@ -24,8 +24,8 @@ from rigkit.io.corners.corner_cache import CornerCache, FoundCorners, image_hash
 from rigkit.io.corners.corners_file import read_corners
 from rigkit.io.manifests.session import Session
 from rigkit.io.media.images import read_image
-from rigkit.workflows.inputs.identify_board import explained
-from rigkit.workflows.inputs.side_by_side import two_pictures
+from rigkit.workflows.inputs.identify_board import why_not_detected
+from rigkit.workflows.inputs.side_by_side import side_by_side_pictures
 
 ODD_SIZES = 3
 """A few images of another size are left out; if they are one in three or more, the session is ambiguous."""
@@ -72,7 +72,7 @@ def session_views(
     """
     found = corners.found
     size_px = _common_size(session, found)
-    if (halves := two_pictures(found, session.boards)) is not None:
+    if (halves := side_by_side_pictures(found, session.boards)) is not None:
         raise InputError(f"{session.path}: {halves}")
     views, dropped = [], list(corners.unreadable.items())
     boards = without_lookalikes({name: item.detections for name, item in found.items()}, session.boards)
@@ -96,7 +96,7 @@ def session_views(
     if not views:
         reasons = Counter(reason for _, reason in dropped).most_common(1)[0]
         # Nobody reads why the first calibration fails.
-        shown = explained(session.images, session.boards) if corners.source else None
+        shown = why_not_detected(session.images, session.boards) if corners.source else None
         alone = "look whether that camera saw the boards, else leave it out; or " if session.whose else ""
         raise InputError(
             f"{session.path}: no board can be used in {counted(len(found), 'image')}{session.whose}; "
@@ -137,7 +137,7 @@ def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Pr
     """
     kept = CornerCache(None if cache is Cache.OFF else session.corners_path, session.boards)
     if not session.images:
-        return _kept_alone(session, kept)
+        return _cached_without_images(session, kept)
     paths = named_images(session)
     hashes = {name: _hash(path) for name, path in paths.items()}
     first = {name: item for name, digest in hashes.items() if (item := kept.get(name, digest)) is not None}
@@ -203,7 +203,7 @@ def _lens_of(session: Session, hashes: Mapping[str, str]) -> str:
     return lens_key(hashes, session.boards, session.model, session.degree)
 
 
-def _kept_alone(session: Session, kept: CornerCache) -> SessionCorners:
+def _cached_without_images(session: Session, kept: CornerCache) -> SessionCorners:
     """Return the cached corners of a session without images."""
     first = {name: item for name in kept.images if (item := kept.get(name, None)) is not None}
     if not first:

@@ -16,7 +16,7 @@ from rigkit.io.boards.board_file import board_text
 from rigkit.io.boards.board_words import WORDS_HELP, board_in_words, board_of_words, with_length
 from rigkit.io.disk.toml_reader import relative_path, toml_text
 from rigkit.io.manifests.session import SESSION_NAME, SESSION_SCHEMA
-from rigkit.io.media.images import folder_of_images, images_below, images_of_folder, name_unread, no_images
+from rigkit.io.media.images import folder_of_images, images_below, images_of_folder, no_images, warn_of_unread_formats
 from rigkit.io.media.video import is_video
 from rigkit.workflows.inputs.identify_board import Suggestion, suggestion
 
@@ -94,7 +94,7 @@ def session_of_folders(
         raise InputError(_missing_board_message(folders))
     cameras = cameras_in(folders)
     for folder in dict.fromkeys(folder for own in cameras.values() for folder, _ in own):
-        name_unread(folder)
+        warn_of_unread_formats(folder)
     place = path.parent
     files: dict[Path, str] = {}
     names = [_board_file(words, place, files) for words in boards]
@@ -146,7 +146,7 @@ def _cameras_in_words(cameras: Mapping[str, Sequence[tuple[Path, str]]], place: 
     return lines
 
 
-def session_to_come(patterns: Mapping[str, str], boards: Sequence[str], place: Path) -> FolderSession:
+def session_of_future_images(patterns: Mapping[str, str], boards: Sequence[str], place: Path) -> FolderSession:
     """Return the session in folder `place` for images still to be taken, which will match `patterns` (by camera).
 
     Images of one moment will have the same name. Boards and errors are as for `session_of_folders`.
@@ -213,7 +213,7 @@ def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
     Raises InputError for a folder without images, or two folders of the same name.
     """
     if len(folders) > 1:
-        return _one_each(folders)
+        return _folder_for_each_camera(folders)
     folder = folders[0]
     images = _images(folder)
     if images:
@@ -255,7 +255,7 @@ def _images(folder: Path) -> list[Path]:
     return images_of_folder(folder)
 
 
-def _one_each(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
+def _folder_for_each_camera(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
     named: dict[str, Path] = {}
     for folder in folders:
         name = folder.resolve().name

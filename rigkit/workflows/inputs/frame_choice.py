@@ -79,7 +79,7 @@ class FrameChoice:
             limit = BLURRED * float(np.median([frame.sigma_px for frame in self.kept.values()]))
             self.kept = {k: frame for k, frame in self.kept.items() if frame.sigma_px <= limit}
         if len(self.kept) > self._max_frames:
-            self.kept = {k: self.kept[k] for k in sorted(self._farthest())}
+            self.kept = {k: self.kept[k] for k in sorted(self._farthest_first())}
         return sorted(before - set(self.kept))
 
     def _thin(self) -> list[int]:
@@ -93,7 +93,7 @@ class FrameChoice:
         self.kept = {frame.number: frame for frame in sorted(rest, key=lambda frame: frame.number)}
         return sorted(gone)
 
-    def _farthest(self) -> list[int]:
+    def _farthest_first(self) -> list[int]:
         """Return the numbers of `max_frames` frames by farthest-first traversal (Gonzalez 1985).
 
         It starts with the frame that the most cameras see, the sharpest of these.

@@ -29,7 +29,7 @@ from rigkit.io.manifests.session import Session, beside_session
 from rigkit.io.media.images import Image
 from rigkit.io.media.video import Video, is_video, read_timestamps
 from rigkit.workflows.inputs.frame_choice import FrameChoice, KeptFrame, describe
-from rigkit.workflows.inputs.identify_board import explained
+from rigkit.workflows.inputs.identify_board import why_not_detected
 
 _log = logging.getLogger(__name__)
 
@@ -125,7 +125,7 @@ def frames_of_videos(
     images = keeper.finish()
     if not images:
         names = ", ".join(f"'{path}'" for path in sources.values())
-        shown = None if live or not boards else explained(list(sources.values()), boards)
+        shown = None if live or not boards else why_not_detected(list(sources.values()), boards)
         raise InputError(
             f"{names}: no board in {looked_at} frames; {shown or 'check focus, light and the size of the board'}"
         )
@@ -197,7 +197,7 @@ def _described(number: int, pictures: Mapping[str, Image], boards: Sequence[Boar
     """Return the descriptors of the boards in the pictures of a moment; None without a board."""
     views, sigmas = {}, []
     for name, picture in pictures.items():
-        found = _quick_look(picture, boards)
+        found = _boards_in_reduced(picture, boards)
         view = describe(found)
         if view is not None:
             views[name] = view
@@ -205,7 +205,7 @@ def _described(number: int, pictures: Mapping[str, Image], boards: Sequence[Boar
     return KeptFrame(number, views, float(np.mean(sigmas))) if views else None
 
 
-def _quick_look(picture: Image, boards: Sequence[Board]) -> list[BoardDetection]:
+def _boards_in_reduced(picture: Image, boards: Sequence[Board]) -> list[BoardDetection]:
     """Return the boards of a picture, detected in a reduced one, in pixels of the full picture."""
     factor = max(1, int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS))))
     if factor > 1:

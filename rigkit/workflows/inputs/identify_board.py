@@ -84,7 +84,7 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     progress("reading", len(images), len(images))
     guess = guess_board(list(images.values()), progress)
     names = tuple(Path(name).name for name in images)
-    mirrored = _mirrored_unless(guess, list(images.items()))
+    mirrored = _mirrored_where_doubtful(guess, list(images.items()))
     if mirrored is not None:
         raise CheckFailed(mirrored)
     if guess is None:
@@ -124,7 +124,7 @@ def _other_board(rest: Sequence[tuple[str, GreyImage]]) -> tuple[str, tuple[str,
     return words_of_board(guess.board), tuple(rest[k][0] for k in guess.images)
 
 
-def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
+def why_not_detected(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     """Return in words why images do not show the declared boards; None if unknown."""
     mirrored = _mirrored(paths, [board for board in boards if board.identified])
     if mirrored is not None:
@@ -145,7 +145,7 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     return f"{what} seen in {counted(count, 'image')}; {words[0]}{whole}"
 
 
-def misread(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
+def why_misplaced(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     """Return in words why corners of boards with marks are misplaced; None if unknown.
 
     The images may show another board with the same marks, or two copies of the board. Chessboards are checked by their
@@ -153,7 +153,7 @@ def misread(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     """
     if not any(board.identified for board in boards):
         return None
-    return explained(paths, boards) or _duplicate_board(paths, boards)
+    return why_not_detected(paths, boards) or _duplicate_board(paths, boards)
 
 
 def _duplicate_board(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
@@ -187,7 +187,7 @@ def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     return _mirror_message(names[0]) if names else None
 
 
-def _mirrored_unless(guess: BoardGuess | None, pictures: Sequence[tuple[str, GreyImage]]) -> str | None:
+def _mirrored_where_doubtful(guess: BoardGuess | None, pictures: Sequence[tuple[str, GreyImage]]) -> str | None:
     """Return a message if the flipped images show boards with marks and `guess` is doubtful, else None.
 
     A guess is doubtful if it is None, a chessboard in few images, or one with marks in its squares.
@@ -247,7 +247,7 @@ def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion
     guess, pictures, unreadable = _guess(paths, progress)
     if unreadable is not None and not pictures:
         return Suggestion(fault=str(unreadable))
-    mirrored = _mirrored_unless(guess, pictures)
+    mirrored = _mirrored_where_doubtful(guess, pictures)
     if mirrored is not None:
         return Suggestion(fault=mirrored)
     if guess is None:

@@ -18,10 +18,10 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibrations.rig_file import SavedRig, is_rig_file
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.workflows.inputs.camera_files import (
+    calibration_of_file,
     import_camera,
     is_rig,
-    own_calibration,
-    saved_rig,
+    rig_of_file,
     warn_if_bad,
     warn_of_pupil,
     warn_of_pupils,
@@ -41,7 +41,7 @@ def with_known(session: RigSession, known: Known) -> RigSession:
     return session if known.rig is None else replace(session, known_rig=known.rig)
 
 
-def with_known_first(session: RigSession) -> RigSession:
+def known_cameras_first(session: RigSession) -> RigSession:
     """Return the session with the cameras of the known rig first, in its order, so that the rig's frame stays the same.
 
     Warns of cameras of the rig that have no images.
@@ -130,7 +130,7 @@ def _covariance_indices(cameras: Mapping[str, tuple[Camera, object]], mounted: S
 
 def _rig_with_names(path: Path, names: Sequence[str]) -> SavedRig:
     """Return a saved rig; the numbered cameras of another tool's get the first of `names`."""
-    rig = saved_rig(path)
+    rig = rig_of_file(path)
     warn_of_pupils(path, rig)
     if is_rig_file(path) or set(rig.cameras) & set(names):
         return rig
@@ -146,7 +146,7 @@ def _camera_and_covariance(path: Path, name: str, names: Sequence[str]) -> tuple
         warn_if_bad(path, rig.verdicts)
         own = _covariance_indices(rig.cameras, [name])
         return rig.cameras[name][0], None if rig.covariance is None else rig.covariance[np.ix_(own, own)]
-    if (calibration := own_calibration(path)) is not None:
+    if (calibration := calibration_of_file(path)) is not None:
         warn_if_bad(path, calibration.verdicts)
         warn_of_pupil(path, calibration)
         return calibration.camera, np.asarray(calibration.covariance)

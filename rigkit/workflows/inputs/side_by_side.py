@@ -18,7 +18,7 @@ MIN_IMAGES = 3
 HALVES = (("left", "right"), ("top", "bottom"))
 
 
-def two_pictures(found: Mapping[str, FoundCorners], boards: Collection[Board]) -> str | None:
+def side_by_side_pictures(found: Mapping[str, FoundCorners], boards: Collection[Board]) -> str | None:
     """Return in words that images hold the pictures of two cameras, or None.
 
     The only board is then seen twice, once in either half, never across the middle, and at about the same distance.

@@ -20,7 +20,13 @@ from rigkit.io.calibrations.calibration_file import save_camera
 from rigkit.io.calibrations.rig_file import is_rig_file, load_saved_rig
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic, write_together
-from rigkit.workflows.inputs.camera_files import import_camera, import_rig, own_calibration, warn_if_bad, warn_of_pupil
+from rigkit.workflows.inputs.camera_files import (
+    calibration_of_file,
+    import_camera,
+    import_rig,
+    warn_if_bad,
+    warn_of_pupil,
+)
 from rigkit.workflows.inputs.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
 from rigkit.workflows.inputs.paths import NamesFiles
 
@@ -84,7 +90,7 @@ def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedC
         save_camera(options.output, camera, force=options.force)
         return ExportedCamera(camera=camera, kind=kind, max_error_px=0.0)
     with about(source):
-        known = own_calibration(source)
+        known = calibration_of_file(source)
         outline = None if known is None else outline_of_corners(known)
         done = _written_camera(camera, kind, outline)
     write_atomic(options.output, done.text, force=options.force)

@@ -13,7 +13,7 @@ CALIBRATIONS = "calibrations"
 """Subfolder of results for cameras that were calibrated for them."""
 
 
-def free_folder(name: str, *, force: bool) -> Path:
+def new_results_folder(name: str, *, force: bool) -> Path:
     """Return the first of out/NAME, out/NAME-2, ... that does not exist; with `force` out/NAME."""
     base = Path("out") / name
     if force:

@@ -23,7 +23,7 @@ from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.outputs.results import write_results
 from rigkit.workflows.reconstruction.datasets import load_cameras
-from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_with, with_whole_sigmas
+from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_with, with_calibration_sigmas
 
 _log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ def export_cloud(
     camera1, camera2 = load_cameras(known.select([pair.pair_id]), progress=progress).of(pair)
     matched, image1, _ = match_images(pair, camera1.near, camera2.near, "raw")
     r = reconstruct_with(matched, pair, options.method, image1)
-    r = with_whole_sigmas(r, options.planes or pair.planes, camera1, camera2)
+    r = with_calibration_sigmas(r, options.planes or pair.planes, camera1, camera2)
     folder, files = options.output, dict[str, str | bytes]()
     if options.kind == "colmap":
         model, notes = colmap_model(

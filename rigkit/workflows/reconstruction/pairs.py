@@ -141,7 +141,7 @@ def planes_of(geometry: PairGeometry, planes: Planes, camera1: LoadedCamera, cam
     return fit_planes(geometry, planes, camera1.known, camera2.known, one_camera=camera1 is camera2)
 
 
-def with_whole_sigmas(
+def with_calibration_sigmas(
     reconstruction: Reconstruction, planes: Planes, camera1: LoadedCamera, camera2: LoadedCamera
 ) -> Reconstruction:
     """Return a reconstruction moved onto `planes`, with the calibrations' covariances in its sigmas.

@@ -21,7 +21,7 @@ from rigkit.workflows.reconstruction.datasets import (
     ready_dataset,
     write_for,
 )
-from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_with, with_whole_sigmas
+from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_with, with_calibration_sigmas
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +92,7 @@ def _reconstruct(job: PairJob[ReconstructOptions]) -> PairReconstruction:
     matched, image1, image2 = match_images(pair, camera1.near, camera2.near, options.chain, options.support)
     r = reconstruct_with(matched, pair, options.method, image1, det_scale=options.det_scale)
     planes = options.planes or pair.planes
-    r = with_whole_sigmas(r, planes, camera1, camera2)
+    r = with_calibration_sigmas(r, planes, camera1, camera2)
     ply = f"{pair.pair_id}/{options.method if planes == 'free' else planes}.ply"
     files = {ply: ply_bytes(r.cloud)}
     if options.pictures:

@@ -26,7 +26,7 @@ from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.pages.cloud_page import build_cloud_page
 from rigkit.report.pictures.figures import as_png, cloud_figure
-from rigkit.workflows.inputs.camera_files import saved_rig, warn_if_bad, warn_of_pupils
+from rigkit.workflows.inputs.camera_files import rig_of_file, warn_if_bad, warn_of_pupils
 from rigkit.workflows.outputs.provenance import software_facts
 from rigkit.workflows.outputs.results import require_folder, write_results
 from rigkit.workflows.reconstruction.reconstruct_scene import CLOUD, SCENE_PAGE, CloudOptions
@@ -101,11 +101,11 @@ def reconstruct_rig_views(options: RigSceneOptions, *, progress: Progress = sile
     """
     if options.output is not None:
         require_folder(options.output, force=options.force)
-    rig = saved_rig(options.rig)
+    rig = rig_of_file(options.rig)
     warn_if_bad(options.rig, rig.verdicts)
     warn_of_pupils(options.rig, rig)
     views, known = _views(options, rig.cameras), rig.quoted
-    pairs = near_pairs([v.cam_from_world for v in views])
+    pairs = neighbouring_pairs([v.cam_from_world for v in views])
     grown: dict[tuple[str, str], PosedCloud] = {}
     notes: list[str] = []
     first: DenseScene | None = None
@@ -140,7 +140,7 @@ def reconstruct_rig_views(options: RigSceneOptions, *, progress: Progress = sile
     )
 
 
-def near_pairs(cam_from_world: Sequence[Rigid3]) -> list[tuple[int, int]]:
+def neighbouring_pairs(cam_from_world: Sequence[Rigid3]) -> list[tuple[int, int]]:
     """Return pairs of views (i < j): each view with its PARTNERS nearest ones of similar axis and another centre."""
     centres = np.array([pose.inverse().translation_mm for pose in cam_from_world])
     axes = np.array([pose.rotation[2] for pose in cam_from_world])

@@ -37,11 +37,11 @@ from rigkit.report.pages.cloud_page import build_cloud_page
 from rigkit.report.pictures.figures import as_png, cloud_figure, epipolar_figure
 from rigkit.report.pictures.scene_figure import normals_png
 from rigkit.workflows.inputs.camera_files import (
+    calibration_of_file,
     import_camera,
     import_near_camera,
     import_pair,
-    own_calibration,
-    saved_rig,
+    rig_of_file,
 )
 from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.outputs.provenance import software_facts
@@ -226,14 +226,14 @@ def _cameras(options: SceneOptions) -> tuple[tuple[Camera, Camera], KnownPose | 
 def _calibrations(options: SceneOptions, cameras: tuple[Camera, Camera]) -> Calibrations | None:
     """Return the cameras with their covariances (zero if a file has none); None if no file has one."""
     if options.rig is not None:
-        rig = saved_rig(options.rig)
+        rig = rig_of_file(options.rig)
         names = list(rig.cameras)
         chosen = options.names or names[:2]
         known_rig = rig.quoted
         return None if known_rig is None else known_rig.pair(*(names.index(name) for name in chosen))
     found = [
         None
-        if path is None or (known := own_calibration(path)) is None
+        if path is None or (known := calibration_of_file(path)) is None
         else uncertain_camera(known, near=isinstance(camera, NearCamera))
         for path, camera in zip((options.camera, options.camera2), cameras, strict=True)
     ]

@@ -29,7 +29,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Finding, Severity, worst
 from rigkit.io.manifests.session import Session
-from rigkit.workflows.calibration.calibrate_rig import judged
+from rigkit.workflows.calibration.calibrate_rig import with_new_verdicts
 
 
 def printed(result: Calibration, words: str) -> bool:
@@ -178,7 +178,7 @@ def test_a_lens_that_no_model_tried_fits(rng: np.random.Generator) -> None:
     assert printed(brown, 'try model = "auto"')
     # A camera's file of a rig has its own verdicts.
     asked: dict[str, Any] = {"path": Path("s.toml"), "images": (), "boards": (), "degree": None, "board_shape": "auto"}
-    of_a_rig = [judged(brown, Session(model=model, **asked)) for model in ("brown", "auto")]
+    of_a_rig = [with_new_verdicts(brown, Session(model=model, **asked)) for model in ("brown", "auto")]
     assert [printed(one, 'try model = "auto"') for one in of_a_rig] == [True, False]
     assert printed(of_a_rig[1], "no lens model or board shape explains it")
 

@@ -16,7 +16,13 @@ from helpers.sentinel_scenes import checked
 from rigkit.calibration.result import Calibration
 from rigkit.core.errors import InputError
 from rigkit.io.calibrations.calibration_file import save_calibration
-from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register, load_history
+from rigkit.io.calibrations.history_file import (
+    HistoryEntry,
+    add_entry,
+    ensure_register,
+    load_history,
+    path_from_register,
+)
 from rigkit.report.pages.history_page import drift_svg, history_facts, history_page
 from rigkit.workflows.checks.history import add_to_history, show_history
 
@@ -44,7 +50,7 @@ def test_a_register_of_months(calibration: Calibration, tmp_path: Path, caplog: 
     check = checked(calibration, lens("reg"), np.random.default_rng(3))
     register = tmp_path / "lab" / "register.jsonl"
     for camera, day in (("left", 3), ("right", 4), ("left", 1), ("left", 5)):
-        source = as_seen_from(register, tmp_path / "lab" / camera / "calibration.json")
+        source = path_from_register(register, tmp_path / "lab" / camera / "calibration.json")
         add_entry(register, HistoryEntry.of_check(check, source, now=datetime(2026, 3, day, tzinfo=UTC)))
     save_calibration(tmp_path / "c.json", calibration)
     add_to_history(register, tmp_path / "c.json", tmp_path / "c.json", temperature_c=19.0)

@@ -15,7 +15,7 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
 from rigkit.io.media.images import read_image
 from rigkit.synthetic.render import Optics
-from rigkit.workflows.inputs.identify_board import explained, misread
+from rigkit.workflows.inputs.identify_board import why_misplaced, why_not_detected
 
 BOARD = Board("c", 7, 7, 30.0, 30.0, pattern=Charuco("DICT_4X4_100", 22.5))
 
@@ -61,14 +61,14 @@ def test_mirrored_images_are_named(folder: Path, tmp_path: Path, capsys: pytest.
 
 
 def test_a_board_that_is_as_declared_needs_no_words_and_another_kind_some(folder: Path) -> None:
-    assert explained([folder / "0.png"], [BOARD]) is None
+    assert why_not_detected([folder / "0.png"], [BOARD]) is None
     plain, larger = Board("plain", 7, 7, 30.0, 30.0), Board("c", 8, 8, 30.0, 30.0, pattern=BOARD.pattern)
-    printed = explained([folder / "0.png"], [plain, larger])
+    printed = why_not_detected([folder / "0.png"], [plain, larger])
     assert printed is not None and 'set type = "charuco"' in printed
-    printed = explained([folder / "0.png"], [plain])
+    printed = why_not_detected([folder / "0.png"], [plain])
     assert printed is not None
     assert 'set type = "charuco", as in --board charuco:7x7xMM,dictionary=DICT_4X4_50,marker_mm=(0.7' in printed
-    printed = explained([folder / "0.png"], [larger])
+    printed = why_not_detected([folder / "0.png"], [larger])
     assert printed is not None and "8 x 8 are declared" in printed
 
 
@@ -90,11 +90,11 @@ def test_boards_alike_are_named_where_a_rig_comes_to_nothing(
 
 
 def test_boards_that_are_as_declared_are_not_misread(folder: Path) -> None:
-    assert misread(sorted(folder.glob("*.png")), [BOARD]) is None
-    assert misread([folder / "0.png"], [Board("plain", 7, 7, 30.0, 30.0)]) is None
+    assert why_misplaced(sorted(folder.glob("*.png")), [BOARD]) is None
+    assert why_misplaced([folder / "0.png"], [Board("plain", 7, 7, 30.0, 30.0)]) is None
 
 
 def test_images_that_show_nothing_are_not_misread(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "grey.png"), np.full((120, 160), 90, dtype=np.uint8))
-    assert misread([tmp_path / "grey.png"], [BOARD]) is None
-    assert misread([tmp_path / "grey.png"], [Board("plain", 7, 7, 30.0, 30.0)]) is None
+    assert why_misplaced([tmp_path / "grey.png"], [BOARD]) is None
+    assert why_misplaced([tmp_path / "grey.png"], [Board("plain", 7, 7, 30.0, 30.0)]) is None

@@ -10,7 +10,7 @@ import pytest
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.io.corners.corner_cache import FoundCorners
-from rigkit.workflows.inputs.side_by_side import two_pictures
+from rigkit.workflows.inputs.side_by_side import side_by_side_pictures
 
 BOARD = Board("b", 4, 3, 30.0, 30.0)
 
@@ -47,7 +47,7 @@ LEFT_RIGHT = [_seen((100 + 9 * k, 200), (480 + 9 * k, 200), square=20.0 + k) for
 )
 def test_both_halves_show_the_only_board(images: Sequence[FoundCorners], words: str | None) -> None:
     found = {f"{k}.png": item for k, item in enumerate(images)}
-    told = two_pictures(found, [BOARD])
+    told = side_by_side_pictures(found, [BOARD])
     assert (words in told) if words is not None and told is not None else told is words
     # Of two boards of one kind one may be in each half.
-    assert two_pictures(found, [BOARD, Board("c", 4, 3, 30.0, 30.0)]) is None
+    assert side_by_side_pictures(found, [BOARD, Board("c", 4, 3, 30.0, 30.0)]) is None
