@@ -344,7 +344,7 @@ def test_the_square_is_enough_where_images_show_the_board(pictures: Path, tmp_pa
     assert main(["calibrate", str(folder), "--board", "9x6x30", "--model", "brown", "--force"]) == 0
 
 
-@pytest.mark.parametrize("name", ["calibration.json", "calibration.html"])
+@pytest.mark.parametrize("name", ["calibration.json", "calibration.html", "calibration-opencv.yaml"])
 def test_an_existing_result_is_refused_before_boards_are_identified(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -353,7 +353,7 @@ def test_an_existing_result_is_refused_before_boards_are_identified(
     (folder / "0.png").touch()
     (folder / name).touch()
     monkeypatch.setattr("rigkit.workflows.calibration.calibrate_any.boards_seen", None)
-    assert main(["calibrate", str(folder), "--square-mm", "30", "-r"]) == 2
+    assert main(["calibrate", str(folder), "--square-mm", "30", "-r", "--export", "opencv"]) == 2
     assert f"'{folder / name}' exists and is left as it is" in capsys.readouterr().err
 
 

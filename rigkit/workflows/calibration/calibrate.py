@@ -92,10 +92,7 @@ def calibrate_session(
     options = options or CalibrateOptions()
     if not isinstance(session, Session):
         session = load_session(session)
-    foreign = [] if options.output is None else foreign_paths(options.output, options.exports)
-    ensure_writable(
-        [options.output, options.report, *foreign], force=options.force, inputs=session_inputs(session, options)
-    )
+    ensure_writable(results_of_camera(options), force=options.force, inputs=session_inputs(session, options))
     with about(session.path):
         corners = corners_of(session, options, progress=progress)
     calibration = calibration_from(session, corners, pupil=options.pupil, progress=progress)
@@ -109,6 +106,12 @@ def calibrate_session(
     return SessionCalibration(
         session=session, calibration=calibration, unreadable=corners.unreadable, written=tuple(files)
     )
+
+
+def results_of_camera(options: CalibrateOptions) -> list[Path]:
+    """Return the files that the calibration of one camera writes."""
+    foreign = [] if options.output is None else foreign_paths(options.output, options.exports)
+    return [path for path in (options.output, options.report, *foreign) if path is not None]
 
 
 def corners_of(session: Session, options: CalibrateOptions, *, progress: Progress = silent) -> SessionCorners:

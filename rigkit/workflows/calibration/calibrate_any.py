@@ -22,9 +22,10 @@ from rigkit.workflows.calibration.calibrate import (
     CalibrateOptions,
     SessionCalibration,
     calibrate_session,
+    results_of_camera,
     session_inputs,
 )
-from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration, calibrate_rig_session
+from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration, calibrate_rig_session, results_of_rig
 from rigkit.workflows.inputs.folder_session import boards_seen, cameras_in, session_of_folders
 from rigkit.workflows.inputs.frames import (
     frames_folder,
@@ -125,9 +126,10 @@ def calibrate_folders(
     session = _session_path(places, options.output)
     declared = [*folders, *([folder_options.timestamps] if folder_options.timestamps else [])]
     # Before boards are identified and frames chosen, which takes minutes.
-    name = "rig.json" if len(videos or cameras_in(places)) > 1 else "calibration.json"
-    output = options.output or beside_session(session, name)
-    results = [path for path in (output, _report_path(options, output)) if path is not None]
+    names = [folder.name for folder in videos] or list(cameras_in(places))
+    output = options.output or beside_session(session, "rig.json" if len(names) > 1 else "calibration.json")
+    resolved = replace(options, output=output, report=_report_path(options, output))
+    results = results_of_rig(names, resolved) if len(names) > 1 else results_of_camera(resolved)
     ensure_writable(results, force=options.force, inputs=declared)
     boards = _boards(given, folder_options, progress)
     if videos:

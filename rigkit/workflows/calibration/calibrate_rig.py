@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -84,7 +84,8 @@ def calibrate_rig_session(
         if len(images) > 1 and all(images.values()) and session.frames != "order":
             frames_of_images(images, session.frames)
         require_distinct(session)
-    targets = _targets(session, options)
+    names = list(session.cameras)
+    targets = results_of_rig(names, options, rigid_boards=bool(session.rigid_boards))
     ensure_writable(targets, force=options.force, inputs=session_inputs(session, options))
     with about(session.path):
         corners = {name: corners_of(own, options, progress=progress) for name, own in session.cameras.items()}
@@ -99,9 +100,9 @@ def calibrate_rig_session(
             outlines = {c.name: outline_of_corners(c.calibration) for c in rig.cameras}
             files |= foreign_rig_files(mounted, options.output, options.exports, outlines)
         for camera in rig.cameras:
-            own = _camera_file(session, options.output, camera.name)
+            own = _camera_file(names, options.output, camera.name)
             files[own] = calibration_text(with_new_verdicts(camera.calibration, session.cameras[camera.name]), origin)
-            files |= foreign_files(camera.calibration, own, _camera_exports(session, options))
+            files |= foreign_files(camera.calibration, own, _camera_exports(names, options))
         if session.rigid_boards:
             files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)
     if options.report is not None:
@@ -113,34 +114,34 @@ def calibrate_rig_session(
     )
 
 
-def _targets(session: RigSession, options: CalibrateOptions) -> list[Path]:
-    """Return the files that will be written."""
+def results_of_rig(names: Sequence[str], options: CalibrateOptions, *, rigid_boards: bool = False) -> list[Path]:
+    """Return the files that the calibration of cameras of these names writes, perhaps with boards on one mount."""
     out = []
     if options.output is not None:
-        out += [options.output] if len(session.cameras) > 1 else []
-        own = [_camera_file(session, options.output, name) for name in session.cameras]
-        out += [*own, *(path for one in own for path in foreign_paths(one, _camera_exports(session, options)))]
-        out += [path for places in _rig_exports(session, options).values() for path in places]
-        out += [_boards_file(options.output)] if session.rigid_boards else []
+        out += [options.output] if len(names) > 1 else []
+        own = [_camera_file(names, options.output, name) for name in names]
+        out += [*own, *(path for one in own for path in foreign_paths(one, _camera_exports(names, options)))]
+        out += [path for places in _rig_exports(names, options).values() for path in places]
+        out += [_boards_file(options.output)] if rigid_boards else []
     return out if options.report is None else [*out, options.report]
 
 
-def _rig_exports(session: RigSession, options: CalibrateOptions) -> dict[str, list[Path]]:
+def _rig_exports(names: Sequence[str], options: CalibrateOptions) -> dict[str, list[Path]]:
     """Return, by requested format that holds a whole rig, its files."""
-    if options.output is None or len(session.cameras) < 2:
+    if options.output is None or len(names) < 2:
         return {}
-    return foreign_rig_paths(list(session.cameras), options.output, options.exports)
+    return foreign_rig_paths(names, options.output, options.exports)
 
 
-def _camera_exports(session: RigSession, options: CalibrateOptions) -> list[str]:
+def _camera_exports(names: Sequence[str], options: CalibrateOptions) -> list[str]:
     """Return the requested formats that hold one camera a file; a rig's file has the lenses already."""
-    whole = _rig_exports(session, options)
+    whole = _rig_exports(names, options)
     return [kind for kind in options.exports if kind not in whole]
 
 
-def _camera_file(session: RigSession, target: Path, name: str) -> Path:
+def _camera_file(names: Sequence[str], target: Path, name: str) -> Path:
     """Return the path of one camera's calibration."""
-    return file_of_camera(target, name) if len(session.cameras) > 1 else target
+    return file_of_camera(target, name) if len(names) > 1 else target
 
 
 def _boards_file(target: Path) -> Path:
