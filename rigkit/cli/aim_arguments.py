@@ -1,4 +1,4 @@
-"""Arguments of `check`, `coach` and `plan` for the positions of boards and for a length to be measured."""
+"""Arguments of several verbs for boards, their positions, and a length to be measured."""
 
 from __future__ import annotations
 
@@ -10,6 +10,13 @@ from rigkit.core.errors import InputError
 if TYPE_CHECKING:
     from rigkit.planning.candidates import Reach
     from rigkit.validation.certificate.contracts import Task
+
+
+def add_board_argument(parser: argparse._ActionsContainer, words: str, *, required: bool = False) -> None:
+    """Add boards, with the help text `words`."""
+    parser.add_argument(
+        "--board", action="append", default=[], required=required, metavar="CxRxMM|BOARD.toml", help=words
+    )
 
 
 def add_reach_arguments(parser: argparse.ArgumentParser) -> None:

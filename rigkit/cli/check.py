@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.aim_arguments import length_of
+from rigkit.cli.aim_arguments import add_board_argument, length_of
 from rigkit.core.errors import ExitCode, InputError
 
 
@@ -21,13 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="IMAGE|FOLDER",
         help="new images; of a rig one folder per camera, one folder with all, or images",
     )
-    parser.add_argument(
-        "--board",
-        action="append",
-        default=[],
-        metavar="CxRxMM|BOARD.toml",
-        help="board in the images (default: those of the calibration)",
-    )
+    add_board_argument(parser, "board in the images (default: those of the calibration)")
     parser.add_argument(
         "--scene", action="store_true", help="without a board: match features of any textured scene (rigs)"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.aim_arguments import add_reach_arguments, length_of, reach_of
+from rigkit.cli.aim_arguments import add_board_argument, add_reach_arguments, length_of, reach_of
 from rigkit.core.errors import ExitCode, InputError
 
 MAX_CAMERAS = 8
@@ -16,9 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "folder", type=Path, metavar="FOLDER", help="folder of the session: a new one, or one to continue"
     )
-    parser.add_argument(
-        "--board", action="append", required=True, metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)"
-    )
+    add_board_argument(parser, "such as 9x6x25 (repeatable)", required=True)
     parser.add_argument(
         "--lens", type=float, default=70.0, metavar="DEG", help="approximate horizontal field of view (default: 70)"
     )

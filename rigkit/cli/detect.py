@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rigkit.cli.aim_arguments import add_board_argument
 from rigkit.core.errors import ExitCode, printable
 
 if TYPE_CHECKING:
@@ -14,13 +15,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", nargs="+", metavar="IMAGE|FOLDER|VIDEO", help="images, folders, videos, camera:0")
-    parser.add_argument(
-        "--board",
-        action="append",
-        default=[],
-        metavar="CxRxMM|BOARD.toml",
-        help="a board to look for, such as 9x6x25 (repeatable; default: chessboards of any size)",
-    )
+    add_board_argument(parser, "a board to look for, such as 9x6x25 (repeatable; default: chessboards of any size)")
     parser.add_argument(
         "--camera",
         metavar="CALIBRATION.json",

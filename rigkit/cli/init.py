@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from rigkit.cli.aim_arguments import add_board_argument
 from rigkit.cli.manifest_words import POSE_TYPES
 from rigkit.core.errors import ExitCode, InputError
 
@@ -54,12 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-o", "--output", type=Path, help="default: dataset.toml (session.toml) in the folder")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
-    parser.add_argument(
-        "--board",
-        **repeatable,
-        metavar="CxRxMM|BOARD.toml",
-        help="board in the images, such as 9x6x25 (repeatable; instead of --square-mm)",
-    )
+    add_board_argument(parser, "board in the images, such as 9x6x25 (repeatable; instead of --square-mm)")
     session = parser.add_argument_group("sessions")
     session.add_argument(
         "--session", action="store_true", help="write a session for rigkit calibrate instead of a manifest"

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigkit.cli.aim_arguments import add_reach_arguments, length_of, reach_of
+from rigkit.cli.aim_arguments import add_board_argument, add_reach_arguments, length_of, reach_of
 from rigkit.cli.console import size_of_words
 from rigkit.core.errors import ExitCode, InputError
 
@@ -40,9 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     lens = parser.add_argument_group("before there is a calibration")
     lens.add_argument("--lens", type=float, metavar="DEG", help="field of view across the width of the image")
     lens.add_argument("--size", metavar="WxH", help="image size, px")
-    lens.add_argument(
-        "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="board, such as 9x6x25 (repeatable)"
-    )
+    add_board_argument(lens, "board, such as 9x6x25 (repeatable)")
     lens.add_argument("--model", help="camera model (default: chosen by the field of view)")
     lens.add_argument(
         "--sigma-px", type=float, metavar="PX", help="standard deviation of a corner per coordinate (default: 0.15)"

@@ -6,11 +6,10 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
@@ -25,9 +24,9 @@ from rigkit.detection.duplicate_marks import duplicate_boards
 from rigkit.detection.lattices import MIN_BOARD_CORNERS
 from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.corners.corners_file import write_corners
+from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.io.media.images import (
-    Image,
     folder_of_images,
     images_of_folder,
     read_image,
@@ -218,8 +217,12 @@ def _detect(job: _DetectJob) -> tuple[Outcome, str | None]:
     """
     cv2.setNumThreads(1)
     try:
-        image = _read(job)
-        found = _boards_in(image, job)
+        if job.camera is None or job.options.camera is None:
+            image = read_image(job.image)
+        else:
+            image = read_image_of(job.image, job.camera.size_px, job.options.camera)
+        with about(job.image):
+            found = detect_boards(image, job.boards, min_corners=job.options.min_corners, camera=job.camera)
         seen = duplicate_boards(image, job.boards) if found else doubtful_grid(image)
     except InputError as error:
         return error, None
@@ -230,16 +233,3 @@ def _detect(job: _DetectJob) -> tuple[Outcome, str | None]:
         picture = cv2.cvtColor(draw_boards(image, found), cv2.COLOR_RGB2BGR)
         write_atomic(job.overlay, np.asarray(cv2.imencode(".png", picture)[1]).tobytes(), force=job.options.force)
     return found, seen
-
-
-def _read(job: _DetectJob) -> Image:
-    if job.camera is None or job.options.camera is None:
-        return read_image(job.image)
-    return read_image_of(job.image, job.camera.size_px, job.options.camera)
-
-
-def _boards_in(image: NDArray[Any], job: _DetectJob) -> tuple[BoardDetection, ...]:
-    try:
-        return detect_boards(image, job.boards, min_corners=job.options.min_corners, camera=job.camera)
-    except InputError as error:
-        raise InputError(f"'{job.image}': {error}") from error
