@@ -106,6 +106,13 @@ def _add_of_folders(parser: argparse.ArgumentParser) -> None:
         help="instead of --board: side of a square (tag; distance of circles); the images say which board it is",
     )
     folders.add_argument(
+        "--cameras",
+        type=int,
+        metavar="N",
+        help="number of cameras whose images the folders hold (default: by the names of images and folders, and by the "
+        "boards in them); 1: all are of one camera",
+    )
+    folders.add_argument(
         "--timestamps", type=Path, metavar="FILE.csv", help="which frames of the videos were taken together"
     )
     folders.add_argument("--model", help=f"{', '.join(MODEL_NAMES)} (default: auto, the lowest held-out error)")
@@ -135,6 +142,12 @@ def folder_options(args: argparse.Namespace) -> FolderOptions:
 
     if args.square_mm is not None and not (math.isfinite(args.square_mm) and args.square_mm > 0.0):
         raise InputError(f"calibrate: --square-mm {args.square_mm}: a positive number of mm is needed")
+    if args.cameras is not None and args.cameras < 1:
+        raise InputError(f"calibrate: --cameras {args.cameras}: at least one camera is needed")
     return FolderOptions(
-        boards=tuple(args.board), square_mm=args.square_mm, model=args.model, timestamps=args.timestamps
+        boards=tuple(args.board),
+        square_mm=args.square_mm,
+        model=args.model,
+        cameras=args.cameras,
+        timestamps=args.timestamps,
     )

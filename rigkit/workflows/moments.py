@@ -28,7 +28,7 @@ def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[ImagesByM
         images = list(images_in(sources))
         return _by_names(names, images) or _in_order(names, images), []
     if len(sources) == 1:
-        found = {name: images_of_camera(own) for name, own in cameras_in(sources).items()}
+        found = {name: images_of_camera(own) for name, own in cameras_in(sources, len(names)).items()}
     else:
         found = {f"{k}": list(images_in([source])) for k, source in enumerate(sources)}
         if {source.name for source in sources} == set(names):

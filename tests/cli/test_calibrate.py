@@ -130,7 +130,7 @@ def test_corners_of_an_earlier_detector_serve_where_the_images_are_gone(
     assert len(found.views) == 5 and found.camera.parameters[2] == pytest.approx(centre, abs=1e-9)
 
 
-def test_linked_images_go_by_their_own_names(session: Path) -> None:
+def test_linked_images_go_by_their_own_names(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As stores of data lay them out: links to files that are named by their checksums."""
     store = session.parent / "store"
     store.mkdir()
@@ -141,6 +141,8 @@ def test_linked_images_go_by_their_own_names(session: Path) -> None:
     assert main(["calibrate", str(session)]) == 0
     views = load_calibration(session.parent / "calibration.json").views
     assert [v.image for v in views] == [f"{k:02d}.jpg" for k in range(5)]
+    printed = capsys.readouterr().err
+    assert "00.jpg' and" in printed and "twice.jpg' are one file, which counts once" in printed
 
 
 def test_bad_input(session: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -40,7 +40,7 @@ def test_one_folder_holds_a_rig(inside: bool, tmp_path: Path) -> None:
         [f"{side}/{k}.png" if inside else f"{side}{k}.png" for side in NAMES] for k in ("01", "02")
     ]
     assert not single
-    with pytest.raises(InputError, match="needs a folder of images for each, got 2"):
+    with pytest.raises(InputError, match="of cameras left, right, not of 3 cameras; give a folder of images for each"):
         moments_of(("left", "right", "top"), [tmp_path])
 
 
@@ -115,6 +115,7 @@ def test_other_names_leave_images_moment_by_moment(names: tuple[str, ...], tmp_p
         ("{}_L", "{}_R", ["l", "r"]),
         ("room [1]_left_{}", "room [1]_right_{}", ["left", "right"]),
         ("mon/left/{}", "tue/left/{}", []),
+        ("image_07/{}", "image_08/{}", ["image_07", "image_08"]),
     ],
 )
 def test_layouts_of_well_known_datasets(first: str, second: str, cameras: list[str], tmp_path: Path) -> None:
@@ -131,6 +132,31 @@ def test_layouts_of_well_known_datasets(first: str, second: str, cameras: list[s
     found = cameras_in([tmp_path])
     assert list(found) == cameras
     assert [sorted(p for folder, one in found[name] for p in folder.glob(one)) for name in cameras] == own
+
+
+def test_as_many_cameras_as_are_known(tmp_path: Path) -> None:
+    """Where their number is known, no word is needed; folders of one image each are moments of one camera."""
+    for k in range(3):
+        _images(tmp_path / "rig" / "linke Kamera", f"{k}")
+        _images(tmp_path / "rig" / "rechte Kamera", f"{k}")
+        _images(tmp_path / "one" / f"image_{k:02d}", "000")
+        _images(tmp_path / "moments" / f"{k}", "A", "B")
+    (tmp_path / "empty").mkdir()
+    assert list(cameras_in([tmp_path / "rig"], 2)) == ["linke Kamera", "rechte Kamera"]
+    assert [[p.name for p in own] for own in moments_of(("l", "r"), [tmp_path / "rig"])[0]] == [
+        [f"{k}.png"] * 2 for k in range(3)
+    ]
+    found = cameras_in([tmp_path / "moments"], 2)
+    assert found == {side: [(tmp_path / "moments" / f"{k}", f"{side}.png") for k in range(3)] for side in "AB"}
+    assert len(cameras_in([tmp_path / "one"], 1)[""]) == 3
+    with pytest.raises(InputError, match="give one folder a camera"):
+        cameras_in([tmp_path / "one"])
+    with pytest.raises(
+        InputError, match=r"of 2 cameras \('linke Kamera', 'rechte Kamera'\) with 3 moments, not of 3 c"
+    ):
+        cameras_in([tmp_path / "rig"], 3)
+    with pytest.raises(InputError, match="has no images"):
+        cameras_in([tmp_path / "empty"], 1)
 
 
 @pytest.mark.parametrize("form", ["{}", "board_{}_"])

@@ -27,7 +27,7 @@ has `images`.
 Images of one moment have the same file name without its ending in every camera's folder (frames = "name"), the same
 number at the end of that name ("number": left07 and right07), or the same place in the sorted list ("order"), or names
 that are times, and nearly the same ("time"). By default it is the time where all names are times (10 digits or more),
-else the first of name and number that two cameras share.
+else the first of name, number, and the parts of path and name that differ within a camera, which two cameras share.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path, PurePath
+from statistics import median
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
@@ -203,8 +204,8 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
     if how == "time":
         return _frames_by_time(images)
     alike = None
-    for key in (how,) if how else ("name", "number"):
-        frames = {name: {image: FRAME_KEYS[key](image) for image in own} for name, own in images.items()}
+    for key in (how,) if how else FRAME_KEYS:
+        frames = {name: dict(zip(own, FRAME_KEYS[key](own), strict=True)) for name, own in images.items()}
         twice = _duplicate_frame(frames)
         known = sorted(frame for own in frames.values() for frame in set(own.values()))
         if twice is None and any(a == b for a, b in pairwise(known)):
@@ -224,8 +225,8 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
 
 
 def _frames_by_time(images: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]:
-    """Return the frames of images whose names are times: each is of the nearest moment of the cameras before, if near.
-    A frame has the name of its first image.
+    """Return the frames of images whose names are times: of each moment of the cameras before, the nearest image, if
+    near. A frame has the name of its first image.
 
     Raises InputError for a name that is no time, or if no two cameras share a moment.
     """
@@ -235,21 +236,17 @@ def _frames_by_time(images: Mapping[str, Sequence[str]]) -> dict[str, dict[str, 
                 raise InputError(f"frames = \"time\": '{image}' of camera '{name}' is not named by a time; rename it")
     times = {name: {image: Decimal(PurePath(image).stem) for image in own} for name, own in images.items()}
     gaps = [b - a for own in times.values() for a, b in pairwise(sorted(own.values()))]
-    near = MAX_PART_OF_GAP * min(gaps, default=Decimal(0))
+    near = MAX_PART_OF_GAP * median(gaps or [Decimal(0)])
     moments: list[Decimal] = []
     called: dict[Decimal, str] = {}
     frames: dict[str, dict[str, str]] = {}
     for name, time_of in times.items():
-        frames[name] = {}
-        known = list(moments)
+        moment_of = _nearest_moments(time_of, moments, near)
         for image, time in time_of.items():
-            place = bisect(known, time)
-            neighbours = [(abs(one - time), one) for one in known[max(place - 1, 0) : place + 1]]
-            gap, moment = min(neighbours, default=(near + 1, time))
-            if gap > near:
-                moment = time
+            if image not in moment_of:
+                moment_of[image] = time
                 insort(moments, time)
-            frames[name][image] = called.setdefault(moment, PurePath(image).stem)
+        frames[name] = {image: called.setdefault(moment_of[image], PurePath(image).stem) for image in time_of}
     if twice := _duplicate_frame(frames):
         raise InputError(f"{twice} are of one time by their names; rename one")
     if sum(map(len, frames.values())) == len(moments):
@@ -260,16 +257,44 @@ def _frames_by_time(images: Mapping[str, Sequence[str]]) -> dict[str, dict[str, 
     return frames
 
 
+def _nearest_moments(time_of: Mapping[str, Decimal], moments: Sequence[Decimal], near: Decimal) -> dict[str, Decimal]:
+    """Return the moment of each image that is the nearest one of its nearest moment (sorted), and not farther than
+    `near`. Of near-copies a moment has one."""
+    found: dict[Decimal, tuple[Decimal, str]] = {}
+    for image, time in time_of.items():
+        place = bisect(moments, time)
+        neighbours = [(abs(one - time), one) for one in moments[max(place - 1, 0) : place + 1]]
+        gap, moment = min(neighbours, default=(near + 1, time))
+        if gap <= near and (moment not in found or gap < found[moment][0]):
+            found[moment] = gap, image
+    return {image: moment for moment, (_, image) in found.items()}
+
+
 TIME = re.compile(r"\d{10,}(\.\d+)?")
 """A name that is a time since 1970: seconds have 10 digits, nanoseconds 19."""
 MAX_PART_OF_GAP = Decimal("0.25")
-"""How far apart times of one moment may be, as part of the shortest gap between two images of a camera. Below a half no
-two images of a camera are of one moment; cameras without a trigger are up to half a frame apart, but images that are
-kept for a calibration are many frames apart."""
+"""How far apart times of one moment may be, as part of the median gap between two images of a camera: cameras without a
+trigger are up to half a frame apart, but images that are kept for a calibration are many frames apart."""
 
-FRAME_KEYS: dict[str, Callable[[str], str]] = {
-    "name": lambda image: PurePath(image).stem,
-    "number": lambda image: last_number(PurePath(image).stem),
+NAME_PART = re.compile(r"\d+|[^\W\d_]+|[\W_]+")
+"""A name is a sequence of numbers, words, and what is between them."""
+
+
+def _parts_that_differ(images: Sequence[str]) -> list[str]:
+    """Return for each image of a camera the parts of its path and name that are not those of all its images: 07 of
+    frame_07/left.png and of img_07_22113.png. Names of different structure are kept whole."""
+    paths = [PurePath(image) for image in images]
+    parts = [[part for name in (*path.parent.parts, path.stem) for part in NAME_PART.findall(name)] for path in paths]
+    if len({len(own) for own in parts}) != 1:
+        return [str(path.with_suffix("")) for path in paths]
+    differ = [k for k, values in enumerate(zip(*parts, strict=True)) if len(set(values)) > 1]
+    return ["_".join(own[k] for k in differ) for own in parts]
+
+
+FRAME_KEYS: dict[str, Callable[[Sequence[str]], list[str]]] = {
+    "name": lambda images: [PurePath(image).stem for image in images],
+    "number": lambda images: [last_number(PurePath(image).stem) for image in images],
+    "part": _parts_that_differ,
 }
 
 

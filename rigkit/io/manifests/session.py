@@ -15,6 +15,7 @@ Sessions of several cameras on one mount have [[cameras]] instead of `images`: s
 from __future__ import annotations
 
 import glob
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +44,8 @@ from rigkit.io.disk.schema_words import (
 )
 from rigkit.io.disk.toml_reader import TomlTable, named_path, read_toml
 from rigkit.io.manifests.truth_file import TRUTH_KEYS, between
+
+_log = logging.getLogger(__name__)
 
 SESSION_SCHEMA = "rigkit.session/1"
 SESSION_NAME = "session.toml"
@@ -175,7 +178,7 @@ def images_of(table: TomlTable) -> tuple[Path, ...]:
     """Return the existing image files that match the patterns of a table."""
     patterns = (table["images"],) if isinstance(table["images"], str) else table["images"]
     found: dict[Path, Path] = {}
-    absent = []
+    absent, again = list[str](), list[tuple[Path, Path]]()
     for pattern in patterns:
         table.path_of(pattern)
         # The root is no pattern: its name may have brackets.
@@ -185,11 +188,16 @@ def images_of(table: TomlTable) -> tuple[Path, ...]:
             matches = [root / pattern]
         for match in filter(is_file_or_broken_link, matches):
             # A file found twice is one image, under its first name.
-            found.setdefault(match.resolve(), named_path(match))
+            first = found.setdefault(match.resolve(), named_path(match))
+            again += [(first, match)] if first != named_path(match) else []
         absent += [pattern] if not matches else []
     # No image at all is valid if the corners are cached; a single pattern without a match is a mistake.
     if found and absent:
         raise table.error(f"'images': nothing matches '{absent[0]}'; correct or remove it")
+    if again:
+        first, other = again[0]
+        more = f", and {len(again) - 1} more like it" if len(again) > 1 else ""
+        _log.warning("'%s' and '%s' are one file, which counts once%s", first, other, more)
     return tuple(found.values())
 
 

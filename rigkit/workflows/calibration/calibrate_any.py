@@ -26,13 +26,14 @@ from rigkit.workflows.calibration.calibrate import (
     session_inputs,
 )
 from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration, calibrate_rig_session, results_of_rig
-from rigkit.workflows.inputs.folder_session import boards_seen, cameras_in, session_of_folders
+from rigkit.workflows.inputs.folder_session import ImagesByCamera, boards_seen, cameras_in, session_of_folders
 from rigkit.workflows.inputs.frames import (
     frames_folder,
     frames_of_videos,
     timestamps_next_to,
     with_frames,
 )
+from rigkit.workflows.inputs.layout_evidence import cameras_by_name, cameras_seen
 from rigkit.workflows.inputs.paths import NamesFiles
 
 _log = logging.getLogger(__name__)
@@ -48,6 +49,8 @@ class FolderOptions(NamesFiles):
     """Side of a square (of a tag, or the spacing of circles); the images show the rest of the board."""
     model: str | None = None
     """Camera model, or "auto"; None means "auto"."""
+    cameras: int | None = None
+    """Number of cameras whose images the folders hold; None: by names and boards."""
     timestamps: Path | None = None
     """File that synchronises several videos; None: timestamps.csv beside them, if it exists."""
 
@@ -126,14 +129,17 @@ def calibrate_folders(
     session = _session_path(places, options.output)
     declared = [*folders, *([folder_options.timestamps] if folder_options.timestamps else [])]
     # Before boards are identified and frames chosen, which takes minutes.
-    names = [folder.name for folder in videos] or list(cameras_in(places))
-    output = options.output or beside_session(session, "rig.json" if len(names) > 1 else "calibration.json")
-    resolved = replace(options, output=output, report=_report_path(options, output))
-    results = results_of_rig(names, resolved) if len(names) > 1 else results_of_camera(resolved)
-    ensure_writable(results, force=options.force, inputs=declared)
+    names = [folder.name for folder in videos] or list(cameras_by_name(places, folder_options.cameras) or ())
+    if names:
+        ensure_writable(_results(names, session, options), force=options.force, inputs=declared)
     boards = _boards(given, folder_options, progress)
     if videos:
         _choose_frames(videos, boards, folder_options.timestamps, progress)
+    cameras: ImagesByCamera | None = None
+    if boards and folder_options.cameras is not None:
+        cameras = cameras_in(places, folder_options.cameras)
+    elif boards:
+        cameras = cameras_seen(places, [board_of_words(words) for words in boards], session, progress)
     wanted = session_of_folders(
         places,
         boards,
@@ -141,8 +147,10 @@ def calibrate_folders(
         model=folder_options.model or "auto",
         output=options.output,
         known=options.known,
+        cameras=cameras,
     )
     new = {path: text for path, text in wanted.files.items() if not _has_content(path, text)}
+    results = _results(list(cameras or ()), session, options)
     ensure_writable([*new, *results], force=options.force, inputs=[*(set(wanted.files) - set(new)), *declared])
     before = {path: read_bytes(path, "session") for path in new if path.exists()}
     write_together(dict(new), force=options.force)
@@ -188,6 +196,13 @@ def _session_path(places: Sequence[Path], output: Path | None) -> Path:
         return usable_path(usable_path(output).with_name(f"{output.stem}-session.toml"))
     place = places[0] if len(places) == 1 else Path(os.path.commonpath([p.absolute() for p in places]))
     return place / SESSION_NAME
+
+
+def _results(cameras: Sequence[str], session: Path, options: CalibrateOptions) -> list[Path]:
+    """Return the files that the calibration of a session's cameras writes."""
+    output = options.output or beside_session(session, "rig.json" if len(cameras) > 1 else "calibration.json")
+    resolved = replace(options, output=output, report=_report_path(options, output))
+    return results_of_rig(cameras, resolved) if len(cameras) > 1 else results_of_camera(resolved)
 
 
 def _report_path(options: CalibrateOptions, output: Path) -> Path | None:

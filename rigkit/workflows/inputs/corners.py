@@ -12,6 +12,7 @@ from pathlib import Path
 from statistics import median
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.result import Calibration
 from rigkit.calibration.views.usable import OTHER_GRIDS, other_size, views_of_image, without_lookalikes
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardDetection, BoardView
@@ -151,13 +152,13 @@ def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Pr
         out = {}
         progress(what, 0, len(names))
 
-        def found_in(name: str) -> FoundCorners | InputError:
+        def found_of(name: str) -> FoundCorners | InputError:
             try:
-                return _found_in(paths[name], session, camera)
+                return found_in(paths[name], session, camera)
             except InputError as error:
                 return error
 
-        for i, (name, found) in enumerate(zip(names, in_threads(found_in, names), strict=True), start=1):
+        for i, (name, found) in enumerate(zip(names, in_threads(found_of, names), strict=True), start=1):
             progress(what, i, len(names))
             if not isinstance(found, InputError):
                 kept.put(name, hashes[name], found, lens)
@@ -219,13 +220,20 @@ def _cached_without_images(session: Session, kept: CornerCache) -> SessionCorner
     return SessionCorners(found=first | through, unreadable={}, source=source)
 
 
-def _found_in(path: Path, session: Session, camera: Camera | None) -> FoundCorners:
+def found_in(path: Path, session: Session, camera: Camera | None = None) -> FoundCorners:
+    """Return the boards in an image, detected with a known `camera`; raises InputError for one that cannot be read."""
     image = read_image(path)
     return FoundCorners((image.shape[1], image.shape[0]), detect_boards(image, session.boards, camera=camera))
 
 
 def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera | None:
     """Return a camera calibrated quickly from `found`; None if that fails: the final calibration reports why."""
+    first = first_calibration(session, found)
+    return None if first is None else first.camera
+
+
+def first_calibration(session: Session, found: Mapping[str, FoundCorners]) -> Calibration | None:
+    """Return a quick calibration from `found`; None if that fails."""
     try:
         corners = SessionCorners(found=found, unreadable={}, source="")
         views, size_px, _ = session_views(session, corners)
@@ -234,7 +242,7 @@ def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera 
         first = calibrate(views, size_px, model=model, degree=session.degree, board="flat", folds=0, pupil="central")
         if session.model == "auto" and first.sigma_px > LOOSE * median(s for v in views for s in v.sigma_px.tolist()):
             first = calibrate(views, size_px, model="auto", board="flat", folds=0, pupil="central")
-        return first.camera
+        return first
     except (InputError, DegenerateError):
         return None
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import glob
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 
 from rigkit.core.errors import InputError
@@ -15,10 +16,12 @@ from rigkit.core.progress import Progress, silent
 from rigkit.io.boards.board_file import board_text
 from rigkit.io.boards.board_words import WORDS_HELP, board_in_words, board_of_words, with_length
 from rigkit.io.disk.toml_reader import relative_path, toml_text
+from rigkit.io.manifests.rig_session import NAME_PART
 from rigkit.io.manifests.session import SESSION_NAME, SESSION_SCHEMA
 from rigkit.io.media.images import folder_of_images, images_below, images_of_folder, no_images, warn_of_unread_formats
 from rigkit.io.media.video import is_video
 from rigkit.workflows.inputs.identify_board import Suggestion, suggestion
+from rigkit.workflows.inputs.layouts import CameraLayout, layouts_of
 
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
 """Common names of a rig's cameras."""
@@ -32,8 +35,13 @@ NAMES = (NAMED_FIRST, NAMED_LAST, NAMED_WITHIN)
 MIN_IN_COMMON = 0.5
 """Fraction of the image names that another camera must have too, apart from the side. Names such as "left_tilted_1" and
 "right_far_1" describe board positions before one camera."""
-SIDE_FOLDER = re.compile(rf"(.*[ _-])?({SIDE}|image[_-]?\d\d|infra(?:red)?[_-]?\d|[lr])", re.IGNORECASE)
+NUMBERED_FOLDER = re.compile(r"(.*[ _-])?image[_-]?\d\d", re.IGNORECASE)
+SIDE_FOLDER = re.compile(
+    rf"(.*[ _-])?({SIDE}|infra(?:red)?[_-]?\d|[lr])|{NUMBERED_FOLDER.pattern.replace('(', '(?:', 1)}", re.IGNORECASE
+)
 """A camera's folder: also KITTI's image_00 and RealSense's infra1."""
+ImagesByCamera = Mapping[str, Sequence[tuple[Path, str]]]
+"""(folder, pattern) pairs of the images of each camera; a single camera is called ""."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +84,7 @@ def session_of_folders(
     model: str = "auto",
     output: Path | None = None,
     known: Known | None = None,
+    cameras: ImagesByCamera | None = None,
 ) -> FolderSession:
     """Return the session, to be written to `path`, of one folder of images, or of one folder for each camera.
 
@@ -89,10 +98,11 @@ def session_of_folders(
     model : camera model of all cameras.
     output : file of the calibration; None: named after the session.
     known : known lenses and rig, of several cameras.
+    cameras : the images of each camera; by default those of `cameras_in`.
     """
     if not boards:
         raise InputError(_missing_board_message(folders))
-    cameras = cameras_in(folders)
+    cameras = cameras or cameras_in(folders)
     for folder in dict.fromkeys(folder for own in cameras.values() for folder, _ in own):
         warn_of_unread_formats(folder)
     place = path.parent
@@ -121,7 +131,7 @@ def session_of_folders(
     return FolderSession(path, files)
 
 
-def _cameras_in_words(cameras: Mapping[str, Sequence[tuple[Path, str]]], place: Path, known: Known) -> list[str]:
+def _cameras_in_words(cameras: ImagesByCamera, place: Path, known: Known) -> list[str]:
     """Return the lines for several cameras of a session in folder `place`."""
     lines = [
         "# Those of one moment have the same name, the same number at its end, or nearly the same time as name.",
@@ -186,7 +196,10 @@ def boards_seen(places: Sequence[Path], side_mm: float, progress: Progress = sil
 def _board_suggestion(places: Sequence[Path], progress: Progress = silent) -> Suggestion:
     if any(is_video(place) for place in places):
         return suggestion(places, progress)
-    entries = [entry for found in cameras_in(places).values() for entry in found]
+    try:
+        entries = [entry for found in cameras_in(places).values() for entry in found]
+    except InputError:
+        entries = cameras_in(places, 1)[""]
     return suggestion(images_of_camera(entries), progress)
 
 
@@ -203,15 +216,71 @@ def _missing_board_message(folders: Sequence[Path]) -> str:
     return f"calibrate: images cannot tell how large squares are; {such}"
 
 
-def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
+def cameras_in(folders: Sequence[Path], count: int | None = None) -> dict[str, list[tuple[Path, str]]]:
     """Return the images of every camera as (folder, pattern), by camera name; a single camera is named "".
 
     Several folders are one camera each. One folder holds several cameras if all its images are named left01, right01
     (or cam0_01, 01_left, left_pose_1, img_L_01), or if it has no images but folders left and right (or cam0, cam1),
-    or mav0/cam0/data and mav0/cam1/data below it.
+    or mav0/cam0/data and mav0/cam1/data below it. With a `count`, the images are those of so many cameras: of one, all
+    images of all folders and below them; of several, by any part of their paths (`layouts_of`).
 
-    Raises InputError for a folder without images, or two folders of the same name.
+    Raises InputError for a folder without images, two folders of the same name, and images that are not of `count`
+    cameras by their names.
     """
+    if count == 1:
+        return {"": [entry for folder in folders for entry in _all_below(folder)]}
+    found: dict[str, list[tuple[Path, str]]] = {}
+    try:
+        found = _by_words(folders)
+        if count in (None, len(found)):
+            return found
+    except InputError:
+        if count is None or len(folders) > 1:
+            raise
+    layouts = layouts_of(images_below(folders[0])) if len(folders) == 1 else []
+    fitting = [layout for layout in layouts if len(layout.cameras) == count]
+    if len(fitting) != 1:
+        read = " or ".join(map(str, layouts)) or (f"cameras {', '.join(found)}" if len(found) > 1 else "one camera")
+        raise InputError(
+            f"by their names the images in '{folders[0]}' are of {read}, not of {count} cameras; give a folder of "
+            "images for each"
+        )
+    return images_of_layout(fitting[0])
+
+
+def images_of_layout(layout: CameraLayout) -> dict[str, list[tuple[Path, str]]]:
+    """Return the images of a layout as `cameras_in` does."""
+    out: dict[str, list[tuple[Path, str]]] = {}
+    for name, own in layout.cameras.items():
+        mine = set(own.values())
+        for folder in dict.fromkeys(image.parent for image in own.values()):
+            inside = images_of_folder(folder)
+            whole = mine.issuperset(inside)
+            patterns = [f"*{suffix}" for suffix in _suffixes(inside)] if whole else _patterns(inside, mine)
+            out.setdefault(name, []).extend((folder, pattern) for pattern in patterns)
+    return out
+
+
+def _patterns(images: Sequence[Path], chosen: Collection[Path]) -> list[str]:
+    """Return patterns of the `chosen` ones of a folder's images: one of the name's part that they share, or names."""
+    names = [path.name for path in images if path in chosen]
+    for part in NAME_PART.findall(Path(names[0]).stem) if len(names) > 1 else ():
+        for pattern in (f"{glob.escape(part)}*{Path(names[0]).suffix}", f"*{glob.escape(part)}{Path(names[0]).suffix}"):
+            if [path.name for path in images if fnmatch(path.name, pattern)] == names:
+                return [pattern]
+    return [glob.escape(name) for name in names]
+
+
+def _all_below(folder: Path) -> list[tuple[Path, str]]:
+    """Return all images of a folder and below it."""
+    places = dict.fromkeys(image.parent for image in images_below(folder))
+    if not places:
+        raise InputError(no_images(folder))
+    return [(place, f"*{suffix}") for place in places for suffix in _suffixes(images_of_folder(place))]
+
+
+def _by_words(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
+    """Return the images of every camera by the words in the names of images or folders."""
     if len(folders) > 1:
         return _folder_for_each_camera(folders)
     folder = folders[0]
@@ -238,7 +307,7 @@ def _cameras_below(folder: Path) -> dict[str, list[tuple[Path, str]]]:
         for k, name in enumerate(parts):
             if SIDE_FOLDER.fullmatch(name) and _images(place):
                 groups.setdefault((parts[:k], parts[k + 1 :]), {})[name] = place
-    depths = {key: len(key[0] + key[1]) for key, own in groups.items() if len(own) > 1}
+    depths = {key: len(key[0] + key[1]) for key, own in groups.items() if len(own) > 1 and _of_cameras(own)}
     nearest = [key for key, depth in depths.items() if depth == min(depths.values())]
     if not nearest:
         only = folder_of_images(folder)
@@ -247,6 +316,13 @@ def _cameras_below(folder: Path) -> dict[str, list[tuple[Path, str]]]:
         raise InputError(no_images(folder))
     rig = groups[nearest[0]]
     return _by_folder({name: rig[name] for name in sorted(rig, key=natural_key)})
+
+
+def _of_cameras(named: Mapping[str, Path]) -> bool:
+    """Return whether folders are those of cameras: image_01 to image_20 with an image or two are moments of one."""
+    return len(named) <= max(len(_images(folder)) for folder in named.values()) or not all(
+        NUMBERED_FOLDER.fullmatch(name) for name in named
+    )
 
 
 def _images(folder: Path) -> list[Path]:

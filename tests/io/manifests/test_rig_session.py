@@ -119,11 +119,28 @@ def test_times_nearly_the_same_are_of_one_moment() -> None:
         frames_of_images({"a": ["left1.png"], "b": ["1700000000.png"]}, "time")
 
 
-def test_images_of_one_name_in_many_folders_are_named() -> None:
-    with pytest.raises(
-        InputError, match=r"'mon/a/img.jpg' and 'tue/a/img.jpg' of camera 'a' are simultaneous by their names"
-    ):
-        frames_of_images({"a": ["mon/a/img.jpg", "tue/a/img.jpg"], "b": ["mon/b/img.jpg", "tue/b/img.jpg"]})
+def test_near_copies_leave_the_moments_of_others_alone() -> None:
+    """The nearest image counts; the other is of no moment of the second camera, whatever the shortest gap is."""
+    times = [1700000000_000000000 + 5_000_000_000 * k for k in range(4)]
+    near_copy = str(times[2] + 1_000_000)
+    first, second = [f"{t}.png" for t in times], [f"{t + 600_000}.png" for t in times]
+    for copied, other in ((first, second), (second, first)):
+        frames = frames_of_images({"a": [*copied, f"{near_copy}.png"], "b": other})
+        shared = [frames["a"][image] for image in copied] == [frames["b"][image] for image in other]
+        taken = frames["a"][f"{near_copy}.png"] in frames["b"].values()
+        # 0.4 ms after the image of the second camera is nearer than 0.6 ms before it.
+        assert (shared, taken) == ((False, True) if copied is first else (True, False))
+        assert len(set(frames["a"].values())) == 5
+
+
+def test_images_of_one_name_in_many_folders_are_told_apart_by_what_differs() -> None:
+    frames = frames_of_images({"a": ["mon/a/img.jpg", "tue/a/img.jpg"], "b": ["tue/b/img.jpg", "wed/b/img.jpg"]})
+    assert frames["a"]["tue/a/img.jpg"] == frames["b"]["tue/b/img.jpg"]
+    assert len({frame for own in frames.values() for frame in own.values()}) == 3
+    numbered = frames_of_images({s: [f"{k}_{s}.jpg" for k in range(3)] for s in ("2211", "2257")})
+    assert numbered["2211"]["1_2211.jpg"] == numbered["2257"]["1_2257.jpg"] == "1"
+    with pytest.raises(InputError, match=r"'mon/a.jpg' and 'tue/a.jpg' of camera 'a' are simultaneous by their names"):
+        frames_of_images({"a": ["mon/a.jpg", "tue/a.jpg"], "b": ["x/b.jpg", "y/b.jpg"]})
 
 
 def test_images_without_a_common_frame_are_named() -> None:

@@ -133,10 +133,10 @@ def mixup_of_all_frames(views: RigViews) -> Finding | None:
     """Return a finding on the mix-up whose correction makes the frames agree, if most disagree; None if there is
     none."""
     names, seen = views.names, views.seen
-    limit = MAX_LEFT_OF_DISTANCE * _typical_px(views)
+    limit = MAX_LEFT_OF_DISTANCE * typical_px(views)
     for k, camera in enumerate(views.cameras):
         for step in STEPS if k else ():
-            if _typical_px(views.with_camera(k, _with_offset(seen, k, step))) <= limit:
+            if typical_px(views.with_camera(k, _with_offset(seen, k, step))) <= limit:
                 return Finding.bad(
                     f"the images of '{names[k]}' belong to {_offset_in_words(step)} in all frames: with that shift the "
                     "cameras agree; an image is missing, or the cameras did not start together",
@@ -144,7 +144,7 @@ def mixup_of_all_frames(views: RigViews) -> Finding | None:
                 )
         for axis in (0, 1):
             mirrored = {key: _mirrored(entry, camera, axis) for key, entry in seen[k].items()}
-            if _typical_px(views.with_camera(k, mirrored)) <= limit:
+            if typical_px(views.with_camera(k, mirrored)) <= limit:
                 # Of two cameras either may be the mirrored one.
                 who = f"'{names[k]}'" if len(seen) > 2 else f"'{names[0]}' or those of '{names[1]}'"
                 return Finding.bad(
@@ -154,7 +154,7 @@ def mixup_of_all_frames(views: RigViews) -> Finding | None:
         turned = _rotated_by_180(seen[k], camera)
         for sides in _frames_better_changed(views, k, turned):
             some = {key: turned[key] if key[0] in sides else entry for key, entry in seen[k].items()}
-            if sides and _typical_px(views.with_camera(k, some)) <= limit:
+            if sides and typical_px(views.with_camera(k, some)) <= limit:
                 return Finding.bad(
                     f"the images of '{names[k]}' are rotated by 180 degrees in {_frames_in_words(_in_order(sides))}, "
                     "or in all others: undoing that makes the cameras agree",
@@ -163,7 +163,7 @@ def mixup_of_all_frames(views: RigViews) -> Finding | None:
     return None
 
 
-def _typical_px(views: RigViews) -> float:
+def typical_px(views: RigViews) -> float:
     """Return the median distance between views, px, with the mounts from `mounts_of`; infinite if there are none."""
     try:
         mounts, _ = mounts_of(views)

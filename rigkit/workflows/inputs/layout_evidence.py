@@ -1,0 +1,153 @@
+"""Whether images are of several cameras on one mount, by the boards in them: between two such cameras the board moves
+in the same way at every moment."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.views.frames import mounts_of
+from rigkit.calibration.rig.views.mispaired import typical_px
+from rigkit.calibration.rig.views.observations import FrameObservations, RigViews, frame_observations
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.core.processes import in_threads
+from rigkit.core.progress import Progress
+from rigkit.geometry.rotation import rotation_angle
+from rigkit.io.corners.corner_cache import FoundCorners
+from rigkit.io.manifests.session import Session
+from rigkit.io.media.images import images_below
+from rigkit.workflows.inputs.corners import (
+    SessionCorners,
+    first_calibration,
+    found_in,
+    named_images,
+    session_views,
+)
+from rigkit.workflows.inputs.folder_session import cameras_in, images_of_layout
+from rigkit.workflows.inputs.layouts import CameraLayout, layouts_of
+
+_log = logging.getLogger(__name__)
+
+MAX_MOMENTS = 12
+"""Number of moments whose images are looked at."""
+TOGETHER = 0.2
+"""Distance between the cameras' views of a board, where one mount fits best, over that with moments exchanged, up to
+which they are of one moment. REAL: 0.001 for the pairs of bouguet-stereo and
+bumblebee2, 0.86 and more for images of one camera, side by side or by halves."""
+MIN_CAMERA_MOTION = 0.02
+"""Motion of boards between two cameras, as a part of their distance; less is a camera that took everything twice."""
+
+
+def cameras_by_name(folders: Sequence[Path], count: int | None = None) -> dict[str, list[tuple[Path, str]]] | None:
+    """Return the images of every camera as `cameras_in` does; None where boards have to decide (`cameras_seen`)."""
+    try:
+        found = cameras_in(folders, count)
+    except InputError:
+        if count is not None or len(folders) > 1:
+            raise
+        return None
+    decided = count is not None or len(folders) > 1 or len(found) > 1
+    return found if decided or not layouts_of(images_below(folders[0])) else None
+
+
+def cameras_seen(
+    folders: Sequence[Path], boards: Sequence[Board], path: Path, progress: Progress
+) -> dict[str, list[tuple[Path, str]]]:
+    """Return the images of every camera as `cameras_in` does; where the structure of names allows several cameras, but
+    no known words say so, boards decide. Raises InputError as `cameras_in`; `path` is that of the session to come."""
+    try:
+        found, doubt = cameras_in(folders), None
+    except InputError as error:
+        found, doubt = {}, error
+    if len(folders) > 1 or len(found) > 1:
+        return found if doubt is None else cameras_in(folders)
+    layouts = layouts_of(images_below(folders[0]))
+    for layout in layouts:
+        if on_one_mount(layout, boards, path, progress):
+            _log.info(f"by names and boards the images are of {layout}; --cameras 1 takes them as one camera's")
+            return images_of_layout(layout)
+    named = " or ".join(f"{layout} (--cameras {len(layout.cameras)})" for layout in layouts)
+    if doubt is not None:
+        shown = f"; by their names the images may be of {named}, but boards do not move alike there" if named else ""
+        raise InputError(f"{doubt}; if all are of one camera: --cameras 1{shown}") from doubt
+    if layouts:
+        _log.info(f"the images may be of {named} by their names; by the boards they are one camera's")
+    return found
+
+
+def on_one_mount(layout: CameraLayout, boards: Sequence[Board], path: Path, progress: Progress) -> bool | None:
+    """Return whether the images of a layout are of cameras on one mount, by up to MAX_MOMENTS moments; None where
+    boards do not tell. `path` is that of the session to come."""
+    at = np.unique(np.linspace(0, len(layout.shared) - 1, MAX_MOMENTS).round().astype(np.int64))
+    moments = [layout.shared[k] for k in at]
+    seen, single = list[FrameObservations](), list[Calibration]()
+    for name, own in layout.cameras.items():
+        images = tuple(own[moment] for moment in moments)
+        session = Session(
+            path=path,
+            images=images,
+            boards=tuple(boards),
+            model="auto",
+            degree=None,
+            board_shape="flat",
+            camera=name,
+        )
+        found = _corners(session, progress)
+        calibration = first_calibration(session, found)
+        if calibration is None:
+            return None
+        views, _, _ = session_views(session, SessionCorners(found=found, unreadable={}, source=""))
+        moment_of = dict(zip(named_images(session), moments, strict=True))
+        seen.append(frame_observations([(moment_of[view.image], view) for view in views], calibration))
+        single.append(calibration)
+    return _move_alike(RigViews(list(layout.cameras), seen, tuple(single), {}))
+
+
+def _corners(session: Session, progress: Progress) -> dict[str, FoundCorners]:
+    """Return the corners of the images that can be read."""
+
+    def corners_of(image: Path) -> FoundCorners | None:
+        try:
+            return found_in(image, session)
+        except InputError:
+            return None
+
+    images, found = named_images(session), {}
+    for k, (name, corners) in enumerate(zip(images, in_threads(corners_of, images.values()), strict=True), start=1):
+        progress(f"first corners of {session.camera}", k, len(images))
+        if corners is not None:
+            found[name] = corners
+    return found
+
+
+def _move_alike(views: RigViews) -> bool | None:
+    """Return whether boards move in the same way between the cameras at all moments; None without enough of them."""
+    try:
+        mounts, _ = mounts_of(views)
+    except InputError:
+        return None
+    together = typical_px(views)
+    others = [typical_px(_later(views, step)) for step in range(1, len({frame for frame, _ in views.seen[0]}))]
+    exchanged = float(np.median([px for px in others if np.isfinite(px)] or [np.inf]))
+    if not np.isfinite(together) or not np.isfinite(exchanged):
+        return None
+    distance = np.median([np.linalg.norm(e.cam_from_board.translation_mm) for e in views.seen[0].values()])
+    moved = [max(rotation_angle(m.rotation), np.linalg.norm(m.translation_mm) / distance) for m in mounts[1:]]
+    return together <= TOGETHER * exchanged and min(moved) > MIN_CAMERA_MOTION
+
+
+def _later(views: RigViews, step: int) -> RigViews:
+    """Return the views with the moments of each camera `step` later than those of the camera before, in a circle."""
+    order = sorted({frame for own in views.seen for frame, _ in own})
+    for k, own in enumerate(views.seen):
+        to = {frame: order[(n + k * step) % len(order)] for n, frame in enumerate(order)}
+        views = views.with_camera(
+            k, {(to[f], b): replace(e, frame=to[f], key=(to[f], e.key[1])) for (f, b), e in own.items()}
+        )
+    return views

@@ -1,0 +1,87 @@
+"""Names without known words: boards decide whether images are of one camera or of a rig."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rigkit.core.errors import InputError
+from rigkit.core.progress import silent
+from rigkit.io.boards.board_words import board_of_words
+from rigkit.io.manifests.rig_session import frames_of_images, load_rig_session
+from rigkit.workflows.calibration.calibrate import CalibrateOptions
+from rigkit.workflows.calibration.calibrate_any import FolderOptions, calibrate_sources
+from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration
+from rigkit.workflows.inputs.corners import named_images
+from rigkit.workflows.inputs.folder_session import session_of_folders
+from rigkit.workflows.inputs.layout_evidence import cameras_seen
+from tests.helpers.stereo_pictures import FRAMES
+
+BOARD = board_of_words("9x6x30")
+
+
+def arranged(pictures: Path, folder: Path, form: str, sides: tuple[str, str]) -> Path:
+    """Images of both cameras under new names."""
+    for side, name in zip(("left", "right"), sides, strict=True):
+        for k, path in enumerate(sorted(pictures.glob(f"{side}*.jpg"))):
+            target = folder / form.format(k=k, side=name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, target)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("form", "sides"),
+    [
+        ("{side}/img_{k}.jpg", ("linke Kamera", "rechte Kamera")),
+        ("frame{k:02d}_{side}.jpg", ("A", "B")),
+        ("frame_{k:04d}/{side}.jpg", ("left", "right")),
+        ("{k}_{side}.jpg", ("2211", "2257")),
+    ],
+)
+def test_boards_that_move_alike_make_a_rig(pictures: Path, tmp_path: Path, form: str, sides: tuple[str, str]) -> None:
+    folder = arranged(pictures, tmp_path / "photos", form, sides)
+    cameras = cameras_seen([folder], [BOARD], folder / "session.toml", silent)
+    for path, text in session_of_folders([folder], ["9x6x30"], folder / "session.toml", cameras=cameras).files.items():
+        path.write_text(text)
+    session = load_rig_session(folder / "session.toml")
+    assert list(session.cameras) == list(sides)
+    assert [len(own.images) for own in session.cameras.values()] == [FRAMES, FRAMES]
+    frames = frames_of_images({name: list(named_images(own)) for name, own in session.cameras.items()})
+    one, other = (list(own.values()) for own in frames.values())
+    assert one == other and len(set(one)) == FRAMES
+
+
+def test_the_command_calibrates_a_folder_for_each_moment(pictures: Path, tmp_path: Path) -> None:
+    folder = arranged(pictures, tmp_path / "photos", "frame_{k:04d}/{side}.jpg", ("1", "2"))
+    options = FolderOptions(boards=("9x6x30",), model="brown")
+    done = calibrate_sources([folder], options, CalibrateOptions())
+    assert isinstance(done, RigSessionCalibration)
+    assert done.rig.baseline_mm("1", "2")[0] == pytest.approx(90.0, abs=0.5)
+    with pytest.raises(InputError, match="not of 3 cameras"):
+        calibrate_sources([folder], replace(options, cameras=3), CalibrateOptions(force=True))
+
+
+@pytest.mark.parametrize("form", ["{side}/{k}.jpg", "{k}/{side}.jpg", "{side}_{k}.jpg"])
+def test_boards_of_one_camera_do_not(pictures: Path, tmp_path: Path, form: str) -> None:
+    """Images of one camera in two folders, in one for each place, or under two names."""
+    folder = tmp_path / "photos"
+    for k, path in enumerate(sorted(pictures.glob("left*.jpg"))[:6]):
+        target = folder / form.format(k=k // 2, side=("day1", "day2")[k % 2])
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, target)
+    if form == "{side}_{k}.jpg":
+        assert list(cameras_seen([folder], [BOARD], folder / "session.toml", silent)) == [""]
+        return
+    with pytest.raises(InputError, match=r"--cameras 1; .* 2 cameras .*\(--cameras 2\), but boards do not move alike"):
+        cameras_seen([folder], [BOARD], folder / "session.toml", silent)
+
+
+def test_an_image_taken_twice_is_of_one_camera(pictures: Path, tmp_path: Path) -> None:
+    for k, path in enumerate(sorted(pictures.glob("left*.jpg"))):
+        for side in "ab":
+            shutil.copy(path, tmp_path / f"{k}{side}.jpg")
+    assert list(cameras_seen([tmp_path], [BOARD], tmp_path / "session.toml", silent)) == [""]
