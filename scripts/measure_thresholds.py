@@ -47,10 +47,8 @@ from scipy.optimize import minimize
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.checks.border import ends_quietly
 from rigkit.detection.checks.evidence import (
-    MIN_BLUR,
-    MIN_EXCESS_RESIDUAL,
     MIN_EXPECTED_CORNERS,
-    MIN_SPACING_CHANGE,
+    MIN_MEASURE,
     OF_EXPECTED_SIZE,
     OFFSET,
     SCORE,
@@ -119,10 +117,10 @@ class Candidate:
         return [
             float(np.log(sigma_cells)),
             float(np.log(scatter)),
-            float(np.log(max(excess_residual, MIN_EXCESS_RESIDUAL))),
-            float(np.log(max(change, MIN_SPACING_CHANGE))),
+            float(np.log(max(excess_residual, MIN_MEASURE))),
+            float(np.log(max(change, MIN_MEASURE))),
             float(np.log(raggedness)),
-            float(np.log(max(blur, MIN_BLUR))),
+            float(np.log(max(blur, MIN_MEASURE))),
         ]
 
 

@@ -15,12 +15,10 @@ from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import grey_image
+from rigkit.detection.saddles.saddle import SAME_CORNER_PX
 from rigkit.detection.targets.base import Search
 from rigkit.detection.targets.registry import FINDERS, check_searchable
 from rigkit.kernels.front import near_any
-
-SAME_CORNER_PX = 2.0
-"""Corners of two detections closer than this are the same corner."""
 
 
 def detect_boards(

@@ -6,16 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import upper_median
-from rigkit.detection.checks.evidence import Evidence
+from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS, Evidence
 from rigkit.detection.lattices import Seen, candidates
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import grey_image
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.subpixel import refine
-
-MIN_DOUBTFUL_CORNERS = 20
-"""Corners of the smallest grid that is reported; smaller ones occur by chance."""
 
 MIN_DOUBTFUL_SCORE = -7.0
 """Smallest evidence score of a grid that is reported. Boards with squares of under 6 px have scores down to -6.5."""
@@ -28,8 +25,8 @@ sigma: they decide which cause is reported."""
 def doubtful_grid(image: NDArray[np.generic]) -> str | None:
     """Return a message on the largest rejected grid of `image` that may be a board; None if there is none."""
     grey = without_bad_pixels(without_mosaic(grey_image(image)))
-    fitted = refine(grey, candidates(Seen.of(grey), MIN_DOUBTFUL_CORNERS, lambda *_: True))
-    large = (item for item in fitted if item.lattice.count >= MIN_DOUBTFUL_CORNERS)
+    fitted = refine(grey, candidates(Seen.of(grey), MIN_EXPECTED_CORNERS, lambda *_: True))
+    large = (item for item in fitted if item.lattice.count >= MIN_EXPECTED_CORNERS)
     seen = [item for item in large if Evidence.of(item).score > MIN_DOUBTFUL_SCORE]
     if not seen:
         return None

@@ -26,7 +26,7 @@ from rigkit.detection.checks.validate import (
     trustworthy,
 )
 from rigkit.detection.lattice.grow import MAX_FAILED_GROWTHS, grow_all
-from rigkit.detection.lattice.lattice import Lattice, build_lattices
+from rigkit.detection.lattice.lattice import MIN_ROWS, Lattice, build_lattices
 from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
@@ -43,8 +43,7 @@ IsPlausible = Callable[[GreyImage, Level, Lattice], bool]
 MIN_PART_CORNERS = 6
 """Corners of the smallest part of a partly covered board."""
 
-MIN_BOARD_CORNERS = 9
-"""Corners of the smallest board, 3 x 3: smaller lattices are often something else."""
+MIN_BOARD_CORNERS = MIN_ROWS**2
 
 Vouched = Callable[[GreyImage, Lattice], bool]
 """Returns whether markers in the squares of a lattice prove that it is a board."""

@@ -16,6 +16,7 @@ from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
 from rigkit.core.processes import in_threads
 from rigkit.core.progress import Progress, silent
+from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS
 from rigkit.detection.circles.unknown import CircleObservations, guessed_circles
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.mosaic import without_mosaic
@@ -25,7 +26,6 @@ from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, GuessedGrid, TagObser
 from rigkit.detection.whole_charuco import next_row, of_pattern
 from rigkit.detection.whole_grids import (
     MIN_IMAGES_OF_GUESS,
-    MIN_SURE_CORNERS,
     GridSeen,
     Size,
     board_size_in,
@@ -179,7 +179,7 @@ def _of_grids(grids: Sequence[GuessedGrid]) -> BoardGuess:
 
 def _without_marks(image: GreyImage, found: BoardDetection) -> bool:
     """Return whether a lattice is certainly a chessboard: large, with empty squares."""
-    if len(found.grid) < MIN_SURE_CORNERS:
+    if len(found.grid) < MIN_EXPECTED_CORNERS:
         return False
     pixels = found.lattice()
     v, u = WITHIN_SQUARES[:, None, None, None, None], WITHIN_SQUARES[None, :, None, None, None]

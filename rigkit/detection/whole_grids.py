@@ -10,6 +10,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardDetection
+from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS
 from rigkit.detection.saddles.response import GreyImage, sample
 
 MIN_SHARE_OF_LINE = 0.5
@@ -17,9 +18,6 @@ MIN_SHARE_OF_LINE = 0.5
 
 MIN_SHARE_OF_GRID = 0.8
 """Smallest share of known corners of a grid; others may be two boards in one. Markers in squares hide few corners."""
-
-MIN_SURE_CORNERS = 20
-"""Smallest number of corners of a lattice that does not occur by chance."""
 
 UNSEEN_BORDER_PX = 5.0
 """Distance from the image border within which corners may be missed (sharp ones are found from 3 px on)."""
@@ -87,7 +85,9 @@ class GridSeen:
 
 def grid_seen(found: BoardDetection, image: GreyImage) -> GridSeen | None:
     """Return the extent of a grid in an image; None if too few of its corners are known."""
-    if not found.complete and len(found.grid) < max(MIN_SURE_CORNERS, MIN_SHARE_OF_GRID * found.columns * found.rows):
+    if not found.complete and len(found.grid) < max(
+        MIN_EXPECTED_CORNERS, MIN_SHARE_OF_GRID * found.columns * found.rows
+    ):
         return None
     lattice = found.lattice()
     borders = np.array(image.shape[::-1]) - 1.0

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+from types import ModuleType
+
 import measure_constants
 import numpy as np
 import pytest
@@ -9,21 +13,34 @@ from measure_constants import Found, Look, changed, constants_of, effect, margin
 
 from rigkit.detection import doubtful
 from rigkit.detection.checks import discontinuity, evidence, validate
-from rigkit.detection.subpixel import edge_fit, whole_board
+from rigkit.detection.subpixel import edge_fit
 
 
 def test_a_constant_is_changed_wherever_it_is_used_and_comes_back() -> None:
     names = constants_of(evidence)
-    assert "OFFSET" in names and "SCORE" not in names and "MIN_BLUR" in names
+    assert "OFFSET" in names and "SCORE" not in names and {"OF_EXPECTED_SIZE", "MIN_EXPECTED_CORNERS"} <= set(names)
     users = [module for module in (evidence, doubtful) if hasattr(module, "OFFSET")]
     before = evidence.OFFSET
     with changed(evidence, "OFFSET", 2.0) as differs:
         assert differs and all(2.0 * before == module.OFFSET for module in users)
     assert all(before == module.OFFSET for module in users)
-    # Equal small integers are one object, and two constants of one name may be equal.
-    own = whole_board.MIN_ROWS
-    with changed(validate, "MIN_ROWS", 2.0):
-        assert own == validate.MIN_ROWS // 2 == whole_board.MIN_ROWS
+
+
+def test_a_constant_of_another_module_with_the_same_name_and_number_is_not_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Equal small integers are one object.
+    modules = []
+    for name in ("one", "two"):
+        file = tmp_path / f"{name}.py"
+        file.write_text("FEWEST = 3\n")
+        module = ModuleType(name)
+        module.__dict__.update(FEWEST=3, __file__=str(file))
+        monkeypatch.setitem(sys.modules, f"rigkit.detection.{name}", module)
+        modules.append(module)
+    with changed(modules[0], "FEWEST", 2.0):
+        assert [vars(module)["FEWEST"] for module in modules] == [6, 3]
+    assert [vars(module)["FEWEST"] for module in modules] == [3, 3]
 
 
 def test_numbers_in_tuples_are_constants_too() -> None:

@@ -17,16 +17,16 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, known_median
 from rigkit.detection.lattice.lattice import Lattice
-from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
+from rigkit.detection.lattice.local_fit import FLEXIBLE, MIN_PREDICTORS, LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.subpixel.refined import RefinedLattice
 
 MIN_CELL_PX = 6.0
 """Smallest side of a square that is evaluated: within smaller ones blur hides the brightness."""
 
-MIN_SUPPORT, MAX_BORDER_GAIN = 6, 12.0
-"""Smallest number of corners of a prediction, and its largest standard deviation for corners of standard deviation 1:
-for a few hundredths of a pixel this is less than a tenth of a square."""
+MAX_BORDER_GAIN = 12.0
+"""Largest standard deviation of a prediction for corners of standard deviation 1: for a few hundredths of a pixel this
+is less than a tenth of a square."""
 
 WITHIN = np.array([-0.2, 0.0, 0.2])
 """Positions along the row at which a square is sampled, from its middle, in squares."""
@@ -235,7 +235,7 @@ class _Squares:
         # The square between two columns is bright if brightness falls with the angle (downwards) across its lower edge.
         bright = wide.signs()[2, 1:-2] < 0.0
         known = wide.known[2, 1:-1]
-        shape = fit_cells(wide.pixels, cells, degree=3, ridge=(1e-3, 1e-2))
+        shape = fit_cells(wide.pixels, cells, **FLEXIBLE._asdict())
         return cls(bright, known[:-1] | known[1:], shape)
 
     def at(self, up: FloatArray, lateral: FloatArray) -> FloatArray:
@@ -259,7 +259,7 @@ class _Squares:
         """Return which squares (M,) are large enough and well predicted, and in the image with the paper beyond."""
         sound = (self.shape.gain < MAX_BORDER_GAIN) & (self.shape.shorter_px() > MIN_CELL_PX)
         inside = self.inside(image, 1.0, 0.5) & self.inside(image, float(BEYOND[-1]), 0.5)
-        return np.asarray(inside & self.near & self.supported(MIN_SUPPORT) & self._of_squares(sound))
+        return np.asarray(inside & self.near & self.supported(MIN_PREDICTORS) & self._of_squares(sound))
 
     def inside(self, image: GreyImage, up: float, lateral: float) -> BoolArray:
         """Return which squares (M,) are in the image at `up` squares beyond the row, to `lateral` on both sides."""

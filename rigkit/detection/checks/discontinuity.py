@@ -124,8 +124,8 @@ def _tested(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[
     outlying, in_place = np.zeros((2, *suspect.shape), np.bool_)
     outlying[suspect] = True
     # Outliers of both predictions.
-    for degree, ridge in (STIFF, FLEXIBLE):
-        shape = fit_cells(pixels, suspect, degree=degree, ridge=ridge)
+    for how in (STIFF, FLEXIBLE):
+        shape = fit_cells(pixels, suspect, **how._asdict())
         off = np.hypot(*(shape.pixels - item.lattice.pixels[suspect]).T)
         good = expected * np.hypot(1.0, shape.gain) * shape.cell_px()
         judged = shape.support >= MIN_NEIGHBOURS_FIT

@@ -19,8 +19,9 @@ from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.lattice.spacing import spacing_changes
 from rigkit.detection.subpixel.refined import RefinedLattice
 
-MIN_EXCESS_RESIDUAL, MIN_SPACING_CHANGE, MIN_BLUR = 0.03, 0.03, 0.03
-"""Lower bounds of measures: smaller values are common to all sharp frontal boards and are no further evidence."""
+MIN_MEASURE = 0.03
+"""Lower bound of the excess residual, the change of spacing and the blur: smaller values are common to all sharp
+frontal boards and are no further evidence."""
 
 SCORE = {
     "sigma_cells": -3.2,
@@ -68,7 +69,7 @@ class Evidence(NamedTuple):
     excess_residual: float
     spacing_change: float
     raggedness: float = 1.0
-    blur_cells: float = MIN_BLUR
+    blur_cells: float = MIN_MEASURE
 
     @classmethod
     def of(cls, refined: RefinedLattice) -> Evidence:
@@ -96,9 +97,9 @@ class Evidence(NamedTuple):
         measures = {
             "sigma_cells": max(self.sigma_cells, 1e-9),
             "scatter": self.scatter,
-            "excess_residual": max(self.excess_residual, MIN_EXCESS_RESIDUAL),
-            "spacing_change": max(self.spacing_change, MIN_SPACING_CHANGE),
+            "excess_residual": max(self.excess_residual, MIN_MEASURE),
+            "spacing_change": max(self.spacing_change, MIN_MEASURE),
             "raggedness": self.raggedness,
-            "blur_cells": max(self.blur_cells, MIN_BLUR),
+            "blur_cells": max(self.blur_cells, MIN_MEASURE),
         }
         return OFFSET + sum(weight * math.log(measures[name]) for name, weight in SCORE.items())

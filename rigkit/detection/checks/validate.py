@@ -9,9 +9,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.checks.evidence import Evidence
-from rigkit.detection.lattice.lattice import MANY, Lattice
-from rigkit.detection.lattice.local_fit import STIFF, fit_cells
+from rigkit.detection.lattice.lattice import MANY, MIN_ROWS, Lattice
+from rigkit.detection.lattice.local_fit import MIN_PREDICTING, STIFF, fit_cells
 from rigkit.detection.saddles.response import Level
+from rigkit.detection.saddles.saddle import SAME_CORNER_PX
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.kernels import lattice as native
 from rigkit.kernels.front import near_any
@@ -21,9 +22,6 @@ STRAY_ROW = 2
 
 FRAME_CELLS = 0.5
 """Corners predicted closer than this to the image border, in cells, may be missing."""
-
-SHARED_PX = 2.0
-"""Corners of two lattices closer than this are the same."""
 
 MAX_SHARED = 0.25
 """Largest share of a lattice's corners that belong to larger ones too: those of a lattice grown across a discontinuity
@@ -35,9 +33,6 @@ MAX_LOST = 0.4
 LARGE_SAMPLE, SAMPLE, RAGGED = 7, 5, 0.75
 """Rows and columns of the sample of a lattice with many corners, of that of a ragged lattice, and the share of corners
 in rows times columns below which a lattice is ragged."""
-
-MIN_ROWS = 3
-"""Rows and columns of the smallest board."""
 
 STEPS_ACROSS, MAX_EDGES = 16, 256
 """Samples across an edge between two corners, and the largest number of edges, by which edge offsets are measured."""
@@ -52,9 +47,9 @@ WIDE_STRIPE, OFFSET_PARTS, MAX_SHIFT, MAX_BOW = 0.25, (0.2, 0.5, 0.8), 0.1, 0.04
 ink, thin print and saturation shift edges by up to 0.08, equally along their length. Rounded corners bow them by 0.01;
 threads shift by 0.15, dots by 0.08 to 0.2, and bow as much."""
 
-RARELY_BY_CHANCE, NEARLY_FULL, BY_CHANCE = 24, 0.9, 24
-"""A lattice is compact if it has at least RARELY_BY_CHANCE corners, or a share of NEARLY_FULL of its rows times
-columns, or a full block of BY_CHANCE squares. Codes and mosaics have such blocks in hardly one of 2^23 places, and one
+NEARLY_FULL, BY_CHANCE = 0.9, 24
+"""A lattice is compact if it has at least BY_CHANCE corners, or a share of NEARLY_FULL of its rows times columns, or a
+full block of BY_CHANCE squares. Codes and mosaics have such blocks in hardly one of 2^23 places, and one
 crooked chain of 24 corners in 126 pages."""
 
 MAX_EXTRA = 2
@@ -90,11 +85,11 @@ def stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
         row[outer] = True
         rest = lattice.without(row)
         missing = row & ~known
-        shape = fit_cells(rest.pixels, missing, radius=3, degree=STIFF.degree, ridge=STIFF.ridge)
+        shape = fit_cells(rest.pixels, missing, radius=3, **STIFF._asdict())
         side = np.abs(shape.along_column) + np.abs(shape.along_row)
         margin = FRAME_CELLS * side
         inside = (shape.pixels > margin) & (shape.pixels < np.array(size_px) - 1.0 - margin)
-        if have < int((inside.all(axis=1) & (shape.support >= 3)).sum()):
+        if have < int((inside.all(axis=1) & (shape.support >= MIN_PREDICTING)).sum()):
             return row
     return None
 
@@ -114,14 +109,14 @@ def separate(lattices: Sequence[Lattice], min_corners: int) -> list[Lattice]:
     if len(candidates) < 2:
         return candidates
     corners = [item.pixels[item.known] for item in candidates]
-    low = np.array([mine.min(axis=0) for mine in corners]) - SHARED_PX
+    low = np.array([mine.min(axis=0) for mine in corners]) - SAME_CORNER_PX
     high = np.array([mine.max(axis=0) for mine in corners])
     kept: list[Lattice] = []
     for k, (item, mine) in enumerate(zip(candidates, corners, strict=True)):
         touching = ((low[:k] < high[k]) & (low[k] < high[:k])).all(axis=1)
         shared = np.zeros(len(mine), np.bool_)
         for other in np.flatnonzero(touching):
-            again = near_any(mine, corners[other], SHARED_PX)
+            again = near_any(mine, corners[other], SAME_CORNER_PX)
             # A single corner may belong to both: two boards that touch there.
             if np.count_nonzero(again) > 1:
                 shared |= again
@@ -183,7 +178,7 @@ def compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:
     covered, or cut by the image border, full blocks remain.
     """
     known = lattice.known
-    if lattice.count >= RARELY_BY_CHANCE or known.mean() >= NEARLY_FULL:
+    if lattice.count >= BY_CHANCE or known.mean() >= NEARLY_FULL:
         return True
     missing = fit_cells(lattice.pixels, ~known, degree=1)
     full = known.copy()

@@ -16,9 +16,6 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.detection.circles.fit import MODEL_SIGMA_PX, CircleFit
 from rigkit.detection.circles.local_map import MIN_SMOOTH
 
-MAP_ERROR = 1.0
-"""Error of a centre relative to that of its circle's size times the radius in distances of neighbours: (n - 1) / 4 for
-n = 5, the first order that the polynomial (`local_map`) lacks."""
 ODD_BY_NOISE = 3.8
 """Ratio of the sum of squares of three changes of shape to its expectation that noise exceeds for 1 % of circles."""
 WAVY_BY_NOISE = 2.5
@@ -34,7 +31,8 @@ def centre_sigmas(fit: CircleFit, label: IntArray, slope_gain: FloatArray | floa
     circle's size and slant, beyond this and beyond those common to all (motion stretches all circles), are an error of
     the map's first derivatives. At the rim, where it is not small, the map is extrapolated: if its polynomial lacks a
     term of order n in the distance t, the ratio of second to first derivatives is (n - 1) / t. A quarter of that, times
-    the radius, shifts the centre. Irregularities of an edge (dirt, a finger, print) shift it as much.
+    the radius, shifts the centre: by the error of the size times the radius for n = 5, the first order that it lacks.
+    Irregularities of an edge (dirt, a finger, print) shift it as much.
 
     Parameters
     ----------
@@ -50,7 +48,7 @@ def centre_sigmas(fit: CircleFit, label: IntArray, slope_gain: FloatArray | floa
     misshapen = np.maximum(odd.sum(axis=1) - ODD_BY_NOISE * more * typical.sum(axis=1), 0.0)
     wavy = (_without_smooth_part(fit.harmonics.reshape(len(label), -1), label) ** 2).mean(axis=1)
     uneven = np.maximum(wavy - WAVY_BY_NOISE * more * relative**2, 0.0)
-    return np.asarray(np.sqrt(more * fit.sigma_px**2 + ((MAP_ERROR * radius) ** 2 * misshapen + uneven) * size_px**2))
+    return np.asarray(np.sqrt(more * fit.sigma_px**2 + (radius**2 * misshapen + uneven) * size_px**2))
 
 
 def _variance_over_white(slants: FloatArray) -> float:

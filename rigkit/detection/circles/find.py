@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from rigkit.detection.circles.lattices import LabelledBlobs
 
 FIRST_EDGE_BLUR = 0.8
-MIN_CIRCLES, MIN_SIDE = 9, 3
-"""Smallest number of circles and of rows and columns: smaller lattices are too often no grids."""
+MIN_SIDE = 3
+"""Smallest number of rows and columns: smaller lattices are too often no grids."""
+MIN_CIRCLES = MIN_SIDE**2
 FIRST_SIGMA_PX = 0.1
 """Standard deviation of the centroids of blobs."""
 MAX_CIRCLE_GROWTH = 0.25
@@ -53,8 +54,6 @@ FIRST_TOLERANCE = 2.0
 MIN_UNEVEN, MAX_UNEVEN = 0.1, 0.9
 """Smallest applied change and largest value of the blur's anisotropy, relative to its variance. Smaller changes do not
 move centres (REAL, hexagonal: within 0.0003 px); the largest is a blur four times as wide one way as across."""
-MAX_NEW_RINGS = 40
-"""Largest number of rings of circles by which a grid grows."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -180,10 +179,7 @@ def _mixed(grey: GreyImage, draft: _Draft) -> _Draft:
 
 def _with_all(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
     """Return the draft extended by rings of circles without blobs; `beside`: with the light of neighbours."""
-    for _ in range(MAX_NEW_RINGS):
-        grown = _larger(grey, draft, beside=beside) if _enough(draft) else None
-        if grown is None:
-            break
+    while _enough(draft) and (grown := _larger(grey, draft, beside=beside)) is not None:
         draft = grown
     return draft
 

@@ -26,13 +26,12 @@ from rigkit.detection.circles.find import (
 from rigkit.detection.circles.fit import CircleFit, edge_reach, fit_circles
 from rigkit.detection.circles.local_map import NEXT
 from rigkit.detection.circles.rows import rows_of
+from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.circles import BESIDE
 
-MIN_POSE_CIRCLES = 12
-"""Smallest number of circles from which the pose of a board is estimated."""
 MISSED_DISTANCES = 0.1
 """Largest median residual of the board's pose for the camera that took the image, in distances of neighbours."""
 
@@ -83,7 +82,7 @@ def seen_through(
 
 def _pose(placed: BoardDetection, board: Board, camera: Camera) -> Rigid3 | None:
     rays, valid = camera.unproject(placed.pixels)
-    if valid.sum() < MIN_POSE_CIRCLES:
+    if valid.sum() < MIN_GUIDE_CORNERS:
         return None
     try:
         return board_pose(rays[valid], board.points(placed.grid[valid])).cam_from_board

@@ -10,12 +10,9 @@ import numpy as np
 
 from rigkit.core.boards import Board
 from rigkit.core.patterns.circles import NEIGHBOUR_DISTANCES, STAGGERS, Circles
-from rigkit.detection.circles.find import CircleGrid, find_grids
+from rigkit.detection.circles.find import MIN_SIDE, CircleGrid, find_grids
 from rigkit.detection.circles.place import may_be_part, placed_on
 from rigkit.detection.saddles.response import GreyImage
-
-MIN_SIDE_CIRCLES = 3
-"""Number of rows and columns of the smallest grid that is recognised."""
 
 
 @dataclass(eq=False, slots=True)
@@ -52,7 +49,7 @@ class CircleObservations:
 def _kinds(grid: CircleGrid) -> Iterator[tuple[str, int, int, str, bool]]:
     """Yield layout, columns, rows, stagger and polarity of the boards with as many circles."""
     count = len(grid)
-    for rows in range(MIN_SIDE_CIRCLES, count // MIN_SIDE_CIRCLES + 1):
+    for rows in range(MIN_SIDE, count // MIN_SIDE + 1):
         if count % rows:
             continue
         columns = count // rows

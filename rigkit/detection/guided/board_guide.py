@@ -15,7 +15,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, known_median
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
-from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
+from rigkit.detection.lattice.local_fit import FLEXIBLE, MIN_PREDICTORS, LocalFit, fit_cells
 from rigkit.detection.stencil import STENCIL, by_differences
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.geometry.board_pose import board_poses, ray_residuals
@@ -26,7 +26,7 @@ HALF_STEP = 0.4
 """Step, in squares, of the differences of the projection: about the size of the window."""
 
 MIN_GUIDE_CORNERS = 12
-"""Smallest number of detected corners of a board for predictions."""
+"""Smallest number of detected corners of a board for its pose, and for predictions."""
 
 MAX_GUIDE_GAIN = 4.0
 """Largest standard deviation of a prediction from neighbouring corners of standard deviation 1."""
@@ -142,9 +142,9 @@ class Guide:
     def at(self, state: BoardState, cells: BoolArray) -> tuple[LocalFit, BoolArray]:
         """Return the local geometry at the M `cells` (R, C), and which of them are predicted well enough."""
         if self.camera is None or self.cam_from_board is None:
-            shape = fit_cells(state.pixels, cells, degree=3, ridge=(1e-3, 1e-2), leave_out=True)
+            shape = fit_cells(state.pixels, cells, **FLEXIBLE._asdict(), leave_out=True)
             adjacent = cv2.dilate(state.known.astype(np.uint8), CROSS)[cells] > 0
-            return shape, np.asarray(adjacent & (shape.support >= 6) & (shape.gain < MAX_GUIDE_GAIN))
+            return shape, np.asarray(adjacent & (shape.support >= MIN_PREDICTORS) & (shape.gain < MAX_GUIDE_GAIN))
         shape, valid = self._projected(self.camera, self.cam_from_board, cells)
         sound = state.known & (state.sigma_px < MAX_RESIDUAL_RATIO * state.typical_sigma)
         if sound.any():
@@ -152,8 +152,8 @@ class Guide:
             every = self._projected(self.camera, self.cam_from_board, sound)[0].pixels
             left = np.full(state.pixels.shape, np.nan)
             left[sound] = state.pixels[sound] - every
-            rest = fit_cells(left, cells, degree=1, ridge=(1e-3, 1e-2), leave_out=True)
-            near = ((rest.support >= 6) & (rest.gain < 1.0))[:, None]
+            rest = fit_cells(left, cells, degree=1, leave_out=True)
+            near = ((rest.support >= MIN_PREDICTORS) & (rest.gain < 1.0))[:, None]
             gain = np.where(near[:, 0], np.hypot(1.0, rest.gain), 1.0)
             shape = replace(shape, pixels=shape.pixels + np.where(near, rest.pixels, 0.0), gain=gain)
         return shape, valid

@@ -26,25 +26,19 @@ from rigkit.detection.guided.corner_fit import RADIUS_PX, fit_corners
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, grey_image
+from rigkit.detection.subpixel.consistent import MOVED_CELLS
 from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
+from rigkit.detection.subpixel.subpixel import FIRST_BLUR
 from rigkit.detection.subpixel.uncertain_corners import IN_PLACE_CELLS, UNCERTAIN_FACTOR, strays
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
-START_BLUR_PX = 1.0
-"""Initial s of the first fit of the detected corners, px."""
-
 WIDE_BLUR_CELLS = 0.05
 """Initial s of the first fit of a missing corner, in sides of the cell: about the error of predictions."""
-
-MAX_GUIDE_ROUNDS = 40
-"""Largest number of rounds of adding, without a camera one ring of corners each: more than any board has rows or
-columns.
-"""
 
 MIN_SIDE_PX = 4.0
 """Smallest side of a cell in which a corner is distinguishable from noise."""
@@ -52,10 +46,8 @@ MIN_SIDE_PX = 4.0
 MARGIN_PX = 1.5
 """Smallest distance of an added corner from the image border."""
 
-MOVED_CELLS = 0.12
-MOVED_FACTOR = 8.0
-MOVED_PX = 0.3
-"""Largest distance of an added corner from its prediction: in sides of its cell; with a camera also MOVED_FACTOR times
+MOVED_FACTOR, MOVED_PX = 8.0, 0.3
+"""Largest distance of an added corner from its prediction with a camera, if less than MOVED_CELLS: MOVED_FACTOR times
 the median distance of the known corners, but at least MOVED_PX."""
 
 OUTLIER_GUIDE_FACTOR = 5.0
@@ -136,11 +128,7 @@ def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Ca
     if guide.camera is not None:
         state = _tested(image, guide, state)
     before = state
-    for _ in range(MAX_GUIDE_ROUNDS):
-        guide = guide.by(state)
-        more = _added(image, guide, state)
-        if more is None:
-            break
+    while (more := _added(image, guide := guide.by(state), state)) is not None:
         state = more
     if guide.camera is None:
         return found if state is before else _with_added(image, guide, found, opened, state)
@@ -231,7 +219,7 @@ def _opened(image: GreyImage, found: BoardDetection, board: Board) -> BoardState
     if not (cells.any(axis=0).sum() >= 3 and cells.any(axis=1).sum() >= 3):
         return None
     local = fit_cells(state.pixels, cells)
-    fit = fit_corners(image, board, cells, local, state.pixels[cells], signs[cells], START_BLUR_PX)
+    fit = fit_corners(image, board, cells, local, state.pixels[cells], signs[cells], FIRST_BLUR)
     if np.median(fit.contrast) < 0.0:
         state = replace(state, signs=-signs)
     # A second fit, as the residual is meaningful only with a converged blur.
@@ -344,7 +332,7 @@ def _unanimous(guide: Guide, state: BoardState) -> BoardState:
     The worst are dropped first, as they affect the predictions of their neighbours.
     """
     rest = state
-    for _ in range(MAX_GUIDE_ROUNDS):
+    while True:
         share = _contradiction(guide, rest, rest)
         outlying = (share > 1.0) & (share >= cv2.dilate(share, np.ones((5, 5))))
         if not outlying.any():

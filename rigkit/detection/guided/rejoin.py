@@ -14,13 +14,12 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
+from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS
 from rigkit.detection.lattice.lattice import Lattice, margins
+from rigkit.detection.saddles.saddle import SAME_CORNER_PX
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.geometry.board_pose import board_poses
 from rigkit.geometry.rigid3 import Rigid3
-
-MIN_REJOINED_CORNERS = 12
-"""Smallest number of corners of a part whose pose is used."""
 
 OFF_GRID = 0.15
 """Largest median distance from the grid of the other part, in squares: poses of small parts have errors, while other
@@ -28,9 +27,6 @@ boards are off by arbitrary fractions of a square."""
 
 OFF_PLANE, OFF_PLANE_PX = 0.03, 0.5
 """Largest median residual of the smaller part under the common pose, in squares or (the larger) in px."""
-
-SAME_REJOINED_PX = 2.0
-"""Largest distance between corners of both parts with the same grid index."""
 
 
 def rejoined(parts: Sequence[RefinedLattice], boards: Sequence[Board], camera: Camera) -> list[RefinedLattice]:
@@ -62,7 +58,7 @@ def rejoined(parts: Sequence[RefinedLattice], boards: Sequence[Board], camera: C
 
 def _both(one: RefinedLattice, two: RefinedLattice, boards: Sequence[Board], camera: Camera) -> RefinedLattice | None:
     """Return the larger part `one` joined with `two`; None if they are not parts of one board."""
-    if one.lattice.count < MIN_REJOINED_CORNERS:
+    if one.lattice.count < MIN_GUIDE_CORNERS:
         return None
     for side_mm in {board.square_x_mm for board in boards}:
         sizes = {size for b in boards if b.square_x_mm == side_mm for size in (b.size, b.size[::-1])}
@@ -82,7 +78,7 @@ def _poses(lattice: Lattice, side_mm: float, camera: Camera) -> list[Rigid3]:
     row, column = np.nonzero(lattice.known)
     pixels = lattice.pixels[row, column]
     rays, seen = camera.unproject(pixels)
-    if seen.sum() < MIN_REJOINED_CORNERS:
+    if seen.sum() < MIN_GUIDE_CORNERS:
         return []
     points = side_mm * np.stack([column, row, np.zeros(len(row))], axis=-1, dtype=np.float64)
     bases = np.asarray(np.linalg.pinv(camera.ray_jacobian(pixels[seen])), dtype=np.float64)
@@ -132,7 +128,7 @@ def _united(
     known = first.lattice.known
     twice = known & second.lattice.known
     separation = np.linalg.norm(first.lattice.pixels - second.lattice.pixels, axis=-1)[twice]
-    if (separation > SAME_REJOINED_PX).any():
+    if (separation > SAME_CORNER_PX).any():
         return None
     return first.filled(second)
 

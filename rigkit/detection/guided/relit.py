@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,10 +13,12 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.guided.board_guide import CROSS
 from rigkit.detection.guided.corner_fit import RADIUS_PX, fit_corners, gap_to_markers
-from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
+from rigkit.detection.guided.guided import MAX_SIGMA_CELLS
+from rigkit.detection.lattice.local_fit import FLEXIBLE, MIN_PREDICTORS, LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.shadows import beside_shadows, in_even_light, light_steps
+from rigkit.detection.subpixel.subpixel import FIRST_BLUR
 
 MIN_EVEN, MAX_EVEN = 9, 32
 """Smallest and largest number of evenly lit corners that give the typical values of the board."""
@@ -32,20 +33,8 @@ TYPICAL_WITHIN_CELLS = 3
 MAX_RELIT_GAIN = 3.0
 """Largest standard deviation of a prediction from corners of standard deviation 1."""
 
-PREDICTION_FIT: dict[str, Any] = {"degree": 3, "ridge": (1e-3, 1e-2)}
-"""Parameters of the predictions, as without a camera in `board_guide`."""
-
-MIN_PREDICTORS = 6
-"""Smallest number of corners of a prediction."""
-
 MIN_SHADED_CELL_PX = 10.0
 """Smallest cell with enough pixels to distinguish a step of the light from a corner."""
-
-START_BLUR_PX = 1.0
-"""Initial s of fits in the image of a ChArUco board, px."""
-
-MAX_SIGMA_CELLS = 0.03
-"""Largest standard deviation of a corner, in sides of the cell."""
 
 MOVED_SIGMAS = 5.0
 """Largest distance of a corner from its prediction by evenly lit corners, in standard deviations."""
@@ -105,7 +94,7 @@ def relit(
     if np.count_nonzero(reference) < MIN_EVEN:
         return found
     typical = _typical(pixels, fits, reference)
-    shape = fit_cells(np.where(even[..., None], pixels, np.nan), suspect, **PREDICTION_FIT)
+    shape = fit_cells(np.where(even[..., None], pixels, np.nan), suspect, **FLEXIBLE._asdict())
     was = _left(image, assumed, suspect, shape, fits.relative_residual, typical)
     tried = (shape.support >= MIN_PREDICTORS) & (shape.gain < MAX_RELIT_GAIN) & (was > TIMES_BETTER * typical.relative)
     tried &= np.linalg.norm(shape.sides, axis=2).min(axis=1) > MIN_SHADED_CELL_PX
@@ -194,7 +183,7 @@ def _as_it_is(
     chosen = np.zeros_like(cells)
     chosen[row, column] = True
     pixels, signs = found.lattice(), refined.lattice.signs()
-    shape, blur = fit_cells(pixels, chosen), START_BLUR_PX
+    shape, blur = fit_cells(pixels, chosen), FIRST_BLUR
     # The width of the windows depends on the initial blur.
     for _ in range(2):
         fit = fit_corners(image, board, chosen, shape, pixels[chosen], signs[chosen], blur)
@@ -214,7 +203,7 @@ def _as_it_is(
 def _typical(pixels: FloatArray, refined: RefinedLattice, even: BoolArray) -> _Typical:
     """Return the typical values of the corners `even` (R, C) of `pixels` (R, C, 2)."""
     blur, relative = upper_median(refined.blur_px[even]), upper_median(refined.relative_residual[even])
-    ahead = fit_cells(pixels, even, **PREDICTION_FIT, leave_out=True)
+    ahead = fit_cells(pixels, even, **FLEXIBLE._asdict(), leave_out=True)
     off = np.linalg.norm(pixels[even] - ahead.pixels, axis=1) / np.hypot(1.0, ahead.gain)
     factor = refined.scatter * refined.correlated
     return _Typical(refined.lattice.signs(), blur, relative, factor, upper_median(off))

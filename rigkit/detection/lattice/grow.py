@@ -21,7 +21,7 @@ from rigkit.detection.lattice.links import (
     MIN_EDGE_PLACES,
     MIN_LATERAL_PX,
 )
-from rigkit.detection.lattice.local_fit import FLEXIBLE, STIFF
+from rigkit.detection.lattice.local_fit import FLEXIBLE, MIN_PREDICTING, PREDICTION_WIDTH, STIFF
 from rigkit.detection.saddles.response import Level
 from rigkit.detection.saddles.ring import ring_rules
 from rigkit.detection.saddles.saddle import Saddles
@@ -34,11 +34,8 @@ MAX_RINGS = 60
 ROOM = 6
 """Empty rows and columns added around a lattice at a time, into which it grows."""
 
-FIT_WIDTH, FIT_RADIUS = 1.3, 3
-"""Standard deviation of the Gaussian weight of the predictions, and their radius, cells."""
-
-MIN_PREDICTING = 3
-"""Smallest number of corners of a prediction."""
+FIT_RADIUS = 3
+"""Radius of the predictions, cells."""
 
 MAX_GROWN, MAX_FAILED_GROWTHS = 96, 16
 """Largest number of lattices that are grown, and of successive ones that are no boards: boards come first, being
@@ -66,7 +63,8 @@ MIN_AREA_PX2 = 1.0
 """Smallest area of a cell, px^2."""
 
 GROWN_AGAIN_PX = 1.4
-"""Corners closer than this are the same, found on two levels."""
+"""A lattice most of whose corners are closer than this to corners of grown ones is one of these, found on two levels.
+With 2 px another seed grows on one of 967 REAL images, blurred by 3 px, and 15 of 399 corners are lost."""
 
 
 def grow_all(
@@ -142,5 +140,5 @@ def _rules() -> GrowthRules:
         "max_lateral": MAX_LATERAL_PX,
         "min_area": MIN_AREA_PX2,
     }
-    predictions = [FitRules(degree, FIT_RADIUS, False, FIT_WIDTH, ridge) for degree, ridge in (STIFF, FLEXIBLE)]
+    predictions = [FitRules(degree, FIT_RADIUS, False, PREDICTION_WIDTH, ridge) for degree, ridge in (STIFF, FLEXIBLE)]
     return GrowthRules.make(predictions, ring_rules(ODD, CENTRE), EDGE_PLACES, **numbers)

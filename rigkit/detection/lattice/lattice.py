@@ -20,6 +20,9 @@ from rigkit.detection.lattice.links import Links
 from rigkit.detection.saddles.saddle import Corners
 from rigkit.kernels.growth import components_of
 
+MIN_ROWS = 3
+"""Rows and columns of the smallest board: smaller lattices are often something else."""
+
 MANY = 200
 """Lattices with so many corners are first tested by a sample."""
 

@@ -27,7 +27,14 @@ class Prediction(NamedTuple):
 
 
 STIFF, FLEXIBLE = Prediction(2, (0.02, 1.0)), Prediction(3, (1e-3, 1e-2))
-"""STIFF is stable with few neighbours, FLEXIBLE follows the rows at the rim of a fisheye."""
+"""STIFF is stable with few neighbours, FLEXIBLE follows the rows at the rim of a fisheye. They are the keywords of
+`fit_cells`: `**STIFF._asdict()`."""
+
+PREDICTION_WIDTH = 1.3
+"""Standard deviation of the Gaussian weight of predictions of uncertain corners, cells."""
+
+MIN_PREDICTING, MIN_PREDICTORS = 3, 6
+"""Smallest number of corners of a prediction: a plane needs three; six determine the curvatures."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

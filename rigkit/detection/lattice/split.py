@@ -17,7 +17,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.detections import grid_turned
 from rigkit.detection.lattice.lattice import Lattice, margins
-from rigkit.detection.lattice.local_fit import FLEXIBLE, STIFF, fit_cells
+from rigkit.detection.lattice.local_fit import FLEXIBLE, MIN_PREDICTING, PREDICTION_WIDTH, STIFF, fit_cells
 from rigkit.detection.lattice.spacing import SpacingChange, spacing_changes
 
 MIN_TURN = 0.16
@@ -43,8 +43,8 @@ FAR_GAP, FAR_MEETS_CELLS, FAR_OUT, FAR_FACING = 3, 0.1, 24, 2
 """A larger gap is allowed if the nearest FAR_OUT corners of the other part agree with their predictions within
 FAR_MEETS_CELLS, and FAR_FACING of them have a corner of the first part along their row or column."""
 
-DIAGONAL, JOIN_REACH = 1.5, 3.3
-"""Upper bounds of a diagonal step, and of the distance between the nearest corners across the larger gap, in sides."""
+JOIN_REACH = 3.3
+"""Upper bound of the distance between the nearest corners across the larger gap, in sides."""
 
 NEAREST_IN, NEAREST_OUT = 16, 6
 """Corners of one part that extrapolate its grid, and of the other part that must agree."""
@@ -99,7 +99,7 @@ def _continues(lattice: Lattice, part: slice, at: int) -> bool:
     pixels[:, part] = lattice.pixels[:, part]
     cells = np.zeros(lattice.known.shape, bool)
     cells[:, at] = lattice.known[:, at]
-    shape = fit_cells(pixels, cells, degree=STIFF.degree, ridge=STIFF.ridge)
+    shape = fit_cells(pixels, cells, **STIFF._asdict())
     side = shape.shorter_px()
     off = np.linalg.norm(shape.pixels - lattice.pixels[cells], axis=1)
     return bool(np.median(off / np.maximum(side, 1e-9)) < CONTINUES_CELLS)
@@ -158,12 +158,12 @@ def _absorb(lattice: Lattice, groups: list[BoolArray]) -> None:
     while loose.any():
         off = np.full((len(groups), *loose.shape), np.inf)
         for number, group in enumerate(groups):
-            fit = fit_cells(lattice.without(~group).pixels, loose, width=1.3, degree=STIFF.degree, ridge=STIFF.ridge)
+            fit = fit_cells(lattice.without(~group).pixels, loose, width=PREDICTION_WIDTH, **STIFF._asdict())
             side = np.minimum(np.hypot(*fit.along_column.T), np.hypot(*fit.along_row.T))
             distance = np.hypot(*(fit.pixels - lattice.pixels[loose]).T)
             with np.errstate(divide="ignore", invalid="ignore"):
                 cells = distance / (side * np.hypot(1.0, fit.gain))
-            off[number][loose] = np.where((fit.support >= 3) & (fit.gain < MAX_HELD_GAIN), cells, np.inf)
+            off[number][loose] = np.where((fit.support >= MIN_PREDICTING) & (fit.gain < MAX_HELD_GAIN), cells, np.inf)
         best = off.argmin(axis=0)
         added = loose & (off.min(axis=0) < LOOSE_CELLS)
         if not added.any():
@@ -264,9 +264,8 @@ def _joined(one: _LatticePart, two: _LatticePart) -> Lattice | None:
     for quarter in range(4):
         shift = whole.astype(np.int64) - grid_turned(two.grid[near], two.lattice.size, quarter)
         if (shift == shift[0]).all():
-            close = separation < DIAGONAL * GAP * longest
             far = far_off < FAR_MEETS_CELLS
-            united = _united(one.lattice, two.lattice.turned(quarter), shift[0], close, far)
+            united = _united(one.lattice, two.lattice.turned(quarter), shift[0], far)
             if united is None or off < MEETS_CELLS:
                 return united
             left, top = np.maximum(0, -shift[0])
@@ -284,12 +283,13 @@ def _agree(pixels: FloatArray, one: BoolArray, two: BoolArray) -> bool:
     """
     reach = np.ones((2 * GAP + 1, 2 * GAP + 1), np.uint8)
     between = (cv2.dilate(one.astype(np.uint8), reach) > 0) & (cv2.dilate(two.astype(np.uint8), reach) > 0)
-    for degree, ridge in (STIFF, FLEXIBLE):
+    for how in (STIFF, FLEXIBLE):
         mine, theirs = (
-            fit_cells(np.where(part[..., None], pixels, np.nan), between, degree=degree, width=1.3, ridge=ridge)
+            fit_cells(np.where(part[..., None], pixels, np.nan), between, width=PREDICTION_WIDTH, **how._asdict())
             for part in (one, two)
         )
-        gain = np.where((mine.support > 3) & (theirs.support > 3), np.maximum(mine.gain, theirs.gain), np.inf)
+        supported = np.minimum(mine.support, theirs.support) > MIN_PREDICTING
+        gain = np.where(supported, np.maximum(mine.gain, theirs.gain), np.inf)
         best = np.argsort(gain)[: min(BETWEEN, int(np.isfinite(gain).sum()))]
         side = np.minimum(np.hypot(*mine.along_column[best].T), np.hypot(*mine.along_row[best].T))
         separation = np.hypot(*(mine.pixels - theirs.pixels)[best].T) / np.maximum(side, 1e-9)
@@ -340,7 +340,7 @@ def _facing(one: Lattice, two: Lattice, steps: int, shape: int = cv2.MORPH_CROSS
     return int(np.count_nonzero((cv2.dilate(one.known.astype(np.uint8), reach) > 0) & two.known))
 
 
-def _united(one: Lattice, two: Lattice, shift: IntArray, near: bool, far: bool) -> Lattice | None:
+def _united(one: Lattice, two: Lattice, shift: IntArray, far: bool) -> Lattice | None:
     """Return `one` joined with `two` shifted by `shift` (columns, rows).
 
     None if they overlap, have different colours, or have a too large gap.
@@ -348,6 +348,6 @@ def _united(one: Lattice, two: Lattice, shift: IntArray, near: bool, far: bool) 
     first, second = (item.padded(*m) for item, m in zip((one, two), margins(one.size, two.size, shift), strict=True))
     if first.rising != second.rising or (first.known & second.known).any():
         return None
-    close = near and (_facing(first, second, GAP) or _facing(first, second, GAP, cv2.MORPH_RECT) >= SLANTED)
+    close = _facing(first, second, GAP) or _facing(first, second, GAP, cv2.MORPH_RECT) >= SLANTED
     across_gap = far and _facing(first, second, FAR_GAP) >= FAR_FACING
     return first.filled(second) if close or across_gap else None

@@ -22,8 +22,9 @@ MAX_SHARPNESS = 0.095
 give 0.08, sharpened ones 0.09, for all angles and down to squares of 4 px; noise gives 0.12. A few corners of boards in
 noise exceed it, which growth adds; of false corners of noise a third."""
 
-KNOWN_PX = 2.0
-"""A corner closer than this to one of a finer level is the same, in pixels of its own level."""
+SAME_CORNER_PX = 2.0
+"""Corners closer than this are the same one, in px, or in px of the coarser of the two levels on which they are found:
+several times the error of a loose corner, and less than half of the smallest squares (5 px)."""
 
 MAX_STEP = 1.5
 """Largest Newton step from the peak of the response to the saddle, px of the level."""
@@ -124,7 +125,7 @@ def _corners_of(level: Level, known: Sequence[Corners]) -> front.CornersOfLevel:
         ring_rules(),
         (level.scale, level.offset),
         np.concatenate([NOWHERE, *(k.pixels for k in known)]),
-        KNOWN_PX * level.scale,
+        SAME_CORNER_PX * level.scale,
     )
 
 
@@ -132,7 +133,7 @@ def _without_known(found: Corners, which: BoolArray, known: list[Corners]) -> Co
     """Return the corners `which` (N,) of `found` that are not among those `known` from finer levels."""
     before = [k.pixels for k in known if len(k)]
     if before and which.any():
-        which = which & ~near_any(found.pixels, np.concatenate(before), KNOWN_PX * float(found.scale[0]))
+        which = which & ~near_any(found.pixels, np.concatenate(before), SAME_CORNER_PX * float(found.scale[0]))
     return found.of(which)
 
 

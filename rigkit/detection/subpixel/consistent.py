@@ -21,12 +21,12 @@ MIN_TESTED = 9
 """Smallest number of corners of a board, and of a prediction, and smallest number of predicted corners, for the
 test."""
 
-HOLE_MOVE = 0.12
-HOLE_CONTRAST = 0.3
-HOLE_RESIDUAL = 2.0
-HOLE_SIGMA = 3.0
-"""Requirements on a corner in an empty cell: largest distance from its prediction (cells), smallest contrast, largest
-residual and sigma, each relative to the corners around it."""
+MOVED_CELLS = 0.12
+"""Largest distance of a corner that is added from its prediction, in sides of its cell."""
+
+HOLE_RESIDUAL, HOLE_SIGMA = 2.0, 3.0
+"""Largest residual and sigma of a corner in an empty cell, relative to the corners around it. Sigma is inverse to the
+contrast, which needs no limit of its own."""
 
 DISPLACED_CELLS = 0.06
 DISPLACED_SIGMAS = 8.0
@@ -60,13 +60,11 @@ def confirmed(item: RefinedLattice, start: Lattice, holes: BoolArray) -> Refined
     """Return `item` without those of the `holes` where the fit does not confirm a corner."""
     known = item.lattice.known
     settled = known & ~holes
-    contrast = item.lattice.contrast
     moved = np.linalg.norm(item.lattice.pixels - start.pixels, axis=2)
     cell = np.full(known.shape, np.nan)
     cell[holes] = fit_cells(start.pixels, holes, degree=1).cell_px()
     with np.errstate(invalid="ignore"):
-        good = (moved < HOLE_MOVE * cell) & (contrast > HOLE_CONTRAST * _around(contrast, settled))
-        good &= item.residual < HOLE_RESIDUAL * _around(item.residual, settled)
+        good = (moved < MOVED_CELLS * cell) & (item.residual < HOLE_RESIDUAL * _around(item.residual, settled))
         good &= item.sigma_px < HOLE_SIGMA * _around(item.sigma_px, settled)
     return item.without(holes & ~good)
 

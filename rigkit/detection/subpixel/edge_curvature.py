@@ -34,7 +34,7 @@ LOOSE_CURVATURE = 0.5
 fit. Fitting all curvatures would take a quarter more time."""
 
 FREE = 1e-6
-"""Weight of the prior on position and direction, which keeps single corners solvable."""
+"""Weight of the prior on unknowns without any other, which keeps the normal equations solvable."""
 
 
 def line_curvature(

@@ -41,11 +41,11 @@ REACHED = 0.25
 """If blur brings the edges of neighbouring lines into more than this share of a board's windows, all corners are fitted
 once more, which takes a third more time; oblique squares or those at the rim alone do not require it."""
 
-MORE_EVIDENCE, BESIDE_PAPER = 0.5, 1.5
-"""Upper bounds of the increase of the evidence score of lattices with small squares: by the second fit (measured:
-0.13), and by modelling the image beyond the outer squares together with it (0.53 for scores above -3.5; 1.8 at -4.4,
-1.1 below). Of 173 such lattices in REAL images, some of them blurred, boards have 3.7 and more; one sample of a board
-that is found as a whole anyway has -4.6."""
+MORE_EVIDENCE = 1.5
+"""Upper bound of the increase of the evidence score of lattices with small squares by further fits: by the second fit
+(measured: 0.13), and by modelling the image beyond the outer squares together with it (0.53 for scores above -3.5; 1.8
+at -4.4, 1.1 below). Of 173 such lattices in REAL images, some of them blurred, boards have 3.7 and more; one sample of
+a board that is found as a whole anyway has -4.6."""
 
 
 def refine(
@@ -260,21 +260,16 @@ def _nearer_pass(
 ) -> tuple[RefinedLattice, list[int]]:
     """Return the fit in the windows of the last pass, without corners that fail, and those of the lattices `numbers`
     with a sufficient `evidence_score`. Only for these the image beyond the boards is modelled."""
-
-    def plausible(item: RefinedLattice, numbers: Sequence[int], more: float) -> list[int]:
-        parts = ((k, item.cut(*sheet.parts[k])) for k in numbers)
-        return [k for k, mine in parts if mine.lattice.count > 0 and evidence_score(mine) > -more]
-
     fit = windows.fit(sheet.image, sheet.signs, slice(None), windows.geometry)
     nearer = _spread(windows.lattice, fit, fit.sigma_px)
-    good = plausible(nearer, numbers, BESIDE_PAPER)
+    parts = ((k, nearer.cut(*sheet.parts[k])) for k in numbers)
+    good = [k for k, mine in parts if mine.lattice.count > 0 and evidence_score(mine) > -MORE_EVIDENCE]
     if not good:
         return nearer, []
     known = windows.lattice.known
     mine = _owners(known, [sheet.parts[k] for k in numbers])
     after = _beside_paper(sheet, windows, fit, mine, sheet.corners_of(good)[known])
-    nearer = nearer if after is fit else _spread(windows.lattice, after, after.sigma_px)
-    return nearer, plausible(nearer, good, MORE_EVIDENCE)
+    return nearer if after is fit else _spread(windows.lattice, after, after.sigma_px), good
 
 
 def _last_pass(sheet: _Stacked, windows: _Windows, parts: Sequence[Part]) -> tuple[RefinedLattice, FloatArray]:

@@ -17,6 +17,7 @@ from rigkit.detection.subpixel.blur_shape import blur_covariance
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.resampled import Resampled, resampled
 from rigkit.detection.subpixel.subpixel import LAST_PASS
+from rigkit.detection.subpixel.whole_board import MIN_BLUR_OF_BOARD, MIN_SQUARE
 
 LOOKED_AT_PX = 1.5
 """Smallest s of boards that are examined: below, motion is less than twice the other blur."""
@@ -28,9 +29,6 @@ and edges extend beyond the windows."""
 
 WINDOW_BLURS = 5.0
 """Smallest radius of the windows in s; edges extend to three s."""
-
-SHARPEST_PX, SQUARE_PX = 1.5, 9.0
-"""Smallest s and smallest square after resampling, unless squares are smaller in the image: as in `whole_board`."""
 
 MIN_WIDTH_PX, MAX_WIDTH_CELLS = 0.5, 0.3
 """Bounds of s: lens and pixels cause a larger one, which is not measurable across a long motion; and s is at most this
@@ -56,7 +54,8 @@ def with_uniform_blur(image: GreyImage, lattice: Lattice, refined: RefinedLattic
     per_blur = (axes / widths) @ axes.T
     sides = np.linalg.norm(shape.sides @ per_blur.T, axis=2)
     square = float(np.quantile(sides, 0.1))
-    even = max(SHARPEST_PX, min(SQUARE_PX / square, float(widths[1])))
+    # Unless squares are smaller in the image.
+    even = max(MIN_BLUR_OF_BOARD, min(MIN_SQUARE / square, float(widths[1])))
     # Windows of the same area as in the image, if these are large enough.
     radius_px = max(even / float(np.sqrt(widths.prod())) * LAST_PASS[0], WINDOW_BLURS * even)
     return resampled(image, lattice, even * per_blur, min(radius_px, LAST_PASS[0]))

@@ -17,10 +17,11 @@ import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, known_median
-from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.lattice.lattice import MIN_ROWS, Lattice
 from rigkit.detection.lattice.local_fit import fit_cells, predicted
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.board_window import BoardWindow, Surroundings, extended
+from rigkit.detection.subpixel.edge_curvature import FREE
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, MAX_BLUR_CHANGE, MAX_MOVE_PX, ROUNDING_VARIANCE
 from rigkit.detection.subpixel.edge_model import WINDOW_REACH, Geometry, ends_of
 from rigkit.detection.subpixel.outer_squares import MAX_PAPER, outer_squares
@@ -69,17 +70,11 @@ would be about a fifth of it."""
 HOLE_SIGMA_PX = 0.5
 """Prior standard deviation of missing corners, predicted by the others."""
 
-FREE = 1e-6
-"""Weight of the prior on all other unknowns."""
-
 OUTWARDS = np.array([-1.0, 1.0, -1.0, 1.0])
 """Outward directions, along columns and rows, at the first and the last end of the board."""
 
-MIN_ROWS = 3
-"""Smallest number of rows and of columns."""
-
 MIN_BLUR_OF_BOARD, MIN_SQUARE = 1.5, 9.0
-"""Smallest s and smallest square, in pixels, after averaging pixels."""
+"""Smallest s and smallest square, in pixels, after averaging or resampling pixels."""
 
 MIN_BLUR_PX, SMALL_SQUARES = 1.2, 9.0
 """Smallest s, px, and largest squares, in s, of boards that are fitted as a whole. The errors of RENDERED boards in a

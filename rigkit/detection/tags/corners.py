@@ -27,11 +27,10 @@ from rigkit.detection.guided.guided import (
     MAX_ADDED_RESIDUAL_MARKED,
     MAX_SIGMA_CELLS,
     MIN_ADDED_CONTRAST,
-    MOVED_CELLS,
     SCATTER_FLOOR_PX,
 )
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.subpixel.consistent import DISPLACED_CELLS
+from rigkit.detection.subpixel.consistent import DISPLACED_CELLS, MOVED_CELLS
 from rigkit.detection.subpixel.correlation import factor_rules
 from rigkit.detection.subpixel.edge_fit import edge_rules
 from rigkit.detection.subpixel.scatter import UNEXPLAINED

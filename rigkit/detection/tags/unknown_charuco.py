@@ -28,11 +28,13 @@ DICTIONARIES = (
 MIN_MARKER_SIDE = 0.35
 """Smallest side of a marker, in squares."""
 
-MIN_MARKERS_READ = 3
-"""Smallest number of markers of one dictionary in an image whose numbers fit one board: one or two may be random."""
+MIN_CODES_READ = 3
+"""Smallest number of markers or tags of one family in an image whose numbers fit one board: one or two may be random
+among thousands of codes."""
 
 MIN_SHARE_FITTING = 0.5
-"""Smallest share of the markers read in all images that fit the board: nearly all do, or few by chance."""
+"""Smallest share of the markers read in all images, or of the tags read in a lattice, whose numbers fit the board:
+nearly all do, or few by chance."""
 
 SURE_OF_KIND = 2
 """Number of images with markers after which only kinds seen before are read."""
@@ -108,7 +110,7 @@ def _read_best(seen: dict[str, ReadMarkers]) -> dict[str, ReadMarkers]:
 
 def _in_squares(quads: FloatArray, numbers: IntArray) -> Markers | None:
     """Return the largest group of markers in squares that follow from each other; None if there are too few."""
-    if len(numbers) < MIN_MARKERS_READ:
+    if len(numbers) < MIN_CODES_READ:
         return None
     middle = quads.mean(axis=1)
     inverse = np.linalg.inv(maps_of_quads(quads))
@@ -129,7 +131,7 @@ def _in_squares(quads: FloatArray, numbers: IntArray) -> Markers | None:
     near &= (squares.sum(axis=2) % 2 == 0) & (squares != 0).any(axis=2)
     near &= near.T
     own, places = max(laid_out(near, squares), key=lambda group: len(group[0]))
-    return None if len(own) < MIN_MARKERS_READ else (numbers[own], places, 1.0 / step)
+    return None if len(own) < MIN_CODES_READ else (numbers[own], places, 1.0 / step)
 
 
 def laid_out(near: BoolArray, steps: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
@@ -166,7 +168,7 @@ def guessed_charuco(seen: MarkerObservations, exactly: int | None = None) -> lis
         return []
     count = sum(len(numbers) for numbers, *_ in own)
     # Two markers alone agree with any number of columns that follows from them.
-    own = [read for markers in own if len((read := _in_order(*markers, columns))[0]) >= MIN_MARKERS_READ]
+    own = [read for markers in own if len((read := _in_order(*markers, columns))[0]) >= MIN_CODES_READ]
     if not own:
         return []
     first = _first_marker(own)

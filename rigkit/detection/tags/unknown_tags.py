@@ -26,17 +26,11 @@ from rigkit.detection.tags.codes import Codes, TagCode, read_tags, transferred
 from rigkit.detection.tags.module_size import module_size
 from rigkit.detection.tags.placing import squares_of
 from rigkit.detection.tags.quads import quadrilaterals
-from rigkit.detection.tags.unknown_charuco import DICTIONARIES, laid_out
+from rigkit.detection.tags.unknown_charuco import DICTIONARIES, MIN_CODES_READ, MIN_SHARE_FITTING, laid_out
 from rigkit.kernels.surface import maps_of_quads
 
 WIDEST_RATIO = 8.0
 """Largest ratio of a tag's side to the gap, or of the gap to the side."""
-
-MIN_TAGS_READ = 3
-"""Smallest number of tags of one family in a lattice: one may be random among thousands of codes."""
-
-MIN_SHARE_COUNTED = 0.5
-"""Smallest share of the tags read in a lattice with consecutive numbers: nearly all, or hardly any by chance."""
 
 MAX_LONE_STEP = 3.0
 """Largest distance from one lone tag to the next, in sides of a tag: `AprilGrid.spacing` is at most 2."""
@@ -127,7 +121,7 @@ class TagObservations:
             if at is None:
                 break
             lattices = build_lattices(at.corners, find_links(at.corners, at.levels[0], LENGTH_RATIO * WIDEST_RATIO))
-            found = [self._read(index, image, lattice) for lattice in lattices if lattice.count >= 4 * MIN_TAGS_READ]
+            found = [self._read(index, image, lattice) for lattice in lattices if lattice.count >= 4 * MIN_CODES_READ]
             if any(found):
                 return True
         return self._look_alone(index, image)
@@ -146,7 +140,7 @@ class TagObservations:
         turn = int(np.bincount(codes.turns[codes.read], minlength=4).argmax())
         own = codes.read & (codes.turns == turn)
         # Every number occurs once on a board; random codes in similar squares are the same ones.
-        if np.count_nonzero(np.unique(codes.number[own], return_counts=True)[1] == 1) < MIN_TAGS_READ:
+        if np.count_nonzero(np.unique(codes.number[own], return_counts=True)[1] == 1) < MIN_CODES_READ:
             return False
         columns, rows = size
         cells = grid_turned(squares[own], (columns - 1, rows - 1), -turn)
@@ -156,7 +150,7 @@ class TagObservations:
         )
         counted = seen.counted()
         # With small families random codes are read in most squares, but not with consecutive numbers.
-        if counted is None or len(counted[2]) < max(MIN_TAGS_READ, MIN_SHARE_COUNTED * len(seen.numbers)):
+        if counted is None or len(counted[2]) < max(MIN_CODES_READ, MIN_SHARE_FITTING * len(seen.numbers)):
             return False
         self._keep(seen, codes)
         return True
@@ -186,7 +180,7 @@ class TagObservations:
             )
             counted = seen.counted()
             # Random codes do not have consecutive numbers.
-            if counted is not None and len(counted[2]) >= MIN_TAGS_READ:
+            if counted is not None and len(counted[2]) >= MIN_CODES_READ:
                 self._keep(self._as_printed(image, seen, upright[members]), codes)
                 shown = True
         return shown
@@ -221,7 +215,7 @@ def _read_kinds(image: GreyImage, quads: FloatArray, families: Sequence[Family])
     for family, border in families:
         pattern = AprilGrid(1.0, family, border, numbering="opencv")
         codes = read_tags(image, quads, Codes.of(pattern, np.arange(marker_count(pattern.dictionary))))
-        if np.count_nonzero(codes.read) >= MIN_TAGS_READ:
+        if np.count_nonzero(codes.read) >= MIN_CODES_READ:
             read.append(((family, border), codes))
     yield from sorted(read, key=lambda one: -float(one[1].likeness[one[1].read].sum()))
 
@@ -294,7 +288,7 @@ def guessed_grids(seen: TagObservations) -> list[GuessedGrid]:
     groups: list[Counted] = []
     for item in seen.seen:
         counted = item.counted() if item.kind == kind else None
-        if counted is not None and len(counted[2]) >= MIN_TAGS_READ:
+        if counted is not None and len(counted[2]) >= MIN_CODES_READ:
             groups.append((item, *counted))
     out = []
     for cluster in _of_one_board(groups):

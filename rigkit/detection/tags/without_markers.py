@@ -16,6 +16,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
+from rigkit.detection.lattice.lattice import MIN_ROWS
 from rigkit.detection.lattice.local_fit import fit_cells, predicted
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.board_window import extended
@@ -36,9 +37,6 @@ DRAWN_PX = 3.0
 
 MAX_SQUARE = 64
 """Largest number of samples along a square; sharp images with larger squares need no removal."""
-
-MIN_LINES = 3
-"""Smallest number of rows and columns: fewer do not determine the ends of their squares."""
 
 AROUND_CORNER = np.ones((3, 3), np.uint8)
 """Neighbourhood of known corners in which predictions are accurate enough for the removal of markers."""
@@ -109,7 +107,7 @@ def _seen(pixels: FloatArray) -> tuple[FloatArray, BoolArray, tuple[int, int]] |
     spans = []
     for axis in (1, 0):
         lines = np.flatnonzero(known.any(axis=axis))
-        if len(lines) < MIN_LINES:
+        if len(lines) < MIN_ROWS:
             return None
         spans.append(slice(max(int(lines[0]) - 1, 0), int(lines[-1]) + 2))
     part, known = pixels[spans[0], spans[1]].copy(), known[spans[0], spans[1]]

@@ -35,7 +35,7 @@ from rigkit.detection.subpixel.scatter import scatter_factors
 from rigkit.detection.subpixel.subpixel import refine
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.detection.tags.codes import transferred
-from rigkit.detection.tags.in_squares import between_markers, place_by_markers
+from rigkit.detection.tags.in_squares import AGREEING_MARKERS, MIN_MARKERS, between_markers, place_by_markers
 from rigkit.detection.tags.without_markers import without_markers
 from rigkit.detection.targets.base import Finder, Search
 from rigkit.kernels.boards import Picture
@@ -43,9 +43,6 @@ from rigkit.kernels.surface import maps_of_quads
 
 SAME_CELLS = 0.2
 """Largest distance of a marker's corner from the same corner of a lattice, in sides of a cell."""
-
-MIN_VOTES, AGREEING_VOTES = 3, 0.7
-"""Smallest number of corners, and smallest share of them, that agree on the place of a lattice on the board."""
 
 MASKING_ROUNDS = 2
 """Rounds of removing markers and fitting corners: the second starts from corners that their ink does not affect."""
@@ -234,7 +231,7 @@ def _placed(lattice: Lattice, grid: IntArray, pixels: FloatArray, board: Board) 
     distance = np.linalg.norm(corners[:, None] - pixels, axis=2)
     nearest = distance.argmin(axis=0)
     near: BoolArray = distance[nearest, np.arange(len(pixels))] < SAME_CELLS * _side_px(lattice)
-    if near.sum() < MIN_VOTES:
+    if near.sum() < MIN_MARKERS:
         return None
     row, column = np.nonzero(known)
     cell = np.stack([column, row], axis=-1)[nearest[near]]
@@ -247,7 +244,7 @@ def _placed(lattice: Lattice, grid: IntArray, pixels: FloatArray, board: Board) 
         # As `Lattice.turned`.
         cell = np.stack([rows - 1 - cell[:, 1], cell[:, 0]], axis=-1)
         columns, rows = rows, columns
-    if best is None or best[0] < max(MIN_VOTES, AGREEING_VOTES * near.sum()):
+    if best is None or best[0] < max(MIN_MARKERS, AGREEING_MARKERS * near.sum()):
         return None
     return _onto(best[1], best[2], board)
 

@@ -15,7 +15,7 @@ from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.subpixel import edge_fit, subpixel
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
-from rigkit.detection.subpixel.subpixel import BESIDE_PAPER, EvidenceScore, refine
+from rigkit.detection.subpixel.subpixel import MORE_EVIDENCE, EvidenceScore, refine
 
 BLUR_PX, COLUMNS, ROWS = 1.6, 9, 6
 MATRIX = np.array([[1.0, 0.1], [-0.07, 0.96]])
@@ -72,7 +72,7 @@ def test_squares_without_promise_are_fitted_once(
 
     def promise(item: RefinedLattice, placed: list[tuple[Lattice, RefinedLattice]]) -> float:
         asked.append((item.lattice.count, len(placed)))
-        return -1.1 * BESIDE_PAPER
+        return -1.1 * MORE_EVIDENCE
 
     refined = refine(image, [large, small], promise)  # type: ignore[arg-type]
     # The first pass of both; the large squares for the last time, and the small ones, where that is all.

@@ -18,13 +18,11 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.lattice.grow import (
     CENTRE,
     FIT_RADIUS,
-    FIT_WIDTH,
     GROWTH_REACH,
     LINE_SINE,
     MAX_RING_PX,
     MAX_SADDLES_TRIED,
     MIN_AREA_PX2,
-    MIN_PREDICTING,
     MIN_RING_PX,
     ODD,
     RING,
@@ -38,7 +36,7 @@ from rigkit.detection.lattice.links import (
     MIN_LATERAL_PX,
     Links,
 )
-from rigkit.detection.lattice.local_fit import FLEXIBLE, STIFF, LocalFit, _local_fit
+from rigkit.detection.lattice.local_fit import FLEXIBLE, MIN_PREDICTING, PREDICTION_WIDTH, STIFF, LocalFit, _local_fit
 from rigkit.detection.saddles.response import Level
 from rigkit.kernels.growth import FitRules, GridBuckets, GrowthRules
 
@@ -110,7 +108,9 @@ def grown(
         for way, (degree, ridge) in enumerate((STIFF, FLEXIBLE)):
             cells = _beside(known) & due[way]
             due[way] &= ~cells
-            prediction = _local_fit(fit(lattice.pixels, cells, FitRules(degree, FIT_RADIUS, False, FIT_WIDTH, ridge)))
+            prediction = _local_fit(
+                fit(lattice.pixels, cells, FitRules(degree, FIT_RADIUS, False, PREDICTION_WIDTH, ridge))
+            )
             added = _added(lattice, np.argwhere(cells), prediction, points, level)
             if added.any():
                 break

@@ -18,12 +18,11 @@ from rigkit.detection.guided.guided import (
     MAX_ADDED_RESIDUAL_MARKED,
     MAX_SIGMA_CELLS,
     MIN_ADDED_CONTRAST,
-    MOVED_CELLS,
     SCATTER_FLOOR_PX,
 )
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.saddles.response import GreyImage, sample
-from rigkit.detection.subpixel.consistent import DISPLACED_CELLS
+from rigkit.detection.subpixel.consistent import DISPLACED_CELLS, MOVED_CELLS
 from rigkit.detection.subpixel.correlation import sigma_factors
 from rigkit.detection.subpixel.edge_fit import EdgeFit, edge_rules
 from rigkit.detection.subpixel.edge_model import WINDOW_REACH
