@@ -88,7 +88,7 @@ class NoiseOfCorners(NamedTuple):
 
 
 def sigma_factors(corners: NoiseOfCorners, boards: int, rules: FactorRules) -> FloatArray:
-    """See `detection.subpixel.correlation.sigma_factors`."""
+    """See `detection.subpixel.correlation.board_factors`."""
     return np.asarray(kernels().sigma_factors(*corners, boards, rules))
 
 

@@ -43,10 +43,11 @@ MIN_SIGMA_FACTOR = 0.5
 """Lower bound of the factor of sigma."""
 
 
-def sigma_factors(
+def board_factors(
     fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray, boards: int, radius_px: float
-) -> FloatArray:
-    """Return the factor (P,) of the sigmas of each of P `boards`: 1 without significant correlation.
+) -> tuple[FloatArray, FloatArray]:
+    """Return the factor (P,) of the sigmas of each of P `boards`, 1 without significant correlation, and those (N,) of
+    corners with more noise than their board (`edges.uneven_factors`).
 
     Parameters
     ----------
@@ -56,13 +57,6 @@ def sigma_factors(
     owner : (N,) index of the board of each corner.
     radius_px : of the windows of the fit.
     """
-    return edges.sigma_factors(_noise_of(fit, good, sides, owner), boards, factor_rules(radius_px))
-
-
-def board_factors(
-    fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray, boards: int, radius_px: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return `sigma_factors` (P,) and `edges.uneven_factors` (N,)."""
     noise, rules = _noise_of(fit, good, sides, owner), factor_rules(radius_px)
     factors = edges.sigma_factors(noise, boards, rules)
     return factors, edges.uneven_factors(noise, factors, rules)
@@ -79,7 +73,7 @@ def _noise_of(fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray)
 
 def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bool) -> tuple[EdgeFit, float]:
     """Return the `fit` of a board's N corners, whose cells have `sides` (N, 2, 2), with sigmas multiplied by
-    `edges.uneven_factors`, and the board's `sigma_factors`, by which they are not.
+    `edges.uneven_factors`, and the board's `edges.sigma_factors`, by which they are not.
 
     That of a `marked` board, with markers in its squares, is 1: all its residuals count as noise.
     """

@@ -22,7 +22,7 @@ class RefinedLattice:
     sigma_px, blur_px : predicted standard deviation, and s of the edges.
     residual, noise : rms residual of the fit and of its part that is noise, grey levels.
     scatter : factor by which `sigma_px` was raised because the corners scatter about the lattice by more than noise.
-    correlated : factor of `sigma_px` due to correlated noise of neighbouring pixels (`correlation.sigma_factors`).
+    correlated : factor of `sigma_px` due to correlated noise of neighbouring pixels (`correlation.board_factors`).
     picture : the resampled part of the image in which the corners were fitted; None: the image itself.
     """
 

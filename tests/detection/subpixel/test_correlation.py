@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.subpixel import edge_fit, subpixel
-from rigkit.detection.subpixel.correlation import board_factors, sigma_factors
+from rigkit.detection.subpixel.correlation import board_factors
 from rigkit.detection.subpixel.edge_fit import EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import Geometry
 from rigkit.synthetic.render import Optics
@@ -67,7 +67,7 @@ def fitted(make: Noise, rng: np.random.Generator, *, count: int = 160) -> tuple[
 
 
 def factor(fit: EdgeFit, sides: np.ndarray) -> float:
-    (out,) = sigma_factors(fit, fit.valid, sides, np.zeros(len(sides), np.int64), 1, RADIUS_PX)
+    ((out,), _) = board_factors(fit, fit.valid, sides, np.zeros(len(sides), np.int64), 1, RADIUS_PX)
     return float(out)
 
 
@@ -106,7 +106,7 @@ def test_each_board_has_its_own(rng: np.random.Generator) -> None:
     owner = (order >= 40).astype(np.int64)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        factors = sigma_factors(mixed, good[order], np.concatenate([sides, sides])[order], owner, 3, RADIUS_PX)
+        factors, _ = board_factors(mixed, good[order], np.concatenate([sides, sides])[order], owner, 3, RADIUS_PX)
     assert abs(factors[0] - 1.0) < ALONE_REL
     assert factors[1] == pytest.approx(factor(shared, sides), rel=1e-9)
     assert factors[1] > 1.9

@@ -23,7 +23,7 @@ from rigkit.detection.guided.guided import (
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.subpixel.consistent import DISPLACED_CELLS, MOVED_CELLS
-from rigkit.detection.subpixel.correlation import sigma_factors
+from rigkit.detection.subpixel.correlation import board_factors
 from rigkit.detection.subpixel.edge_fit import EdgeFit, edge_rules
 from rigkit.detection.subpixel.edge_model import WINDOW_REACH
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
@@ -315,7 +315,7 @@ class _Fitter:
         owner, factor = np.zeros(len(sides), np.int64), 1.0
         if self.tags.pattern.corner_squares:
             good = fit.valid & (fit.contrast > 0.0)
-            factor = float(sigma_factors(fit, good, sides, owner, 1, LAST_PASS[0])[0])
+            factor = float(board_factors(fit, good, sides, owner, 1, LAST_PASS[0])[0][0])
         for rules in WHOLE_ROUNDS:
             whole = with_whole_tags(self.image, self.tags, self.places, state, partial(self.map_of, state), rules)
             if whole is state:
