@@ -11,10 +11,11 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs, find_blobs
 from rigkit.detection.circles.certainty import centre_sigmas
 from rigkit.detection.circles.evidence import GridEvidence
-from rigkit.detection.circles.fit import NEAR_BESIDE, CircleFit, edge_reach, fit_circles
+from rigkit.detection.circles.fit import CircleFit, edge_reach, fit_circles
 from rigkit.detection.circles.local_map import CORNER, PlaneMap, beside_each, local_maps, steps, with_smooth_curvatures
 from rigkit.detection.circles.rows import joined, rows_of
 from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS
 
 if TYPE_CHECKING:
     from rigkit.detection.circles.lattices import LabelledBlobs
@@ -299,7 +300,7 @@ def _through_its_blur(grey: GreyImage, draft: _Draft) -> _Draft:
     grown = False
     for done in range(BLUR_ROUNDS):
         half_gap_px = (0.5 / draft.radius - 1.0) * np.sqrt(np.abs(np.linalg.det(draft.fit.maps)))
-        beside = bool((half_gap_px < NEAR_BESIDE * draft.fit.blur_px).any())
+        beside = bool((half_gap_px < TAIL_SIGMAS * draft.fit.blur_px).any())
         uneven = _uneven(draft)
         change = float(np.linalg.norm(uneven - draft.uneven_px2))
         settled = change < MIN_UNEVEN * float(np.median(draft.fit.blur_px)) ** 2

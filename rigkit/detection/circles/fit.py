@@ -14,10 +14,9 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS
 from rigkit.kernels import circles as kernel
 
-NEAR_BESIDE = 3.0
-"""Distance, in sigmas of the blur, up to which light of a neighbour counts in a pixel: beyond, it is below a 700th."""
 RULES = kernel.CircleRules.of(
     near_sigmas=4.0,
     near_px=3.0,
@@ -28,7 +27,7 @@ RULES = kernel.CircleRules.of(
     max_light=1.5,
     converged_px=1e-3,
     converged_sigmas=0.05,
-    near_beside=NEAR_BESIDE,
+    near_beside=TAIL_SIGMAS,
     iterations=30,
     plain_iterations=5,
     min_pixels=16,

@@ -11,7 +11,7 @@ from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.lattice.local_fit import LocalFit
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
-from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry, ends_of
+from rigkit.detection.subpixel.edge_model import NEAR_PX, TAIL_SIGMAS, Geometry, ends_of
 from rigkit.detection.subpixel.outer_squares import fitted_beside_paper
 
 RADIUS_PX, FIT_STEPS = 18.0, 8
@@ -67,7 +67,7 @@ def _short_of_markers(board: Board, sides: FloatArray, blur: FloatArray) -> Floa
     """Return the initial s (M,), reduced so that windows, a few s to either side of a line, exclude markers."""
     if isinstance(board.pattern, Charuco):
         gap = gap_to_markers(board, sides)
-        blur = np.minimum(blur, (gap - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS)
+        blur = np.minimum(blur, (gap - MARKER_BLURS * blur - NEAR_PX) / TAIL_SIGMAS)
     return np.clip(blur, *BLUR_RANGE)
 
 

@@ -23,7 +23,8 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 
 TAIL_SIGMAS = 3.0
-"""Reach of an edge's blur, in s: edges of neighbouring lines within it are part of the model."""
+"""Reach of an edge's blur, in s: beyond, its light is below a 700th. Edges of neighbouring lines within it are part of
+the model."""
 
 PIXEL_KURTOSIS = -1.0 / 120.0
 """Fourth cumulant of a uniform distribution of width 1, that of a pixel's square along its sides, px^4."""
@@ -36,8 +37,9 @@ WINDOW_REACH = 0.5
 """Half size of the window in sides of the cell: windows of neighbouring corners touch but do not overlap, so that every
 pixel is used and the errors of neighbours are independent."""
 
-NEAR_SIGMAS, NEAR_PX = 3.0, 1.5
-"""Largest distance of used pixels from one of the lines, in s plus px: others carry no information on the corner."""
+NEAR_PX = 1.5
+"""Largest distance of used pixels from one of the lines, in px beyond TAIL_SIGMAS: others carry no information on the
+corner."""
 
 END_SIGMAS = 2.5
 MIN_REACH = 0.25

@@ -30,6 +30,7 @@ from rigkit.detection.subpixel.edge_fit import (
 )
 from rigkit.detection.subpixel.edge_model import PIXEL_KURTOSIS, SHARP_BLUR_PX
 from rigkit.detection.subpixel.subpixel import LAST_PASS
+from rigkit.detection.subpixel.whole_board import PICTURE_SIGMAS
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import SmoothMap
 from rigkit.kernels.tag_board import tag_heights
@@ -45,9 +46,6 @@ CURVATURE_SIGMAS = 0.3
 """Standard deviation of the middles of a tag's sides relative to its corners, in their sigmas: the curvature comes from
 three tags or more; a second difference has sqrt(6) of their sigma, and the sagitta is an eighth of it."""
 
-EDGE_REACH_SIGMAS = 4.0
-"""Distance, in s, beyond which edges have no effect on a pixel."""
-
 ROUGH_STEP_PX = 0.1
 """Last step of a round after which tags are fitted again: the remaining error is a tenth of it."""
 
@@ -58,7 +56,7 @@ unknown, and if it was fitted one step after the corners, sigmas were up to four
 
 def _rules(converged_px: float) -> TagRules:
     return TagRules.of(
-        tail_sigmas=EDGE_REACH_SIGMAS,
+        tail_sigmas=PICTURE_SIGMAS,
         pixel_kurtosis=PIXEL_KURTOSIS,
         sharp_blur=SHARP_BLUR_PX,
         min_blur=BLUR_RANGE[0],

@@ -29,7 +29,7 @@ from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage, pyramid
 from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
-from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS
+from rigkit.detection.subpixel.edge_model import NEAR_PX, TAIL_SIGMAS
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import scatter_factors
 from rigkit.detection.subpixel.subpixel import refine
@@ -273,7 +273,7 @@ def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board, cam
         return _MarkedBoard(refined, board, image, board)
     shape, blur = fit_cells(refined.lattice.pixels, known), float(np.median(refined.blur_px[known]))
     narrow = _fitted(image, refined, board, blur)
-    if float(np.median(gap_to_markers(board, shape.sides))) > (NEAR_SIGMAS + MARKER_BLURS) * blur + NEAR_PX:
+    if float(np.median(gap_to_markers(board, shape.sides))) > (TAIL_SIGMAS + MARKER_BLURS) * blur + NEAR_PX:
         return _MarkedBoard(narrow, board, image, board)
     # Blurred ink of the markers reaches into any window.
     given = narrow

@@ -18,7 +18,6 @@ from rigkit.detection.subpixel.edge_model import (
     END_SIGMAS,
     MIN_REACH,
     NEAR_PX,
-    NEAR_SIGMAS,
     PAPER_SIGMAS,
     PIXEL_KURTOSIS,
     SHARP_BLUR_PX,
@@ -89,7 +88,7 @@ def collect(image: GreyImage, pixels: FloatArray, geometry: Geometry, blur: Floa
     cells = rows @ np.stack([du, dv, np.ones_like(du)]).astype(np.float32)
     limits = _reach(geometry, blur).astype(np.float32)
     inside: BoolArray = np.all((cells >= -limits[:, :, :1]) & (cells <= limits[:, :, 1:]), axis=1)
-    near = NEAR_SIGMAS * blur + NEAR_PX
+    near = TAIL_SIGMAS * blur + NEAR_PX
     far = np.stack([np.linalg.norm(b, axis=1), np.linalg.norm(a, axis=1)], axis=1) * (near / np.abs(area))[:, None]
     inside &= (np.abs(cells) <= far[:, :, None].astype(np.float32)).any(axis=1)
     at_frame = ((centre < reach) | (centre > np.array([width, height]) - 1 - reach)).any(axis=1)

@@ -46,7 +46,7 @@ from rigkit.detection.subpixel.edge_fit import (
     VALID_MOVE_CELLS,
     VALID_MOVE_PX,
 )
-from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, WINDOW_REACH, Geometry
+from rigkit.detection.subpixel.edge_model import NEAR_PX, TAIL_SIGMAS, WINDOW_REACH, Geometry
 from rigkit.detection.tags.corners import NOTHING_NEAR_PX
 from rigkit.kernels.edges import LAGS, CurvatureRules, Rules, TagWindow
 from rigkit.kernels.surface import TagSurface
@@ -341,7 +341,7 @@ def fit_tag_corners(
     assert (window.blurs, window.nothing_near) == (MARKER_BLURS, NOTHING_NEAR_PX)
     shape, own = TagSurface(surface), steps[cells]
     expected = np.clip(blur, *BLUR_RANGE)
-    narrow = (window.border * shape.heights.min(axis=1) - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS
+    narrow = (window.border * shape.heights.min(axis=1) - MARKER_BLURS * blur - NEAR_PX) / TAIL_SIGMAS
     gaps = np.where(single[:, :1, None] == 0.0, own * shape.heights[:, :, None], NOTHING_NEAR_PX)
     none = np.zeros(gaps.shape)
     return fit_corners(
