@@ -55,6 +55,8 @@ FIRST_TOLERANCE = 2.0
 MIN_UNEVEN, MAX_UNEVEN = 0.1, 0.9
 """Smallest applied change and largest value of the blur's anisotropy, relative to its variance. Smaller changes do not
 move centres (REAL, hexagonal: within 0.0003 px); the largest is a blur four times as wide one way as across."""
+MAX_NEW_RINGS = 40
+"""Largest number of rings of circles by which a grid grows: around a centre, circles are neighbours without end."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -180,7 +182,10 @@ def _mixed(grey: GreyImage, draft: _Draft) -> _Draft:
 
 def _with_all(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
     """Return the draft extended by rings of circles without blobs; `beside`: with the light of neighbours."""
-    while _enough(draft) and (grown := _larger(grey, draft, beside=beside)) is not None:
+    for _ in range(MAX_NEW_RINGS):
+        grown = _larger(grey, draft, beside=beside) if _enough(draft) else None
+        if grown is None:
+            break
         draft = grown
     return draft
 
