@@ -165,7 +165,7 @@ def _edge_offsets(lattice: Lattice, level: Level, reach: float, along: Sequence[
     """Return the offsets (K,), in squares, of edges to the dark side of their corners' line at parts `along` (K,) of
     it.
 
-    They are sought within `reach` squares to both sides.
+    The edges are searched within `reach` squares on both sides.
     """
     seen = (level.smooth, level.scale, level.offset)
     return native.shifts_of_edges(lattice.pixels, lattice.rising, *seen, reach, along, STEPS_ACROSS, MAX_EDGES)
