@@ -230,7 +230,7 @@ def _sigma(fit: CircleFit) -> float:
 
 
 def _tested(draft: _Draft, tolerance: float = 1.0) -> _Draft:
-    """Return the draft without what is no circle of it; `tolerance`: factor of the limits of shape and residual."""
+    """Return the draft without false circles; `tolerance`: factor of the limits of shape and residual."""
     fit = draft.fit
     good = fit.valid & ((fit.contrast > 0.0) == draft.bright)
     good &= (np.abs(_own_growth(fit, good)) < tolerance * MAX_CIRCLE_GROWTH).all(axis=1)
