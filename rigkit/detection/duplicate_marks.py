@@ -56,7 +56,7 @@ def _marks(grey: GreyImage, board: Board) -> tuple[FloatArray, IntArray]:
 
 
 def _have_duplicates(quads: FloatArray, numbers: IntArray) -> bool:
-    """Return whether so many marks are at two places that they are of two boards."""
+    """Return whether enough marks are at two places to be those of two boards."""
     middle, side = quads.mean(axis=1), np.linalg.norm(quads[:, 1] - quads[:, 0], axis=1)
     away = np.linalg.norm(middle[:, None] - middle, axis=2) > MIN_SEPARATION_SIDES * np.maximum(side[:, None], side)
     twins = len(np.unique(numbers[((numbers[:, None] == numbers) & away).any(axis=1)]))
