@@ -153,7 +153,7 @@ def laid_out(near: BoolArray, steps: IntArray) -> Iterator[tuple[IntArray, IntAr
 
 def guessed_charuco(seen: MarkerObservations, exactly: int | None = None) -> list[Board]:
     """Return the ChArUco board of most markers, with squares of 1 mm: both patterns if the markers fit both, none if
-    the markers determine no board. It has `exactly` so many rows, or by default those that were read."""
+    the markers determine no board. It has `exactly` rows if given, else those that were read."""
     if not seen.markers:
         return []
     (dictionary, inverted), _ = seen.kinds.most_common(1)[0]
