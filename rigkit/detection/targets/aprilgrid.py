@@ -117,7 +117,7 @@ def _confirmed(image: GreyImage, tags: TagBoard, seen: BoardDetection) -> bool:
 
 
 def _nearly_whole(tags: TagBoard, pixels: FloatArray, shape: tuple[int, ...]) -> bool:
-    """Return whether so many corners (R, C, 2) are known that the others are better predicted from them."""
+    """Return whether enough corners (R, C, 2) are known to predict the others from them."""
     known = np.isfinite(pixels[..., 0])
     count, wanted = int(np.count_nonzero(known)), known.size
     if FIRST_SEEN * wanted > count >= MIN_SEEN_AT_FIRST:
