@@ -98,7 +98,7 @@ def checked(item: RefinedLattice, parts: Sequence[tuple[slice, slice]]) -> Refin
     excess = spread(distance / (item.sigma_px[known] * np.hypot(1.0, shape.gain)))
     gain = spread(shape.gain)
     relative = item.noise / item.lattice.contrast
-    # Nor is a corner one that has no other beside it: nobody judges it.
+    # Corners without neighbours are dropped, too: nothing confirms them.
     around = cv2.boxFilter(known.astype(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
     alone = known & (around == 1)
     drop = np.zeros_like(known)
