@@ -3,7 +3,7 @@
 
 /* Rotate the `size` columns of `m`, of `length` numbers each, until they are orthogonal, and set `v` (size columns of size) to the
  * rotations: a singular value decomposition by one-sided Jacobi, which is accurate for small singular values, too (Golub and Van
- * Loan, "Matrix Computations", section 8.6.3). */
+ * Loan, "Matrix Computations"). */
 INLINE void orthogonalise(double *m, int length, double *v, int size)
 {
     for (int i = 0; i < size * size; i++)

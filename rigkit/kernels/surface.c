@@ -6,7 +6,7 @@
 enum { ENTRIES = 9, SWEEPS = 12 };
 
 /* Set `least` to the eigenvector of the smallest eigenvalue of the symmetric A (cyclic Jacobi: Golub and Van Loan, "Matrix
- * Computations", section 8.5). */
+ * Computations"). */
 static void min_eigenvector(double A[ENTRIES][ENTRIES], double least[ENTRIES])
 {
     double V[ENTRIES][ENTRIES] = {{0.0}};

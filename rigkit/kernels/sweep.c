@@ -1,6 +1,6 @@
 /* A sweep over ranges: the matching cost of two images at each (census transform: Zabih and Woodfill, "Non-parametric local
  * transforms for computing visual correspondence", 1994), and its semi-global aggregation along eight paths (Hirschmueller, "Stereo
- * processing by semiglobal matching and mutual information", 2008, equation 13).
+ * processing by semiglobal matching and mutual information", 2008).
  *
  * The definitions in numpy are in tests/kernels/reference/sweep.py. */
 #include "kernels.h"
