@@ -243,12 +243,11 @@ def _moved(observations: Observations, fit: Fit, tried: Sequence[FittedModel]) -
     """Return a finding where the lens changed during the session by the chosen model, or else by the model with the
     least scatter: of images of two lenses a small model may predict best, whose error differs with the boards' places
     and hides the change."""
-    moved, camera = moved_lens(observations, fit), far_camera(fit.state.camera)
+    camera = far_camera(fit.state.camera)
     best = far_camera(min(tried, key=lambda option: option.fit.sigma_px).fit.state.camera)
-    if moved or same_model(best, camera):
-        return moved
-    other = with_other_lens(observations, fit, best)
-    return () if other is None else moved_lens(observations, other)
+    other = None if same_model(best, camera) else with_other_lens(observations, fit, best)
+    fits = [fit] if other is None else [fit, other]
+    return next((found for one in fits if (found := moved_lens(observations, one, tests=len(fits)))), ())
 
 
 def _others(tried: Sequence[FittedModel], model: str) -> list[Candidate]:

@@ -41,9 +41,10 @@ ORDERS, CHANCE = 199, 0.02
 DIGITS = re.compile(r"\d+")
 
 
-def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
+def moved_lens(observations: Observations, fit: Fit, *, tests: int = 1) -> tuple[Finding, ...]:
     """Return a finding if the images before and from one image on, in the order given, have different intrinsics, or
-    if images with two kinds of names do."""
+    if images with two kinds of names do. `tests` is the number of models that are tested in turn: chance counts each
+    (Bonferroni)."""
     images = list(dict.fromkeys(observations.images))
     if len(images) < MIN_IMAGES_FOR_HALVES:
         return ()
@@ -83,7 +84,7 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
             )
             return (Finding.bad(message, "calibrate each camera from its own images"),)
     distance = difference_sigmas(later)
-    if distance is None or (chance := scores.chance(observations.clusters(), number)) > CHANCE:
+    if distance is None or (chance := tests * scores.chance(observations.clusters(), number, tests)) > CHANCE:
         return ()
     message = (
         f"the lens (or the board) changed at image '{images[first]}' ({distance:.0f} standard deviations, p <= "
@@ -166,17 +167,17 @@ class _ImageScores:
         whole = pull.ravel() @ np.linalg.solve(every.reshape(3 * p, 3 * p), pull.ravel())
         return float(whole - pull[0] @ np.linalg.solve(every[0, :, 0], pull[0]))
 
-    def chance(self, clusters: IntArray, number: IntArray) -> float:
+    def chance(self, clusters: IntArray, number: IntArray, tests: int = 1) -> float:
         """Return the p-value of the permutation test: the part of random orders with a split at least as good as in the
-        true order; 1 as soon as it exceeds `CHANCE`. Near-duplicates, views (V,) of one cluster, stay together;
-        `number` (V,) is the index of each view's image."""
+        true order; 1 as soon as it exceeds `CHANCE` / `tests`. Near-duplicates, views (V,) of one cluster, stay
+        together; `number` (V,) is the index of each view's image."""
         of_image = np.zeros(len(self.score), np.int64)
         of_image[number] = clusters
         found = self.gains(np.arange(len(of_image))).max()
         rng, reached = np.random.default_rng(0), 1
         for _ in range(ORDERS):
             reached += bool(self.gains(np.argsort(rng.random(of_image.max() + 1)[of_image])).max() >= found)
-            if reached > CHANCE * (ORDERS + 1):
+            if tests * reached > CHANCE * (ORDERS + 1):
                 return 1.0
         return reached / (ORDERS + 1)
 
