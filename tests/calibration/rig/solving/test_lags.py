@@ -17,7 +17,7 @@ from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.rig.solving.lags import Timing, times_of
+from rigkit.calibration.rig.solving.lags import Timing, cost_of_own_times, times_of
 from rigkit.calibration.rig.solving.shutters import with_longer_readouts
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
@@ -170,6 +170,36 @@ def test_heldout_frames_do_not_choose_their_readouts() -> None:
     again, _ = heldout_rms(moved, 5)
     assert found is not None and again is not None
     assert again < 1.3 * found
+
+
+def test_times_fitted_to_heldout_frames_cost_what_predicting_them_would() -> None:
+    """The cost grows by the squares of the times under their prior, and is not zero where they are."""
+    joints = list[JointRig]()
+
+    def kept(joint: JointRig, folds: int) -> tuple[None, tuple[None, None]]:
+        joints.append(joint)
+        return None, (None, None)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rigkit.calibration.rig.calibrate.heldout_rms", kept)
+        rig_of(0.1, 1, jitter=0.05)
+    (joint,) = joints
+    moments = joint.solution.state.moments
+    assert joint.timing == "lags" and moments is not None
+    free = np.isfinite(moments.information)
+    count = int(free.sum())
+    assert count > FRAMES // 2
+
+    def cost(times: float) -> float:
+        state = replace(joint.solution.state, moments=replace(moments, own=times * moments.own))
+        return cost_of_own_times(joint.observations, state, joint.sigma_px)
+
+    squares = float((moments.information[free] * moments.own[free] ** 2).sum())
+    assert squares > count * 0.3 * joint.sigma_px**2
+    # Positions and speeds change a little with the times, and with them what fitting gains by chance.
+    assert cost(1.0) - cost(0.0) == pytest.approx(squares, rel=0.05)
+    assert cost(0.0) > 0.5 * count * joint.sigma_px**2
+    assert cost_of_own_times(joint.observations, replace(joint.solution.state, moments=None), 1.0) == 0.0
 
 
 def test_cameras_of_one_moment_have_no_lag() -> None:
