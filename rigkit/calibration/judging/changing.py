@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.assemble import with_solution
+from rigkit.calibration.judging.drift import drifting
 from rigkit.calibration.judging.turned import flipped_images
 from rigkit.calibration.judging.two_kinds import two_kinds
 from rigkit.calibration.judging.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
@@ -115,6 +116,8 @@ def changing(
             return [flipped]
     if not but and changes["lens"].ratio >= MIN_VARIANCE_RATIO and (kinds := two_kinds(calibration, evidence)):
         return [kinds]
+    if not but and (drift := drifting(calibration, evidence)):
+        return [drift]
     if solved is not None and changes["lens"].ratio >= MIN_VARIANCE_RATIO and changes["lens"].share >= MIN_SHARE_TRIED:
         changes |= {
             kind: _solved_for(kind, evidence, calibration, *solved, changes[kind], clusters) for kind in OF_LENS

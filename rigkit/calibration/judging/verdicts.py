@@ -30,6 +30,7 @@ from rigkit.calibration.judging.mixed import two_cameras
 from rigkit.calibration.judging.moved import moment
 from rigkit.calibration.judging.pupil import modelled_pupil, moving_pupil
 from rigkit.calibration.judging.two_kinds import KINDS_REMEDY, min_of_a_kind
+from rigkit.calibration.judging.undistorted import undistorted
 from rigkit.calibration.judging.view_evidence import neighbour_correlation
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.solving.fit import Fit
@@ -132,6 +133,7 @@ def judge(
     if not mixed:
         found += [
             *unclear,
+            *undistorted(calibration),
             *([] if contradicting else pattern),
             *_overfit(calibration),
             *diagnose_boards(calibration, " if pixels are square" if upright else "", sure=not contradicting),

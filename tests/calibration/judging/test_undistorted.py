@@ -1,0 +1,37 @@
+"""Images that show no distortion, which few lenses take."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import SIZE, lens, random_views
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.cameras.base import Camera
+from rigkit.cameras.brown import Brown
+
+WITHOUT = Brown(SIZE, np.array([1200.0, 1200.0, 801.0, 595.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+SLIGHT = Brown(SIZE, np.array([1200.0, 1200.0, 801.0, 595.0, -0.02, 0.0, 0.0, 0.0, 0.0]))
+WORDS = "the images show no distortion"
+
+
+@pytest.mark.parametrize(
+    ("camera", "model", "reported"),
+    [
+        (WITHOUT, "pinhole", True),
+        (WITHOUT, "brown", True),
+        (SLIGHT, "brown", False),
+        (lens("fish"), "scaramuzza", False),
+    ],
+)
+def test_no_distortion_is_said(camera: Camera, model: str, reported: bool, rng: np.random.Generator) -> None:
+    views, _, _ = random_views(camera, 16, rng, reach_deg=33.0, noise_px=0.05)
+    found = calibrate(views, SIZE, model=model, board="flat", folds=0)
+    assert any(WORDS in str(verdict) for verdict in found.verdicts) == reported
+
+
+def test_a_narrow_lens_may_have_none(rng: np.random.Generator) -> None:
+    narrow = Brown(SIZE, np.array([6000.0, 6000.0, 801.0, 595.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    views, _, _ = random_views(narrow, 16, rng, reach_deg=6.0, noise_px=0.05)
+    found = calibrate(views, SIZE, model="pinhole", board="flat", folds=0)
+    assert not any(WORDS in str(verdict) for verdict in found.verdicts)
