@@ -69,7 +69,7 @@ def _place_together(image: GreyImage, lattice: Lattice, board: Board) -> tuple[i
     squares, cells = squares_of(lattice, dark=_pattern(board).inverted)
     if len(squares) < MIN_TAGS_OF_PLACE:
         return None
-    excess = excess_likeness(_as_printed(image, board), _within(squares, board), marker_codes(board))
+    excess = excess_likeness(as_printed(image, _pattern(board)), _within(squares, board), marker_codes(board))
     codes_at, places = np.full((board.rows + 1, board.columns + 1), -1), _places(board)
     codes_at[places[:, 1], places[:, 0]] = 4 * np.arange(len(places))
     place = place_together(excess, cells, lattice.size, codes_at)
@@ -138,7 +138,7 @@ def likeness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, numbers
     inside = np.isfinite(quads).all(axis=(1, 2))
     out, codes = np.full(len(squares), np.nan), marker_codes(board)
     if inside.any():
-        excess = excess_likeness(_as_printed(image, board), quads[inside], codes)
+        excess = excess_likeness(as_printed(image, _pattern(board)), quads[inside], codes)
         upright = {int(n): k for k, (n, turns) in enumerate(zip(codes.numbers, codes.turns, strict=True)) if turns == 0}
         out[inside] = excess[np.arange(len(excess)), [upright[int(n)] for n in numbers[inside]]]
     return out
@@ -149,7 +149,7 @@ def brightness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, board
     arguments as for `likeness_at`."""
     modules = marker_codes(board).modules
     middles = (np.stack(np.meshgrid(*2 * [np.arange(modules)]), axis=-1).reshape(-1, 2) + 0.5) / modules
-    return _sampled(_as_printed(image, board), _outlines(image, pixels, squares, board), middles)
+    return _sampled(as_printed(image, _pattern(board)), _outlines(image, pixels, squares, board), middles)
 
 
 def brightness_around(
@@ -157,7 +157,7 @@ def brightness_around(
 ) -> FloatArray:
     """Return the brightness (N, K), as `brightness_at`, at the positions `at` (K, 2), in sides of each square from its
     first corner, which may be beyond the square; NaN outside of the image."""
-    return _sampled(_as_printed(image, board), _square_corners(pixels, squares), at)
+    return _sampled(as_printed(image, _pattern(board)), _square_corners(pixels, squares), at)
 
 
 def _sampled(image: GreyImage, quads: FloatArray, at: FloatArray) -> FloatArray:
@@ -172,6 +172,11 @@ def _sampled(image: GreyImage, quads: FloatArray, at: FloatArray) -> FloatArray:
 
 def _in_image(image: GreyImage, places: FloatArray) -> BoolArray:
     return np.asarray(((places >= 0.0) & (places <= np.array(image.shape[::-1]) - 1.0)).all(axis=-1))
+
+
+def marker_outlines(image: GreyImage, pixels: FloatArray, board: Board) -> FloatArray:
+    """Return the outlines (M, 4, 2) of all markers of a ChArUco board; NaN and arguments as for `likeness_at`."""
+    return _outlines(image, pixels, _places(board), board)
 
 
 def _outlines(image: GreyImage, pixels: FloatArray, squares: IntArray, board: Board) -> FloatArray:
@@ -216,12 +221,12 @@ def marker_codes(board: Board) -> Codes:
 
 def _read(image: GreyImage, squares: FloatArray, board: Board) -> TagCode:
     """Return the codes in the squares (N, 4, 2) of a board."""
-    return read_tags(_as_printed(image, board), _within(squares, board), marker_codes(board))
+    return read_tags(as_printed(image, _pattern(board)), _within(squares, board), marker_codes(board))
 
 
-def _as_printed(image: GreyImage, board: Board) -> GreyImage:
+def as_printed(image: GreyImage, pattern: Charuco | AprilGrid) -> GreyImage:
     """Return the image with dark markers on white."""
-    return 255 - image if _pattern(board).inverted else image
+    return 255 - image if pattern.inverted else image
 
 
 def _within(squares: FloatArray, board: Board) -> FloatArray:

@@ -32,6 +32,7 @@ from rigkit.workflows.inputs.folder_session import Known
 from rigkit.workflows.inputs.identify_board import why_misplaced
 from rigkit.workflows.inputs.interlaced import interlaced
 from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.inputs.wrong_print import wrong_print
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths
 from rigkit.workflows.outputs.provenance import provenance_of
 
@@ -156,7 +157,12 @@ def calibration_from(
             if shown is None:
                 raise
             raise InputError(f"{shown} ({error})") from error
-    also = [*suggest_rigid_boards(views, result), *interlaced(result, named_images(session))]
+    images = named_images(session)
+    also = [
+        *suggest_rigid_boards(views, result),
+        *interlaced(result, images),
+        *wrong_print(result, images, session.boards),
+    ]
     verdicts = diagnose_session(result, dropped, also)
     if verdicts[0].severity is Severity.BAD:
         shown = why_misplaced(session.images, session.boards)
