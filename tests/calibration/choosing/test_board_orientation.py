@@ -82,6 +82,12 @@ def test_the_lens_gains_by_it(rng: np.random.Generator) -> None:
     assert np.abs(projection_difference(found.camera, best.camera, 0.95 * REACH_DEG["reg"])).max() < 1e-3
 
 
+def test_a_board_without_print_errors_has_no_ends_to_tell(rng: np.random.Generator) -> None:
+    views, _ = scene("flat", OBLONG, 8, rng)
+    result = calibrate(views, SIZE, model="brown", degree=4, board="released", folds=0, pupil="central")
+    assert not changed(result, views).any()
+
+
 @pytest.mark.parametrize("kind", ["flat", "bow", "print alike from both ends"])
 @pytest.mark.parametrize("shape", ["auto", "released"])
 def test_what_looks_the_same_from_both_ends_is_left_alone(kind: str, shape: str, rng: np.random.Generator) -> None:
