@@ -90,9 +90,11 @@ def plane_views(part: str) -> list[BoardView]:
     return [published_corners(path, board) for path in sorted(folder.glob("*.orpc"))]
 
 
+# Whether the pupil moves is decided in nearly half of the time.
+@pytest.mark.parametrize("pupil", ["central", pytest.param("auto", marks=pytest.mark.thorough)])
 @pytest.mark.parametrize(("shape", "limit"), [("warp", PLANE_WARP_PX), ("released", PLANE_RELEASED_PX)])
-def test_plane_with_published_corners(shape: str, limit: float) -> None:
-    result = calibrate(plane_views("train"), (1280, 800), model="kannala_brandt", board=shape)
+def test_plane_with_published_corners(shape: str, limit: float, pupil: str) -> None:
+    result = calibrate(plane_views("train"), (1280, 800), model="kannala_brandt", board=shape, pupil=pupil)
     assert len(result.views) == 18 and result.dropped == ()
     # The published test split, every corner of it: only the poses of its views are fitted.
     others = _rms_of_other_views(result, plane_views("test"))
