@@ -58,7 +58,7 @@ def worst_px(camera: Camera) -> float:
 
 def test_a_broken_link_is_named(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A store of data links images that were not fetched to nothing: the others are used, and these are named."""
-    folder = of_one_camera(pictures, tmp_path / "photos", 5)
+    folder = of_one_camera(pictures, tmp_path / "photos")
     (folder / "DSC_9999.JPG").symlink_to(tmp_path / "store" / "abc.jpg")
     command = [
         "calibrate",
@@ -73,7 +73,7 @@ def test_a_broken_link_is_named(pictures: Path, tmp_path: Path, capsys: pytest.C
     ]
     assert main(command) == 2
     assert load_calibration(tmp_path / "out.json").heldout_rms_px is not None
-    assert "5 files; SHA-256" in (tmp_path / "out.html").read_text()
+    assert f"{FRAMES} files; SHA-256" in (tmp_path / "out.html").read_text()
     assert "image 'DSC_9999.JPG' is left out" in "".join(capsys.readouterr())
 
 

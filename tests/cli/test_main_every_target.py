@@ -39,8 +39,6 @@ CAM_FROM_HAND = Rigid3(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([20.0, -30.
 BASE_FROM_BOARD = Rigid3(exp_so3(np.array([3.0, 0.2, 0.1])), np.array([600.0, 100.0, 0.0]))
 OPTICS, PHOTOMETRY = Optics(0.6, supersample=2), Photometry(exposure=0.95, noise_levels=1.5)
 VIEWS, FRESH = 6, 2
-COACHED = 4
-"""Pictures for a coach, which a first calibration needs."""
 SEEDS = {"left": 7, "right": 8, "fresh/left": 9, "fresh/right": 10}
 
 MIN_COSINE = 0.4
@@ -327,7 +325,7 @@ def test_the_coach_takes_pictures_of_every_board(lab: Lab, left: str, tmp_path: 
         guide=GuideOptions(boards=(board_of_words(lab.words),), hfov_deg=63.0),
     )
     coach = open_coach(options)
-    for n in range(COACHED):
+    for n in range(VIEWS):
         grey = to_grey(read_image(Path(left, f"{n:02d}.png")))
         state = coach.look([np.repeat(grey[..., None], 3, axis=2)], take=Take.YES)
         assert state["taken"] is not None

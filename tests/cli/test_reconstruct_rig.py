@@ -26,21 +26,25 @@ POSES = tuple(
 )
 
 
-@pytest.fixture
-def files(tmp_path: Path) -> tuple[Path, list[str], Corner]:
-    """A folder with the rig's file, three images, and the exact scene."""
+@pytest.fixture(scope="module")
+def corner_images() -> list[np.ndarray]:
+    """One picture of the corner by each camera."""
     rng = np.random.default_rng(5)
-    corner = Corner.of_a_room()
-    names = []
-    for k, pose in enumerate(POSES):
-        names.append(str(tmp_path / f"{k}.png"))
-        cv2.imwrite(names[-1], corner.image(CAMERA, pose, rng))
+    return [Corner.of_a_room().image(CAMERA, pose, rng) for pose in POSES]
+
+
+@pytest.fixture
+def files(corner_images: list[np.ndarray], tmp_path: Path) -> tuple[Path, list[str], Corner]:
+    """A folder with the rig's file, three images, and the exact scene."""
+    names = [str(tmp_path / f"{k}.png") for k in range(len(corner_images))]
+    for name, picture in zip(names, corner_images, strict=True):
+        cv2.imwrite(name, picture)
     cameras = [
         {"name": f"cam{k}", "camera": camera_to_json(CAMERA), "cam_from_rig": p.matrix()[:3].tolist(), "rms_px": 0.1}
         for k, p in enumerate(POSES)
     ]
     (tmp_path / "rig.json").write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": cameras}))
-    return tmp_path, names, corner
+    return tmp_path, names, Corner.of_a_room()
 
 
 def run(folder: Path, *more: str) -> int:
