@@ -30,8 +30,8 @@ WATCHED = (
 )
 """In place of the optimisation: arithmetic, and what is exported, are as always."""
 OPTIONS = {
-    # Python itself leaves memory to the system at its end.
-    "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0:detect_stack_use_after_return=1",
+    # Python itself leaves memory to the system at its end, and kernels without memory say so.
+    "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0:detect_stack_use_after_return=1:allocator_may_return_null=1",
     "UBSAN_OPTIONS": "print_stacktrace=1",
     "PYTHONMALLOC": "malloc",
 }
