@@ -23,7 +23,7 @@ from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.unknown_charuco import MarkerObservations, guessed_charuco
 from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, GuessedGrid, TagObservations, guessed_grids
-from rigkit.detection.whole_charuco import next_row, of_pattern
+from rigkit.detection.whole_charuco import begins, next_row, of_pattern
 from rigkit.detection.whole_grids import (
     MIN_IMAGES_OF_GUESS,
     GridSeen,
@@ -135,7 +135,7 @@ def _guess_of(
         while more and (taller := guessed_charuco(markers, charuco[0].rows + 1)):
             charuco, more = taller, next_row(taller[0], shown)
         board, sure = of_pattern(charuco, shown)
-        sizes = () if more is False else (board.size,)
+        sizes = () if more is False and begins(board, shown) else (board.size,)
         return BoardGuess(board=board, images=tuple(markers.images), sizes=sizes, either_pattern=not sure)
     guess = _plain_guess(images, plain)
     determined = guess is not None and guess.determined

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.patterns.aruco import largest_dictionary, marker_count
 from rigkit.core.patterns.charuco import Charuco
@@ -38,6 +38,9 @@ ACROSS_SQUARE, BEFORE_END, BEYOND_END = (0.2, 0.5, 0.8), 0.92, 1.06
 """Positions in squares of the last row, in their sides, at which the brightness shows where they end. The black squares
 of 5 boards in 46 REAL images, original and blurred by 3 px, end at 0.94 to 1.03 as predicted from the corners; at 1.07
 begins what is around a board that is cut out along its squares."""
+
+MIN_ENDS = 2
+"""Smallest number of squares that show where a board begins: one alone may be hidden."""
 
 MARKER_SEEN = 0.5
 """Smallest likeness of a marker that is not hidden, relative to the median of the row."""
@@ -81,18 +84,43 @@ def next_row(board: Board, images: Sequence[GreyImage]) -> bool | None:
         likeness = likeness_at(image, pixels, squares, numbers, taller)
         # An even place may also be covered, or outside of the valid part of a corrected image.
         likeness[likeness == 0.0] = np.nan
-        seen = last & (likeness > MARKER_SEEN * np.median([*likeness[last & np.isfinite(likeness)], 0.0]))
-        return likeness, _ends(image, pixels, squares[seen], taller)
+        return likeness, _ends(image, pixels, squares[last & _visible(likeness, last)], taller)
 
     likeness, ends = zip(*in_threads(like, images[:: -(-len(images) // IMAGES_OF_ROWS)]), strict=True)
     of_last, beyond = (np.concatenate([one[row] for one in likeness]) for row in (last, ~last))
     return _like_the_last(beyond[np.isfinite(beyond)], of_last[np.isfinite(of_last)], sum(ends))
 
 
-def _ends(image: GreyImage, pixels: FloatArray, marked: IntArray, board: Board) -> int:
+def begins(board: Board, images: Sequence[GreyImage]) -> bool:
+    """Return whether no row is before a board's first one: its markers are numbered from 0, or images show it."""
+    pattern = board.pattern
+    assert isinstance(pattern, Charuco)
+    if pattern.first_marker == 0:
+        return True
+    squares = pattern.places(*board.size)
+    first = squares[:, 1] == 0
+    numbers = pattern.first_marker + np.flatnonzero(first)
+
+    def count(image: GreyImage) -> int:
+        found = next((item for item in detect_boards(image, [board]) if item.board_id is not None), None)
+        if found is None:
+            return 0
+        likeness = likeness_at(image, found.lattice(), squares[first], numbers, board)
+        visible = _visible(likeness, np.ones(len(likeness), np.bool_))
+        return _ends(image, found.lattice(), squares[first][visible], board, first=True)
+
+    return sum(in_threads(count, images[:: -(-len(images) // IMAGES_OF_ROWS)])) >= MIN_ENDS
+
+
+def _visible(likeness: FloatArray, row: BoolArray) -> BoolArray:
+    """Return which markers (N,) are visible, by the median likeness of those of a row."""
+    return np.asarray(likeness > MARKER_SEEN * np.median([*likeness[row & np.isfinite(likeness)], 0.0]))
+
+
+def _ends(image: GreyImage, pixels: FloatArray, marked: IntArray, board: Board, *, first: bool = False) -> int:
     """Return how many squares with markers, `marked` (M, 2), of the last row show that the board ends with it: the next
     row would have black squares beyond them. It is 0 if one shows that it does not, or that the last row is covered:
-    then the black squares beside end elsewhere than it does.
+    then the black squares beside end elsewhere than it does. Or likewise the `first` row, before which it begins.
 
     pixels : (R, C, 2) corners.
     """
@@ -101,7 +129,7 @@ def _ends(image: GreyImage, pixels: FloatArray, marked: IntArray, board: Board) 
         return 0
     row = np.stack([np.arange(columns), np.full(columns, marked[0, 1])], axis=1)
     across, down = np.meshgrid(ACROSS_SQUARE, (BEFORE_END, BEYOND_END))
-    at = np.stack([across.ravel(), down.ravel()], axis=1)
+    at = np.stack([across.ravel(), 1.0 - down.ravel() if first else down.ravel()], axis=1)
     levels = brightness_around(image, pixels, row, at, board).reshape(columns, *across.shape).mean(axis=2)
     count = 0
     for column, modules in zip(marked[:, 0].tolist(), brightness_at(image, pixels, marked, board), strict=True):

@@ -18,7 +18,7 @@ from rigkit.detection.tags import unknown_tags
 from rigkit.detection.tags.unknown_charuco import MarkerObservations
 from rigkit.detection.tags.unknown_tags import TagObservations
 from rigkit.detection.unknown import guess_board
-from rigkit.detection.whole_charuco import next_row
+from rigkit.detection.whole_charuco import begins, next_row
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
@@ -166,6 +166,22 @@ def test_a_marked_board_that_the_frame_cuts_has_more_rows() -> None:
     guess = guess_board([image[:330].copy() for image in straight(MARKED)])
     assert guess is not None and guess.board.pattern.type == "charuco" and not guess.determined
     assert guess.sizes == ((10, 4),)
+
+
+def test_whether_a_board_begins_with_the_first_row_read() -> None:
+    """Four rows of squares have 22 markers."""
+    numbered = replace(MARKED, rows=4, pattern=Charuco("DICT_4X4_50", 45.0, first_marker=20))
+    assert begins(numbered, straight(numbered)) and begins(MARKED, [])
+    later = replace(MARKED, rows=3, pattern=Charuco("DICT_4X4_50", 45.0, first_marker=22))
+    assert not begins(later, straight(MARKED))
+
+
+def test_a_board_whose_first_rows_are_hidden_has_more() -> None:
+    images = straight(MARKED)
+    for image in images:
+        image[:240] = 235.0
+    guess = guess_board(images)
+    assert guess is not None and guess.board.pattern.type == "charuco" and not guess.determined
 
 
 def test_rows_that_were_not_read_are_added(monkeypatch: pytest.MonkeyPatch) -> None:
