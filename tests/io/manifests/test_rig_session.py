@@ -131,6 +131,10 @@ def test_near_copies_leave_the_moments_of_others_alone() -> None:
         # 0.4 ms after the image of the second camera is nearer than 0.6 ms before it.
         assert (shared, taken) == ((False, True) if copied is first else (True, False))
         assert len(set(frames["a"].values())) == 5
+    # Two of the second camera are near one moment of the first.
+    later = frames_of_images({"a": first, "b": [*second, f"{near_copy}.png"]})
+    assert [later["a"][image] for image in first] == [later["b"][image] for image in second]
+    assert later["b"][f"{near_copy}.png"] not in later["a"].values()
 
 
 def test_images_of_one_name_in_many_folders_are_told_apart_by_what_differs() -> None:
