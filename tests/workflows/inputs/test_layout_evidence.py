@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from helpers.stereo_pictures import FRAMES
 
 from rigkit.core.errors import InputError
 from rigkit.core.progress import silent
@@ -18,7 +19,6 @@ from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration
 from rigkit.workflows.inputs.corners import named_images
 from rigkit.workflows.inputs.folder_session import session_of_folders
 from rigkit.workflows.inputs.layout_evidence import cameras_seen
-from tests.helpers.stereo_pictures import FRAMES
 
 BOARD = board_of_words("9x6x30")
 
