@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
 from rigkit.calibration.choosing.begun import BegunCalibration, camera_named_in_errors
@@ -80,21 +81,13 @@ def calibrate_rig(
     _require_entries(views, sizes_px=sizes_px, model=model, degree=degree)
     _require_one_image(views)
     _require_known(views, sizes_px, known)
+    models = {name: model if isinstance(model, str) else model[name] for name in views}
+    degrees = {name: degree[name] if isinstance(degree, Mapping) else degree for name in views}
     requests = {
-        name: Request(
-            size_px=sizes_px[name],
-            model=model if isinstance(model, str) else model[name],
-            degree=degree[name] if isinstance(degree, Mapping) else degree,
-            board=board,
-            folds=folds,
-            pupil=pupil,
-        )
-        for name in views
+        n: Request(size_px=sizes_px[n], model=models[n], degree=degrees[n], board=board, folds=folds, pupil=pupil)
+        for n in views
     }
-
-    def each_alone(seen: Views) -> RigViews:
-        return _each_alone(seen, requests, known, begun, progress)
-
+    each_alone = partial(_each_alone, requests=requests, known=known, begun=begun, progress=progress)
     same = duplicate_images(views)
     every, notes = each_alone(views), tuple[Finding, ...]()
     if rigid_boards:
@@ -103,8 +96,7 @@ def calibrate_rig(
         joint, heldout = _best_timing(every, known, folds, progress)
     rig, far = assemble_rig(joint, heldout)
     notes = (*same, *_mispaired(rig, every, joint.cost_sigmas), *notes, *joint.notes)
-    options = ("model", {one.model for one in requests.values()}), ("board_shape", {board})
-    in_force = [name for name, values in options if values == {"auto"}]
+    in_force = [n for n, v in (("model", set(models.values())), ("board_shape", {board})) if v == {"auto"}]
     return replace(rig, verdicts=diagnose_rig(rig, far, notes, in_force=in_force))
 
 

@@ -19,7 +19,7 @@ from rigkit.calibration.certainty.uncertainty import (
     worst_direction,
 )
 from rigkit.calibration.choosing.between_models import rival_fits, rival_shapes
-from rigkit.calibration.choosing.choice import FittedModel, HeldOut, choose, described, settled
+from rigkit.calibration.choosing.choice import FittedModel, HeldOut, choose, converged_ones, described
 from rigkit.calibration.choosing.lens_choice import choose_lenses, like_cameras
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.choosing.one_model import ModelOutcome
@@ -110,8 +110,8 @@ def test_a_model_that_did_not_converge_is_not_chosen_beside_one_that_did(
     one, other = lenses(fits, np.zeros(IMAGES))
     stopped = Convergence(iterations=60, converged=False, reason="stopped after 60 iterations")
     creeping = replace(other, fit=replace(other.fit, convergence=stopped))
-    assert settled([creeping, one]) == [one]
-    assert settled([creeping]) == [creeping]
+    assert converged_ones([creeping, one]) == [one]
+    assert converged_ones([creeping]) == [creeping]
     assert creeping.heldout is not None
     better = replace(creeping, heldout=0.5 * creeping.heldout)
     assert choose([better, one]) is one
