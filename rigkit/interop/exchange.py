@@ -100,29 +100,6 @@ def best_accepted(
     return min((entry for entry in found if entry[1].covered >= widest - 0.01), key=lambda entry: entry[0])[1]
 
 
-def best_common(
-    cameras: Sequence[Camera],
-    families: Sequence[Sequence[Accepted]],
-    format_name: str,
-    outlines: Sequence[Pixels | None],
-) -> tuple[Written, ...]:
-    """Return the cameras as `best_accepted`, all by models of one of the `families`: that which covers most of the
-    images, then has the smallest maximum error. Raises InputError if none fits all lenses."""
-    found = []
-    for accepted in families:
-        try:
-            written = tuple(
-                best_accepted(camera, accepted, format_name, outline)
-                for camera, outline in zip(cameras, outlines, strict=True)
-            )
-        except InputError:
-            continue
-        found.append((1.0 - min(one.covered for one in written), max(one.max_error_px for one in written), written))
-    if not found:
-        raise InputError(f"{format_name}: no family of its models follows all lenses; take another format")
-    return min(found, key=lambda entry: entry[:2])[2]
-
-
 def _without_zero_terms(camera: Camera) -> list[Camera]:
     """Return the Brown camera with fewer terms, for all counts whose omitted terms are zero."""
     if camera.model != "brown":

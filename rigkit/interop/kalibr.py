@@ -23,7 +23,6 @@ from rigkit.interop.exchange import (
     Accepted,
     Written,
     best_accepted,
-    best_common,
     camera_of,
     field,
     image_size,
@@ -36,11 +35,7 @@ from rigkit.interop.foreign_lenses import fov_lens, unified_brown_lens
 from rigkit.interop.nearest import Lens, nearest_camera_of
 from rigkit.interop.yaml_text import flow, parse_yaml
 
-KALIBR_FAMILIES = (
-    PERSPECTIVE[:2],
-    *((Accepted(model),) for model in ("kannala_brandt", "ucm", "eucm", "double_sphere")),
-)
-KALIBR_ACCEPTS = tuple(kind for family in KALIBR_FAMILIES for kind in family)
+KALIBR_ACCEPTS = (*PERSPECTIVE[:2], *(Accepted(model) for model in ("kannala_brandt", "ucm", "eucm", "double_sphere")))
 _log = logging.getLogger(__name__)
 
 CAMERA = re.compile(r"cam[0-9]{1,3}")
@@ -66,16 +61,15 @@ def write_kalibr(
     cam_from_rig : pose of each camera, in mm; needed for several cameras.
     outlines : outline of each camera, as for `best_accepted`; None: unknown.
 
-    Lenses of one model that Kalibr lacks are refitted by one model, not each by its own. Raises InputError for missing
-    poses, or a lens that no model of Kalibr fits.
+    Raises InputError for missing poses, or a lens that no model of Kalibr fits.
     """
     if not cameras or (len(cameras) > 1 and cam_from_rig is None):
         raise InputError("camchain: give at least one camera, and for several the pose of each (cam_from_rig)")
     if cam_from_rig is not None and len(cam_from_rig) != len(cameras):
         raise InputError(f"camchain: {len(cameras)} cameras, but {len(cam_from_rig)} poses")
     parts = []
-    for i, chosen in enumerate(_accepted(cameras, outlines or [None] * len(cameras))):
-        camera = cameras[i]
+    for i, camera in enumerate(cameras):
+        chosen = best_accepted(camera, KALIBR_ACCEPTS, "Kalibr", None if outlines is None else outlines[i])
         model, intrinsics, distortion_model, distortion = _described(chosen.camera)
         lines = [f"cam{i}:"]
         if i and cam_from_rig is not None:
@@ -92,21 +86,6 @@ def write_kalibr(
         ]
         parts.append(replace(chosen, text="\n".join(lines) + "\n"))
     return KalibrChain("".join(part.text for part in parts), tuple(parts))
-
-
-def _accepted(cameras: Sequence[Camera], outlines: Sequence[Pixels | None]) -> list[Written]:
-    """Return the cameras in Kalibr's models; where refits of lenses of one model would differ in theirs, the one that
-    fits all best."""
-    found = [best_accepted(c, KALIBR_ACCEPTS, "Kalibr", o) for c, o in zip(cameras, outlines, strict=True)]
-    for model in dict.fromkeys(camera.model for camera in cameras):
-        own = [k for k, one in enumerate(found) if cameras[k].model == model and one.note]
-        models = {found[k].camera.model for k in own}
-        if len(models) > 1:
-            families = [family for family in KALIBR_FAMILIES if models & {kind.model for kind in family}]
-            alike = best_common([cameras[k] for k in own], families, "Kalibr", [outlines[k] for k in own])
-            for k, one in zip(own, alike, strict=True):
-                found[k] = one
-    return found
 
 
 def read_kalibr(text: str, name: str = "camchain") -> tuple[tuple[Camera, ...], tuple[Rigid3, ...]]:

@@ -25,7 +25,6 @@ from rigkit.interop.exchange import (
     Accepted,
     Written,
     best_accepted,
-    best_common,
     camera_of,
     field,
     numbers,
@@ -170,8 +169,7 @@ def opencv_stereo(
     if camera1.size_px != camera2.size_px:
         sizes = " and ".join(f"{width}x{height}" for width, height in (camera1.size_px, camera2.size_px))
         raise InputError(f"OpenCV stereo: images of {sizes} px are not rectified together; take another format")
-    first, second = best_common((camera1, camera2), FAMILIES, "OpenCV", outlines)
-    chosen, fisheye = (first, second), first.camera.model == "kannala_brandt"
+    chosen, fisheye = _family(camera1, camera2, outlines)
     (K1, D1), (K2, D2) = (opencv_arrays(one.camera) for one in chosen)
     R, T = cam2_from_cam1.rotation, cam2_from_cam1.translation_mm
     R1, R2, P1, P2, Q = _rectified((K1, D1, K2, D2), camera1.size_px, R, T.reshape(3, 1), fisheye=fisheye)
@@ -200,6 +198,27 @@ def read_opencv_stereo(text: str, name: str = "OpenCV stereo") -> tuple[tuple[Ca
         camera_from_arrays(size, found[f"M{k}"], found[f"D{k}"], fisheye=fisheye, name=name) for k in (1, 2)
     )
     return (camera1, camera2), pose_of(found["R"].reshape(3, 3), found["T"], name)
+
+
+def _family(
+    camera1: Camera, camera2: Camera, outlines: Sequence[Pixels | None]
+) -> tuple[tuple[Written, Written], bool]:
+    """Return both cameras in the family of models that covers more of the images, then has the smaller error."""
+    found = []
+    for fisheye, accepted in enumerate(FAMILIES):
+        try:
+            pair = (
+                best_accepted(camera1, accepted, "OpenCV", outlines[0]),
+                best_accepted(camera2, accepted, "OpenCV", outlines[1]),
+            )
+        except InputError:
+            continue
+        missed = 1.0 - min(one.covered for one in pair)
+        found.append((missed, max(one.max_error_px for one in pair), fisheye, pair))
+    if not found:
+        raise InputError("OpenCV stereo: no family of OpenCV's models follows both lenses; take another format")
+    _, _, fisheye, pair = min(found, key=lambda f: f[:3])
+    return pair, bool(fisheye)
 
 
 def _rectified(
