@@ -212,23 +212,14 @@ def cost_of_own_times(observations: RigObservations, state: RigState, sigma_px: 
     """Return what the images' own times cost where they were fitted to the observations, px^2: their distance from the
     lags under the prior, and what fitting them gains by chance, so that the cost with it is that of frames whose times
     are predicted (twice the negative logarithm of the marginal likelihood, times `sigma_px` squared)."""
-    if state.moments is None:
+    if state.exposures is None:
         return 0.0
     by_target = _by_target(state, observations)
-    information = state.moments.information.T
+    own, information = state.exposures.own.T, state.exposures.information.T
     free = _free(by_target) & np.isfinite(information)
-    system = _with_times(by_target, state.moments.speeds_at_all())[..., :-1]
-    poses, late = np.arange(6), np.arange(6, system.shape[1])
-    largest = np.maximum(np.einsum("fii->fi", system).max(axis=1, keepdims=True), 1.0)
-    system[:, poses, poses] += RIDGE * largest
-    alone = np.linalg.slogdet(system[:, :6, :6])[1]
-    # A time that is not free has no part: its row is that of a unit matrix.
-    used = np.pad(free, ((0, 0), (6, 0)), constant_values=True)
-    system *= used[:, None] & used[:, :, None]
-    prior = np.where(free, information, 1.0)
-    system[:, late, late] += prior
-    chance = np.linalg.slogdet(system)[1] - alone - np.log(prior).sum(axis=1)
-    return float((np.where(free, state.moments.own.T, 0.0) ** 2 * prior).sum() + sigma_px**2 * chance.sum())
+    system, prior = _regularised(_with_times(by_target, state.exposures.all_speeds()), free, information)
+    chance = np.linalg.slogdet(system)[1] - np.linalg.slogdet(system[:, :6, :6])[1] - np.log(prior).sum(axis=1)
+    return float((own[free] ** 2 * prior[free]).sum() + sigma_px**2 * chance.sum())
 
 
 def _by_target(state: RigState, observations: RigObservations) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -184,22 +184,22 @@ def test_times_fitted_to_heldout_frames_cost_what_predicting_them_would() -> Non
         patch.setattr("rigkit.calibration.rig.calibrate.heldout_rms", kept)
         rig_of(0.1, 1, jitter=0.05)
     (joint,) = joints
-    moments = joint.solution.state.moments
-    assert joint.timing == "lags" and moments is not None
-    free = np.isfinite(moments.information)
+    exposures = joint.solution.state.exposures
+    assert joint.timing == "lags" and exposures is not None
+    free = np.isfinite(exposures.information)
     count = int(free.sum())
     assert count > FRAMES // 2
 
     def cost(times: float) -> float:
-        state = replace(joint.solution.state, moments=replace(moments, own=times * moments.own))
+        state = replace(joint.solution.state, exposures=replace(exposures, own=times * exposures.own))
         return cost_of_own_times(joint.observations, state, joint.sigma_px)
 
-    squares = float((moments.information[free] * moments.own[free] ** 2).sum())
+    squares = float((exposures.information[free] * exposures.own[free] ** 2).sum())
     assert squares > count * 0.3 * joint.sigma_px**2
     # Positions and speeds change a little with the times, and with them what fitting gains by chance.
     assert cost(1.0) - cost(0.0) == pytest.approx(squares, rel=0.05)
     assert cost(0.0) > 0.5 * count * joint.sigma_px**2
-    assert cost_of_own_times(joint.observations, replace(joint.solution.state, moments=None), 1.0) == 0.0
+    assert cost_of_own_times(joint.observations, replace(joint.solution.state, exposures=None), 1.0) == 0.0
 
 
 def test_cameras_of_one_moment_have_no_lag() -> None:
