@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from rigkit.calibration.board_shape import BoardShape
-from rigkit.calibration.result import Calibration
+from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.cameras.base import Camera
 from rigkit.core.findings import Finding
 from rigkit.core.patterns.aprilgrid import AprilGrid
 
@@ -33,7 +34,7 @@ def diagnose_boards(c: Calibration, provided: str, *, sure: bool) -> Iterator[Fi
     """
     for board in c.boards:
         name = f"board '{board.board_id}'"
-        yield from _unseen_rows(name, board, c)
+        yield from _unseen_rows(name, board, c.camera, c.views)
         if board.kind == "flat":
             continue
         extent = float(np.linalg.norm(np.ptp(board.points_mm, axis=0)))
@@ -52,11 +53,11 @@ def diagnose_boards(c: Calibration, provided: str, *, sure: bool) -> Iterator[Fi
         yield from _spacing(name, board)
 
 
-def _unseen_rows(name: str, board: BoardShape, c: Calibration) -> Iterator[Finding]:
+def _unseen_rows(name: str, board: BoardShape, camera: Camera, views: Sequence[ViewResult]) -> Iterator[Finding]:
     """Yield a finding where no image shows the first or last rows of a board with marks, though they would be in
     several: fewer are printed than declared. Other numbers of columns, or of rows of a chessboard, fit no corners."""
     declared = board.declared
-    views = [view for view in c.views if view.board_id == board.board_id]
+    views = [view for view in views if view.board_id == board.board_id]
     if declared is None or not declared.identified or not views:
         return
     seen = np.concatenate([view.grid[:, 1] for view in views])
@@ -67,8 +68,8 @@ def _unseen_rows(name: str, board: BoardShape, c: Calibration) -> Iterator[Findi
         return
     count = 0
     for view in views:
-        pixels, valid = c.camera.project(view.cam_from_board.apply(declared.points(unseen)))
-        count += bool((valid & c.camera.on_image(pixels)).all())
+        pixels, valid = camera.project(view.cam_from_board.apply(declared.points(unseen)))
+        count += bool((valid & camera.on_image(pixels)).all())
     if count < MIN_WITHOUT_ROWS:
         return
     size = f"{declared.columns // per} x {{}} {declared.pattern.count_word}"

@@ -158,11 +158,7 @@ def calibration_from(
                 raise
             raise InputError(f"{shown} ({error})") from error
     images = named_images(session)
-    also = [
-        *suggest_rigid_boards(views, result),
-        *interlaced(result, images),
-        *wrong_print(result, images, session.boards),
-    ]
+    also = [*suggest_rigid_boards(views, result), *interlaced(result, images), *wrong_print(views, images)]
     verdicts = diagnose_session(result, dropped, also)
     if verdicts[0].severity is Severity.BAD:
         shown = why_misplaced(session.images, session.boards)

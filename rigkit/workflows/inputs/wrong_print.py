@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.core.patterns.aprilgrid import MAX_BORDER, AprilGrid
@@ -34,14 +34,14 @@ OFF_MARKER = 0.08
 4 boards declared as printed (REAL, original, blurred by 2 px, with twice the light)."""
 
 
-def wrong_print(calibration: Calibration, images: Mapping[str, Path], boards: Sequence[Board]) -> list[Finding]:
+def wrong_print(views: Sequence[BoardView], images: Mapping[str, Path]) -> list[Finding]:
     """Return findings on boards whose tags or markers are printed otherwise than declared; unreadable `images` (files
     by name) are skipped."""
     out = []
-    for board in boards:
+    for board in {view.board.board_id: view.board for view in views}.values():
         prints = list(_prints(board))
         if prints:
-            seen = list(_seen(calibration, images, board))
+            seen = list(_seen([view for view in views if view.board.board_id == board.board_id], images))
             likeness = [_mean_likeness(seen, one) for one in prints]
             out += _finding(board, prints[int(np.argmax(likeness))], max(likeness) - _mean_likeness(seen, board))
     return out
@@ -57,12 +57,12 @@ def _prints(board: Board) -> Iterator[Board]:
             yield replace(board, pattern=replace(pattern, marker_mm=side * min(board.squares_mm)))
 
 
-def _seen(calibration: Calibration, images: Mapping[str, Path], board: Board) -> Iterator[tuple[GreyImage, FloatArray]]:
-    """Yield some images of a board with its corners (R, C, 2)."""
-    there = [view for view in calibration.views if view.board_id == board.board_id and view.image in images]
+def _seen(views: Sequence[BoardView], images: Mapping[str, Path]) -> Iterator[tuple[GreyImage, FloatArray]]:
+    """Yield some images of a board's views with its corners (R, C, 2)."""
+    there = [view for view in views if view.image in images]
     chosen = np.unique(np.linspace(0, len(there) - 1, min(IMAGES_OF_PRINT, len(there))).astype(int)).tolist()
     for view in (there[k] for k in chosen):
-        lattice = np.full((board.rows, board.columns, 2), np.nan)
+        lattice = np.full((view.board.rows, view.board.columns, 2), np.nan)
         lattice[view.grid[:, 1], view.grid[:, 0]] = view.pixels
         try:
             yield grey_image(read_image(images[view.image])), lattice

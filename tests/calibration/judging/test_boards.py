@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -54,8 +52,8 @@ def test_rows_that_no_image_shows_are_told(own: int, count: int, told: bool, rng
                 kept=np.ones(own * 8, bool),
             )
         )
-    calibration: Any = SimpleNamespace(views=results[:count], camera=lens("reg"))
-    found = _unseen_rows("board 'tags'", BoardShape("tags", "flat", board.points(), declared=board), calibration)
+    shape = BoardShape("tags", "flat", board.points(), declared=board)
+    found = list(_unseen_rows("board 'tags'", shape, lens("reg"), results[:count]))
     assert bool(found) == told
     if told:
         assert found[0].message == (

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +11,7 @@ import pytest
 from detection_bench.scenes import one_board
 
 from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.charuco import Charuco
@@ -47,9 +46,9 @@ def test_prints_unlike_the_declared_ones_are_told(
     scene = one_board(rng, board=board, max_tilt_deg=30.0)
     cv2.imwrite(str(tmp_path / "a.png"), np.asarray(scene.render(optics=Optics(0.7), noise_levels=2.0, rng=rng)))
     (truth,) = scene.truth()
-    views = [SimpleNamespace(image=name, board_id="b", grid=truth.grid, pixels=truth.pixels) for name in ("a", "gone")]
+    wrong, sigma_px = replace(board, pattern=declared), np.full(len(truth.grid), 0.1)
+    views = [BoardView(name, wrong, truth.grid, truth.pixels, sigma_px) for name in ("a", "gone")]
     images = {"a": tmp_path / "a.png", "gone": tmp_path / "gone.png"}
-    calibration: Any = SimpleNamespace(views=views)
-    found = wrong_print(calibration, images, [replace(board, pattern=declared)])
+    found = wrong_print(views, images)
     assert [finding.message for finding in found] == ([] if told is None else [told])
-    assert wrong_print(calibration, {}, [replace(board, pattern=declared)]) == []
+    assert wrong_print(views, {}) == []
