@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import known_median
 from rigkit.detection.checks.border import ends_quietly
-from rigkit.detection.checks.discontinuity import split_at_discontinuities, without_outliers
+from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at_discontinuities, without_outliers
 from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS, OF_EXPECTED_SIZE, Evidence
 from rigkit.detection.checks.validate import (
     compact,
@@ -248,7 +248,11 @@ def _fitted(
     out = []
     for item in _confirmed(grey, boards, refined, sought):
         own = without_outliers(item, size_px)
-        parts = split_at_discontinuities(own, several=too_large(own.lattice, sought.sizes))
+        parts = (
+            split_at_discontinuities(own, several=too_large(own.lattice, sought.sizes))
+            if may_be_discontinuous(item, size_px)
+            else [own]
+        )
         if len(parts) == 1:
             if large(own.lattice, sought.min_corners):
                 # Corners of squares with markers are fitted again by their finder.

@@ -38,6 +38,9 @@ MIN_SUSPECT_RESIDUAL = 0.02
 MIN_NEIGHBOURS_FIT = 8
 """Smallest number of corners of a prediction by which a suspect is dropped."""
 
+UNUSUAL, MIN_UNUSUAL = 1.3, 3
+"""There may be a discontinuity if at least MIN_UNUSUAL corners have residuals above UNUSUAL times the median."""
+
 WINDOW = 5
 """Columns on each side of a discontinuity that are used."""
 
@@ -60,6 +63,23 @@ AS_SMOOTH = 1.3
 
 SURFACE_RIDGE = 1e-9
 """Ridge of the normal equations, whose terms are about 1: terms that few columns do not determine remain 0."""
+
+
+def may_be_discontinuous(item: RefinedLattice, size_px: tuple[int, int]) -> bool:
+    """Return quickly whether `item` may have a discontinuity; `size_px` is the (width, height) of the image.
+
+    Corners on a discontinuity have large residuals; if boards are not exactly side by side, corners within the image
+    are missing.
+    """
+    known = item.lattice.known
+    relative = np.sort(item.residual[known] / item.lattice.contrast[known])
+    if len(relative) > MIN_UNUSUAL and float(relative[-MIN_UNUSUAL]) > UNUSUAL * float(relative[len(relative) // 2]):
+        return True
+    if known.all():
+        return False
+    missing = fit_cells(item.lattice.pixels, ~known, degree=1).pixels
+    inside = ((missing > 0.0) & (missing < np.array(size_px) - 1.0)).all(axis=1)
+    return int(np.count_nonzero(inside)) >= MIN_UNUSUAL
 
 
 def without_outliers(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedLattice:

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
-from rigkit.detection.checks.discontinuity import split_at_discontinuities, without_outliers
+from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at_discontinuities, without_outliers
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.subpixel.refined import RefinedLattice
@@ -146,6 +146,19 @@ def test_parts_of_a_board_that_something_covers_stay_together(rng: np.random.Gen
     covered[:4, 5:7] = np.nan
     covered[4:, 6:9] = np.nan
     assert len(split_at_discontinuities(sheet(covered))) == 1
+
+
+def test_only_suspicious_lattices_need_the_full_search() -> None:
+    whole = sheet(smooth(8, 6))
+    assert not may_be_discontinuous(whole, SIZE_PX)
+    hidden = whole.without(np.add.outer(np.arange(6), np.arange(8)) < 3)
+    assert may_be_discontinuous(hidden, SIZE_PX)
+    # What the frame cuts off is not missing.
+    moved = hidden.lattice.pixels - [50.0, 50.0]
+    assert not may_be_discontinuous(replace(hidden, lattice=replace(hidden.lattice, pixels=moved)), SIZE_PX)
+    uneven = whole.residual.copy()
+    uneven[:, 3] *= 1.5
+    assert may_be_discontinuous(replace(whole, residual=uneven), SIZE_PX)
 
 
 def test_what_fits_badly_goes_where_it_lies_aside_and_else_stays(rng: np.random.Generator) -> None:
