@@ -107,10 +107,9 @@ def judge(
     unlike, unclear = ([], []) if mixed else _views(calibration)
     pattern = [] if mixed else list(_pattern(calibration, correlation, in_force, bool(change)))
     effects = list(_uncertain(calibration, far))
-    # Images that contradict each other make the lens uncertain, however many there are.
-    contradicting = worst(effects) is Severity.BAD
-    # A cause found already explains why later images are of another lens than the first.
-    named = bool(mixed) or worst(change) is Severity.BAD
+    # Images that contradict each other make the lens uncertain, however many there are. A cause found already explains
+    # why later images are of another lens than the first.
+    contradicting, named = worst(effects) is Severity.BAD, bool(mixed) or worst(change) is Severity.BAD
     # Findings that make the quality of the calibration unknown: it is not called good.
     causes = [
         *_not_converged(calibration, in_force),

@@ -282,10 +282,10 @@ NAME_PART = re.compile(r"\d+|[^\W\d_]+|[\W_]+")
 
 def _parts_that_differ(images: Sequence[str]) -> list[str]:
     """Return for each image of a camera the parts of its path and name that are not those of all its images: 07 of
-    frame_07/left.png and of img_07_22113.png. Names of different structure are kept whole."""
+    frame_07/left.png and of img_07_22113.png. Names of different structure, and of a single image, are kept whole."""
     paths = [PurePath(image) for image in images]
     parts = [[part for name in (*path.parent.parts, path.stem) for part in NAME_PART.findall(name)] for path in paths]
-    if len({len(own) for own in parts}) != 1:
+    if len(images) < 2 or len({len(own) for own in parts}) != 1:
         return [str(path.with_suffix("")) for path in paths]
     differ = [k for k, values in enumerate(zip(*parts, strict=True)) if len(set(values)) > 1]
     return ["_".join(own[k] for k in differ) for own in parts]
