@@ -9,6 +9,7 @@ type and order, for others an error is raised.
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections.abc import Callable
 from typing import Any, NoReturn, Self, TypeVar, cast
 
@@ -198,10 +199,15 @@ def structure(name: str) -> Any:
     return fill
 
 
+_making = threading.Lock()
+"""Two classes of one structure are not the same type to a kernel."""
+
+
 def make_struct(name: str, **members: Any) -> Struct:
     """Return the structure `name` of api.h, which needs no class of its own, with its members; see `Struct.of`."""
-    if name not in STRUCTURES:
-        structure(name)(type(name, (Struct,), {}))
+    with _making:
+        if name not in STRUCTURES:
+            structure(name)(type(name, (Struct,), {}))
     return STRUCTURES[name].of(**members)
 
 

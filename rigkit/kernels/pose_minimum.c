@@ -68,7 +68,7 @@ INLINE void affinity_terms(const pose_problem_t *p, const pose_t pose, int64_t r
         const double variance = at[22 * chosen + k] * square + 0.5 * (share1 + share2);
         const double scale = variance > 0.0 ? 1.0 / sqrt(variance) : 0.0;
         const double half = variance > 0.0 ? 0.5 / variance : 0.0, inverse = 2.0 * half * at[22 * chosen + k];
-        /* residuals._half_slope */
+        /* residuals._half_pixel_share_jacobian */
         const double s1 = half * at[23 * chosen + k], s2 = half * at[24 * chosen + k];
         const double puu = s1 * (a1 * auu + a2 * avu) + s2 * muu, pvu = s1 * (a3 * auu + a4 * avu) + s2 * mvu;
         const double puv = s1 * (a1 * auv + a2 * avv) + s2 * muv, pvv = s1 * (a3 * auv + a4 * avv) + s2 * mvv;

@@ -336,7 +336,7 @@ void refit_tag_corners(const tag_fit_t *fit)
     fit->numbers[MAP_KNOWN] = 0.0;
 }
 
-/* Return the factor for the sigmas of the corners fitted together last (detection.subpixel.correlation.sigma_factors). */
+/* Return the factor for the sigmas of the corners fitted together last (rigkit.kernels.edges.sigma_factors). */
 double tag_sigma_factor(const tag_fit_t *fit, const factor_rules_t *rules)
 {
     tag_room_t room = room_of(fit);

@@ -189,7 +189,7 @@ def images_of(table: TomlTable) -> tuple[Path, ...]:
         for match in filter(is_file_or_broken_link, matches):
             # A file found twice is one image, under its first name.
             first = found.setdefault(match.resolve(), named_path(match))
-            again += [(first, match)] if first != named_path(match) else []
+            again += [(first, named_path(match))] if first != named_path(match) else []
         absent += [pattern] if not matches else []
     # No image at all is valid if the corners are cached; a single pattern without a match is a mistake.
     if found and absent:

@@ -151,6 +151,8 @@ def images_of_folder(folder: Path, pattern: str = "*") -> list[Path]:
 def images_below(folder: Path) -> list[Path]:
     """Return the images of a folder and its subfolders, sorted; hidden subfolders are skipped, unreadable ones with a
     warning, and links to folders are followed unless these are below, too."""
+    if not folder.is_dir():
+        return []
     out, walked = list[Path](), set[Path]()
 
     def warn(error: OSError) -> None:

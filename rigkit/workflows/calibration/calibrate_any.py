@@ -79,7 +79,8 @@ def calibrate_sources(
         )
     if has_options:
         raise InputError(
-            f"calibrate: '{first}' states its board and model already; leave out --board, --square-mm and --model"
+            f"calibrate: '{first}' states board, model and cameras already; leave out --board, --square-mm, --model "
+            "and --cameras"
         )
     return calibrate_session_file(first, options, progress=progress)
 
@@ -125,6 +126,8 @@ def calibrate_folders(
     """
     given = [inside for folder in folders for inside in videos_inside(Path(folder))]
     videos = _videos_of(given, options.output)
+    if videos and folder_options.cameras not in (None, len(videos)):
+        raise InputError(f"calibrate: --cameras {folder_options.cameras}, but the videos are of {len(videos)}")
     places = list(videos) or given
     session = _session_path(places, options.output)
     declared = [*folders, *([folder_options.timestamps] if folder_options.timestamps else [])]

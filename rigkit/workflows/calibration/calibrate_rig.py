@@ -28,9 +28,10 @@ from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibration
 from rigkit.workflows.calibration.rigid_boards import named_as_listed, named_by_rule, require_distinct
 from rigkit.workflows.calibration.session_page import rig_page
 from rigkit.workflows.inputs.camera_files import file_of_camera
-from rigkit.workflows.inputs.corners import SessionCorners, session_corners, session_views
+from rigkit.workflows.inputs.corners import SessionCorners, named_images, session_corners, session_views
 from rigkit.workflows.inputs.identify_board import why_misplaced
 from rigkit.workflows.inputs.known_cameras import known_cameras, known_cameras_first, with_known
+from rigkit.workflows.inputs.wrong_print import wrong_print
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
 from rigkit.workflows.outputs.provenance import provenance_of
 
@@ -220,13 +221,12 @@ def rig_from(
             raise
         raise InputError(f"{session.path}: {causes[0]} ({error})") from error
     rig = named_by_rule(session, rig)
-    if not session.rigid_boards:
-        ties = [
-            s
-            for own, c in zip(views.values(), rig.single, strict=True)
-            for s in suggest_rigid_boards([v for _, v in own], c)
-        ]
-        rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(ties)))
+    also = list[Finding]()
+    for (name, own), calibration in zip(views.items(), rig.single, strict=True):
+        seen = [view for _, view in own]
+        also += [] if session.rigid_boards else suggest_rigid_boards(seen, calibration)
+        also += wrong_print(seen, named_images(session.cameras[name]))
+    rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(also)))
     if rig.verdicts[0].severity is Severity.BAD:
         wrong = [Finding.bad(words) for words in _misread(session)]
         rig = replace(rig, verdicts=(rig.verdicts[0], *wrong, *rig.verdicts[1:]))

@@ -18,7 +18,6 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.processes import in_threads
 from rigkit.core.progress import Progress
-from rigkit.geometry.rotation import rotation_angle
 from rigkit.io.corners.corner_cache import FoundCorners
 from rigkit.io.manifests.session import Session
 from rigkit.io.media.images import images_below
@@ -36,12 +35,14 @@ _log = logging.getLogger(__name__)
 
 MAX_MOMENTS = 12
 """Number of moments whose images are looked at."""
-TOGETHER = 0.2
+TOGETHER = 0.05
 """Distance between the cameras' views of a board, where one mount fits best, over that with moments exchanged, up to
-which they are of one moment. REAL: 0.001 for the pairs of bouguet-stereo and
-bumblebee2, 0.86 and more for images of one camera, side by side or by halves."""
+which they are of one moment. REAL: 0.001 for the pairs of bouguet-stereo and bumblebee2, 0.86 and more for images of
+one camera, side by side or by halves. SIMULATED: 0.17 and more for a board that one camera sees twice at the same
+tilts, repeated to 3 degrees and 10 mm. A robot that repeats them exactly looks like a rig."""
 MIN_CAMERA_MOTION = 0.02
-"""Motion of boards between two cameras, as a part of their distance; less is a camera that took everything twice."""
+"""Distance of two cameras, as a part of that of the boards, or angle of their axes; less is one camera that took
+everything twice, or whose images were rotated."""
 
 
 def cameras_by_name(folders: Sequence[Path], count: int | None = None) -> dict[str, list[tuple[Path, str]]] | None:
@@ -67,12 +68,15 @@ def cameras_seen(
         found, doubt = {}, error
     if len(folders) > 1 or len(found) > 1:
         return found if doubt is None else cameras_in(folders)
-    layouts = layouts_of(images_below(folders[0]))
+    images = images_below(folders[0])
+    layouts = layouts_of(images)
     for layout in layouts:
         if on_one_mount(layout, boards, path, progress):
             _log.info(f"by names and boards the images are of {layout}; --cameras 1 takes them as one camera's")
             return images_of_layout(layout)
     named = " or ".join(f"{layout} (--cameras {len(layout.cameras)})" for layout in layouts)
+    if doubt is not None and not images:
+        raise doubt
     if doubt is not None:
         shown = f"; by their names the images may be of {named}, but boards do not move alike there" if named else ""
         raise InputError(f"{doubt}; if all are of one camera: --cameras 1{shown}") from doubt
@@ -138,7 +142,8 @@ def _move_alike(views: RigViews) -> bool | None:
     if not np.isfinite(together) or not np.isfinite(exchanged):
         return None
     distance = np.median([np.linalg.norm(e.cam_from_board.translation_mm) for e in views.seen[0].values()])
-    moved = [max(rotation_angle(m.rotation), np.linalg.norm(m.translation_mm) / distance) for m in mounts[1:]]
+    axes = [np.arccos(np.clip(m.rotation[2, 2], -1.0, 1.0)) for m in mounts[1:]]
+    moved = [max(axis, np.linalg.norm(m.translation_mm) / distance) for axis, m in zip(axes, mounts[1:], strict=True)]
     return together <= TOGETHER * exchanged and min(moved) > MIN_CAMERA_MOTION
 
 

@@ -6,6 +6,8 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from helpers.stereo_pictures import FRAMES
 
@@ -13,6 +15,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.progress import silent
 from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.manifests.rig_session import frames_of_images, load_rig_session
+from rigkit.io.media.images import read_image
 from rigkit.workflows.calibration.calibrate import CalibrateOptions
 from rigkit.workflows.calibration.calibrate_any import FolderOptions, calibrate_sources
 from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration
@@ -80,8 +83,10 @@ def test_boards_of_one_camera_do_not(pictures: Path, tmp_path: Path, form: str) 
         cameras_seen([folder], [BOARD], folder / "session.toml", silent)
 
 
-def test_an_image_taken_twice_is_of_one_camera(pictures: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("turned", [False, True], ids=["twice", "rotated"])
+def test_an_image_and_its_copy_are_of_one_camera(pictures: Path, tmp_path: Path, turned: bool) -> None:
     for k, path in enumerate(sorted(pictures.glob("left*.jpg"))):
-        for side in "ab":
-            shutil.copy(path, tmp_path / f"{k}{side}.jpg")
+        shutil.copy(path, tmp_path / f"{k}a.jpg")
+        image = read_image(path)
+        cv2.imwrite(str(tmp_path / f"{k}b.jpg"), np.ascontiguousarray(image[::-1, ::-1]) if turned else image)
     assert list(cameras_seen([tmp_path], [BOARD], tmp_path / "session.toml", silent)) == [""]
