@@ -222,8 +222,8 @@ def rig_from(
         raise InputError(f"{session.path}: {causes[0]} ({error})") from error
     rig = named_by_rule(session, rig)
     also = list[Finding]()
-    for (name, own), calibration in zip(views.items(), rig.single, strict=True):
-        seen = [view for _, view in own]
+    for (name, framed), calibration in zip(views.items(), rig.single, strict=True):
+        seen = [view for _, view in framed]
         also += [] if session.rigid_boards else suggest_rigid_boards(seen, calibration)
         also += wrong_print(seen, named_images(session.cameras[name]))
     rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(also)))
