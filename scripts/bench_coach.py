@@ -32,10 +32,10 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.cameras.compare import compare_cameras, grid_pixels
+from rigkit.coach.full_rig_calibration import full_rig_calibration, remaining_errors_of_rig
 from rigkit.coach.guide import Advice, CaptureGuide, GuideOptions
 from rigkit.coach.look import FrameObservation
 from rigkit.coach.rig import RigGuide
-from rigkit.coach.rig_whole import full_rig_calibration, remaining_errors_of_rig
 from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3

@@ -34,7 +34,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
-from rigkit.planning.information import CornerError, HeldBoards, Knowledge
+from rigkit.planning.information import BoardPoses, CornerError, Knowledge
 from rigkit.planning.plan import plan_views
 from rigkit.synthetic.scene import PlacedBoard, place_board, sees_paper
 
@@ -146,7 +146,7 @@ def planned_poses(lens: Lens, rng: np.random.Generator, taken: list[BoardView]) 
         if calibration is None:
             knowledge = Knowledge.guessed(guess, CornerError(NOISE_PX))
             for pose in held:
-                known = HeldBoards(BOARD.points(), pose.rotation[None], pose.translation_mm[None], whole)
+                known = BoardPoses(BOARD.points(), pose.rotation[None], pose.translation_mm[None], whole)
                 knowledge = knowledge.with_views(known)
         else:
             knowledge = Knowledge.of(calibration)

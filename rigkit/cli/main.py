@@ -18,7 +18,7 @@ from typing import Any
 
 from rigkit.cli.examples import EXAMPLES, FIRST_STEPS
 from rigkit.cli.log import add_log_arguments, logged_run, logging_to
-from rigkit.cli.surroundings import SURROUNDINGS, Terminated, flush_stderr, open_streams, say, signals_interrupt
+from rigkit.cli.operating_system import SYSTEM_ERRORS, Terminated, flush_stderr, open_streams, say, signals_interrupt
 from rigkit.core.errors import ExitCode, InputError, RigkitError, interruption, printable
 
 VERBS: dict[str, str] = {
@@ -136,9 +136,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             reason = printable(str(error)) or "out of memory"
             say(f"{reason}; use fewer processes (-j 1), smaller images, or a machine with more memory")
             return ExitCode.BAD_INPUT
-        if isinstance(error, OSError) and error.errno in SURROUNDINGS:
+        if isinstance(error, OSError) and error.errno in SYSTEM_ERRORS:
             where = f"'{error.filename}': " if error.filename else ""
-            say(printable(f"{where}{error.strerror}; {SURROUNDINGS[error.errno]}"))
+            say(printable(f"{where}{error.strerror}; {SYSTEM_ERRORS[error.errno]}"))
             return ExitCode.BAD_INPUT
         say("this is a bug in rigkit; please report the lines above", before=traceback.format_exc())
         return ExitCode.BUG

@@ -16,8 +16,8 @@ from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.cameras.compare import grid_pixels
+from rigkit.coach.full_calibration import FullCalibrations, full_calibration
 from rigkit.coach.look import FrameObservation
-from rigkit.coach.whole import FullCalibrations, full_calibration
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
@@ -27,7 +27,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Goal, RemainingError, Requirement, projection_goal, px_words, rotation_free_jacobian
 from rigkit.planning.guess import guessed_camera
-from rigkit.planning.information import CornerError, HeldBoards, Knowledge
+from rigkit.planning.information import BoardPoses, CornerError, Knowledge
 from rigkit.planning.plan import Plan, Proposal, covariance_of, plan_views
 from rigkit.planning.words import placement
 
@@ -278,7 +278,7 @@ class CaptureGuide:
         for view in later:
             pose = _pose(knowledge.camera, view)
             if pose is not None:
-                knowledge = knowledge.with_views(held_view(view, pose), view.board.board_id)
+                knowledge = knowledge.with_views(posed_view(view, pose), view.board.board_id)
         return knowledge
 
     def repeats(self, view: BoardView) -> bool:
@@ -295,7 +295,7 @@ class CaptureGuide:
         if pose is None:
             return 0.0
         known = plan.knowledge
-        more = known.of_views(held_view(view, pose), view.board.board_id)[0]
+        more = known.of_views(posed_view(view, pose), view.board.board_id)[0]
         frame_gain = relative_gain(plan, float(plan.goal.error(covariance_of(known.information + more))), photo=photo)
         # With so few frames the gain of others cannot be predicted.
         return max(frame_gain, MIN_GAIN_OF_PHOTO) if photo and not self.has_many else frame_gain
@@ -343,11 +343,11 @@ def _pose(camera: Camera, view: BoardView) -> Rigid3 | None:
         return None
 
 
-def held_view(view: BoardView, pose: Rigid3) -> HeldBoards:
+def posed_view(view: BoardView, pose: Rigid3) -> BoardPoses:
     """Return a view as a board with its corners seen in one pose."""
     seen = np.zeros((1, view.board.corner_count), dtype=bool)
     seen[0, view.board.index(view.grid)] = True
-    return HeldBoards(view.board.points(), pose.rotation[None], pose.translation_mm[None], seen)
+    return BoardPoses(view.board.points(), pose.rotation[None], pose.translation_mm[None], seen)
 
 
 def _calibrated(views: Sequence[BoardView], size_px: tuple[int, int]) -> Calibration | None:

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.coach.full_calibration import FullCalibrations
+from rigkit.coach.full_rig_calibration import RigKnown, full_rig_calibration
 from rigkit.coach.guide import (
     CHECKING,
     ENOUGH_FRAMES,
@@ -23,18 +25,16 @@ from rigkit.coach.guide import (
     CaptureGuide,
     GuideOptions,
     enough_words,
-    held_view,
     min_gain_of,
+    posed_view,
 )
 from rigkit.coach.look import FrameObservation
-from rigkit.coach.rig_whole import RigKnown, full_rig_calibration
-from rigkit.coach.whole import FullCalibrations
 from rigkit.core.arrays import Pixels
 from rigkit.core.errors import DegenerateError
 from rigkit.core.processes import SerialExecutor
-from rigkit.planning.candidates import held_boards, outline_mm
+from rigkit.planning.candidates import board_poses_in_view, outline_mm
 from rigkit.planning.goal import RemainingError
-from rigkit.planning.information import HeldBoards
+from rigkit.planning.information import BoardPoses
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
 from rigkit.planning.words import placement
 
@@ -230,19 +230,19 @@ class RigGuide:
                 self._shared[c] = self._views(a, c, in_a, in_b)
         return self._shared[c]
 
-    def _views(self, a: int, b: int, in_a: HeldBoards, in_b: HeldBoards) -> SharedViews:
+    def _views(self, a: int, b: int, in_a: BoardPoses, in_b: BoardPoses) -> SharedViews:
         sizes = [next(f[c].size_px for f in self.frames) for c in (a, b)]
         cameras = [self.lenses[c].camera(size) for c, size in zip((a, b), sizes, strict=True)]
         return SharedViews(cameras[0], cameras[1], in_a, in_b, self.lenses[b].corner_error(sizes[1]))
 
-    def _held_by(self, a: int, b: int, frame: Sequence[FrameObservation]) -> tuple[HeldBoards, HeldBoards] | None:
+    def _held_by(self, a: int, b: int, frame: Sequence[FrameObservation]) -> tuple[BoardPoses, BoardPoses] | None:
         first, second = frame[a].view, frame[b].view
         if first is None or second is None or first.board.board_id != second.board.board_id:
             return None
         poses = [self.lenses[c].pose_of(v, frame[c].size_px) for c, v in ((a, first), (b, second))]
         if poses[0] is None or poses[1] is None:
             return None
-        return held_view(first, poses[0]), held_view(second, poses[1])
+        return posed_view(first, poses[0]), posed_view(second, poses[1])
 
     def _mount_px(self, c: int) -> float | None:
         shared = self._shared_of(c)
@@ -273,7 +273,7 @@ class RigGuide:
             return words, targets
         motions = [shared.in_b.pose(k) @ shared.in_a.pose(k).inverse() for k in range(len(shared.in_a))]
         board = self.options.boards[0]
-        in_a = held_boards(shared.a, board, self.options.reach)
+        in_a = board_poses_in_view(shared.a, board, self.options.reach)
         in_b = in_a.transformed(mean_motion(motions))
         pixels, valid = shared.b.project(in_b.in_cam(outline_mm(board)))
         both = np.all(valid & shared.b.on_image(pixels), axis=1)
@@ -317,9 +317,9 @@ class RigGuide:
         return out | {"cameras": cameras}
 
 
-def _together(held: Sequence[HeldBoards]) -> HeldBoards:
+def _together(held: Sequence[BoardPoses]) -> BoardPoses:
     """Return several poses of one board as one."""
-    return HeldBoards(
+    return BoardPoses(
         held[0].points_mm,
         np.concatenate([h.rotation for h in held]),
         np.concatenate([h.translation_mm for h in held]),

@@ -232,7 +232,7 @@ def _refine(
     )
 
 
-def stepped(poses: tuple[FloatArray, ...], step: FloatArray) -> tuple[FloatArray, ...]:
+def after_pose_step(poses: tuple[FloatArray, ...], step: FloatArray) -> tuple[FloatArray, ...]:
     """Return poses (N, 3, 3), (N, 3) after steps (w, dt) (N, 6): R <- exp(w) R, t <- t + dt."""
     return exp_so3(step[:, :3]) @ poses[0], poses[1] + step[:, 3:]
 

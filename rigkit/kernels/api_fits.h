@@ -223,7 +223,7 @@ EXPORT void read_codes(
  * once, and the doubles that hold one. */
 enum { TAG_OUTCOMES = 16, TAG_TERMS = 10, TAG_SIDE = 4, TAG_BLOCK = 80 };
 
-/* The constants of detection.tags.whole, under their names there. */
+/* The constants of detection.tags.whole_tags, under their names there. */
 typedef struct {
     double tail_sigmas, pixel_kurtosis, sharp_blur, min_blur, max_blur, max_move_px, max_blur_change, light_sigma;
     double min_variance, converged_px, max_taken;

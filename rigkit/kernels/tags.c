@@ -1,5 +1,5 @@
 /* The fit of whole tags with known modules, for the positions of their four corners. The definition in numpy is in
- * tests/kernels/reference/tags.py, the numbers are in rigkit.detection.tags.whole.
+ * tests/kernels/reference/tags.py, the numbers are in rigkit.detection.tags.whole_tags.
  *
  * Cells between `breaks` along both sides of a tag are ink or paper: its modules, the gap around it, and what is beyond. The
  * place of a pixel in the tag is a cubic polynomial of its position. Moves of the four corners displace it with the weights of

@@ -12,7 +12,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.geometry.rotation import exp_so3, unit
-from rigkit.planning.information import HeldBoards
+from rigkit.planning.information import BoardPoses
 
 CANDIDATES_DRAWN, CANDIDATES_KEPT = 2400, 900
 """Candidate poses generated, and the most kept: both cover position, tilt and size evenly."""
@@ -64,7 +64,7 @@ def outline_mm(board: Board) -> Points:
     return np.stack([corners, between], axis=1).reshape(8, 3)
 
 
-def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
+def board_poses_in_view(camera: Camera, board: Board, reach: Reach) -> BoardPoses:
     """Return poses of `board` that a person can hold in front of `camera`, evenly spread and deterministic.
 
     Raises DegenerateError where the board never fits into the image.
@@ -99,7 +99,7 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
     return held.chosen(np.flatnonzero(good)[:CANDIDATES_KEPT])
 
 
-def board_in_view(camera: Camera, board: Board, held: HeldBoards, reach: Reach) -> BoolArray:
+def board_in_view(camera: Camera, board: Board, held: BoardPoses, reach: Reach) -> BoolArray:
     """Say for each of C poses whether the camera sees the whole board, large enough and not too slanted."""
     return _inside(camera, held.in_cam(outline_mm(board)), reach.field_deg) & _squares_visible(camera, board, held)
 
@@ -126,7 +126,7 @@ def _tilted(tilt_rad: FloatArray, azimuth_rad: FloatArray) -> FloatArray:
 
 def _placed(
     camera: Camera, board: Board, spot: Pixels, facing: FloatArray, square_px: FloatArray, middle: FloatArray
-) -> tuple[HeldBoards, BoolArray]:
+) -> tuple[BoardPoses, BoolArray]:
     """Return the poses with the board's centre at `spot` (C, 2) in the image and a square `square_px` wide if seen
     frontally, and whether `spot` is in the field of view."""
     rays, seen = camera.unproject(spot)
@@ -140,7 +140,7 @@ def _placed(
     towards = np.stack([x, np.cross(rays, x), rays], axis=-1)
     rotation = towards @ facing
     translation = rays * distance[:, None] - rotation @ middle
-    held = HeldBoards(board.points(), rotation, translation, np.ones((len(rays), board.corner_count), bool))
+    held = BoardPoses(board.points(), rotation, translation, np.ones((len(rays), board.corner_count), bool))
     return held, np.asarray(seen & np.isfinite(distance))
 
 
@@ -171,7 +171,7 @@ def _in_field(points: Points, field_deg: float | None) -> BoolArray:
     return np.asarray(points[..., 2] >= limit * np.linalg.norm(points, axis=-1))
 
 
-def _squares_visible(camera: Camera, board: Board, held: HeldBoards) -> BoolArray:
+def _squares_visible(camera: Camera, board: Board, held: BoardPoses) -> BoolArray:
     """Say for each board whether all squares are large enough, and no line of sight too slanted."""
     columns, rows = board.size
     lattice = board.points().reshape(rows, columns, 3)[[0, 0, -1, -1], [0, -1, 0, -1]]

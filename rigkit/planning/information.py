@@ -58,7 +58,7 @@ class CornerError:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class HeldBoards:
+class BoardPoses:
     """One board in C poses: cam_from_board as `rotation` (C, 3, 3) and `translation_mm` (C, 3), and the mask `seen`
     (C, N) of its N corners."""
 
@@ -74,14 +74,14 @@ class HeldBoards:
         """Return cam_from_board of the pose at `index`."""
         return Rigid3(self.rotation[index], self.translation_mm[index])
 
-    def chosen(self, index: IntArray | BoolArray) -> HeldBoards:
+    def chosen(self, index: IntArray | BoolArray) -> BoardPoses:
         """Return the poses at `index`."""
-        return HeldBoards(self.points_mm, self.rotation[index], self.translation_mm[index], self.seen[index])
+        return BoardPoses(self.points_mm, self.rotation[index], self.translation_mm[index], self.seen[index])
 
-    def transformed(self, other_from_cam: Rigid3) -> HeldBoards:
+    def transformed(self, other_from_cam: Rigid3) -> BoardPoses:
         """Return the poses in another frame; `seen` is unchanged."""
         rotation, translation = other_from_cam.rotation @ self.rotation, other_from_cam.apply(self.translation_mm)
-        return HeldBoards(self.points_mm, rotation, translation, self.seen)
+        return BoardPoses(self.points_mm, rotation, translation, self.seen)
 
     def in_cam(self, points_mm: Points) -> Points:
         """Return points (K, 3) of the board in the camera frame, (C, K, 3)."""
@@ -132,7 +132,7 @@ class Knowledge:
             for row, view in zip(seen, views, strict=True):
                 row[board.index(view.grid)[view.kept]] = True
             poses = [view.cam_from_board for view in views]
-            held = HeldBoards(
+            held = BoardPoses(
                 shape.points_mm,
                 np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3),
                 np.array([pose.translation_mm for pose in poses]).reshape(-1, 3),
@@ -146,7 +146,7 @@ class Knowledge:
         """Return the same with the inadequacy of the model, estimated from alternative models."""
         return cls.of(calibration).with_model_inadequacy(lens_modes(calibration))
 
-    def of_views(self, held: HeldBoards, board_id: str = "") -> FloatArray:
+    def of_views(self, held: BoardPoses, board_id: str = "") -> FloatArray:
         """Return the information of each view of the board `board_id` in C poses, (C, T, T)."""
         camera, p = self.camera, self.camera.parameters.size
         out = np.zeros((len(held), *self.information.shape))
@@ -174,25 +174,25 @@ class Knowledge:
         information[amounts, amounts] += 1.0
         return replace(self, camera=camera, information=information)
 
-    def with_views(self, held: HeldBoards, board_id: str = "") -> Knowledge:
+    def with_views(self, held: BoardPoses, board_id: str = "") -> Knowledge:
         """Return the knowledge after these views are taken."""
         return replace(self, information=self.information + self.of_views(held, board_id).sum(axis=0))
 
 
-def view_information(camera: Camera, held: HeldBoards, error: CornerError) -> FloatArray:
+def view_information(camera: Camera, held: BoardPoses, error: CornerError) -> FloatArray:
     """Return the information of each view of a board in C poses about the camera's parameters, (C, P, P)."""
     products = _products(camera, held, error)
     return reduced_by_cluster(products, camera.parameters.size, np.arange(len(products)))[0]
 
 
-def pose_information(camera: Camera, held: HeldBoards, error: CornerError) -> FloatArray:
+def pose_information(camera: Camera, held: BoardPoses, error: CornerError) -> FloatArray:
     """Return the information of each view of a board in C poses about that pose, for a known camera, (C, 6, 6): about
     a rotation around the board's origin (rad) and a translation (mm), in the camera frame."""
     p = camera.parameters.size
     return _products(camera, held, error)[:, p : p + 6, p : p + 6]
 
 
-def _products(camera: Camera, held: HeldBoards, error: CornerError, shape: ShapeModel | None = None) -> FloatArray:
+def _products(camera: Camera, held: BoardPoses, error: CornerError, shape: ShapeModel | None = None) -> FloatArray:
     corners = held.seen.shape[1]
     if shape is None:
         none = np.zeros(0, dtype=np.int64)

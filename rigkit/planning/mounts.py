@@ -14,7 +14,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3, skew
-from rigkit.planning.information import CornerError, HeldBoards, pose_information
+from rigkit.planning.information import BoardPoses, CornerError, pose_information
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -23,8 +23,8 @@ class SharedViews:
 
     a: Camera
     b: Camera
-    in_a: HeldBoards
-    in_b: HeldBoards
+    in_a: BoardPoses
+    in_b: BoardPoses
     error: CornerError
 
     def rotations_and_offsets(self) -> tuple[FloatArray, FloatArray]:

@@ -12,7 +12,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.planning.candidates import Reach, held_boards
+from rigkit.planning.candidates import Reach, board_poses_in_view
 from rigkit.planning.goal import Aim
 from rigkit.planning.information import Knowledge
 
@@ -130,7 +130,7 @@ def plan_views(
     """
     if not boards or count < 1:
         raise InputError("plan: at least one board and one view are needed")
-    held = [held_boards(knowledge.camera, board, reach or Reach()) for board in boards]
+    held = [board_poses_in_view(knowledge.camera, board, reach or Reach()) for board in boards]
     views = np.concatenate([knowledge.of_views(h, b.board_id) for h, b in zip(held, boards, strict=True)])
     rotation = np.concatenate([h.rotation for h in held])
     middle = np.concatenate([h.rotation @ h.points_mm.mean(axis=0) + h.translation_mm for h in held])

@@ -111,12 +111,12 @@ def maximum_likelihood(
 ) -> State:
     """Return the state of maximum likelihood near `state`; only the parameters `free` (P,) change."""
 
-    def stepped(at: State, step: DenseStep) -> State:
+    def after_step(at: State, step: DenseStep) -> State:
         change = np.zeros(len(free))
         change[free] = step.change
         return moved(at, change)
 
-    return minimise(state, linearise, stepped, DAMPING_OF_PLANES, STOP_OF_PLANES).state
+    return minimise(state, linearise, after_step, DAMPING_OF_PLANES, STOP_OF_PLANES).state
 
 
 def inliers_by_median(lengths: FloatArray) -> BoolArray:

@@ -22,7 +22,7 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.geometry.board_pose import board_pose
 from rigkit.planning.goal import Goal, projection_goal
-from rigkit.planning.information import CornerError, HeldBoards, Knowledge
+from rigkit.planning.information import BoardPoses, CornerError, Knowledge
 from rigkit.planning.plan import choose_views, covariance_of
 
 REAL = ("caliper", "camodocal", "ov-plane", "charuco-stereo-left", "charuco-stereo-right")
@@ -99,7 +99,7 @@ def _of_image(view: BoardView, knowledge: Knowledge) -> FloatArray:
         pose = board_pose(rays[valid], points[valid]).cam_from_board
     except RigkitError:
         return np.zeros_like(knowledge.information)
-    held = HeldBoards(points, pose.rotation[None], pose.translation_mm[None], valid[None])
+    held = BoardPoses(points, pose.rotation[None], pose.translation_mm[None], valid[None])
     return knowledge.of_views(held, view.board.board_id)[0]
 
 

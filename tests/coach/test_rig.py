@@ -39,7 +39,7 @@ from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, log_so3, unit
 from rigkit.io.manifests.rig_session import load_rig_session
-from rigkit.planning.candidates import held_boards
+from rigkit.planning.candidates import board_poses_in_view
 from rigkit.planning.information import CornerError
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
 from rigkit.validation.certificate.contracts import Quantity, Task
@@ -73,9 +73,11 @@ def test_the_error_of_a_mount_is_what_repeated_frames_show(rng: np.random.Genera
 
 def test_a_rig_is_enough_when_lenses_and_mounts_are(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     # Many calibrations: which model the lens has is told, not found each time.
-    monkeypatch.setattr("rigkit.coach.whole.Request", lambda **asked: Request(**(asked | {"model": "brown"})))
     monkeypatch.setattr(
-        "rigkit.coach.rig_whole.calibrate_rig",
+        "rigkit.coach.full_calibration.Request", lambda **asked: Request(**(asked | {"model": "brown"}))
+    )
+    monkeypatch.setattr(
+        "rigkit.coach.full_rig_calibration.calibrate_rig",
         lambda views, sizes, model, board, begun: calibrate_rig(views, sizes, model="brown", degree=5),
     )
     guide = RigGuide(("left", "right"), GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=0.3, reach=REACH))
@@ -83,7 +85,7 @@ def test_a_rig_is_enough_when_lenses_and_mounts_are(rng: np.random.Generator, mo
     first = guide.advise(empty)
     assert first.words.startswith("left: Hold the board") and first.targets[1] is None and first.mount_px is None
     # Every camera by itself: both lenses are known well, and of the mount nothing.
-    alone = held_boards(CAMERA, BOARD, REACH)
+    alone = board_poses_in_view(CAMERA, BOARD, REACH)
     for k in range(0, 220, 10):
         own = frame_observation(alone.pose(k), rng, f"{k}")
         guide.add([own, empty[0]] if k % 20 else [empty[0], own])
@@ -214,7 +216,7 @@ def test_the_goal_may_be_a_length_in_mm(tmp_path: Path, rng: np.random.Generator
     guide = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_mm=0.2, reach=REACH)
     length = Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=500.0)
     coach = open_coach(CoachOptions(folder=tmp_path, boards=("9x6x25",), guide=guide, length=length))
-    held = held_boards(CAMERA, BOARD, REACH)
+    held = board_poses_in_view(CAMERA, BOARD, REACH)
     for k in range(0, 120, 10):
         coach.guide.add([frame_observation(held.pose(k), rng, f"{k}")])
     advice = coach.guide.advise([frame_observation(held.pose(7), rng, "x")])

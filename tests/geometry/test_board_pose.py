@@ -9,11 +9,11 @@ import pytest
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.board_pose import (
+    after_pose_step,
     board_pose,
     board_poses,
     moved_board_poses,
     ray_residuals,
-    stepped,
     tangent_bases,
 )
 from rigkit.geometry.rotation import exp_so3, log_so3, rotation_angle, unit
@@ -198,6 +198,6 @@ def test_a_step_is_that_of_which_residuals_have_their_derivatives(rng: np.random
     for k, size in enumerate((1e-6, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3)):
         step = size * np.eye(6)[k : k + 1]
         ahead, back = (
-            ray_residuals(rays, bases, points, *stepped((rotation, translation), s))[0] for s in (step, -step)
+            ray_residuals(rays, bases, points, *after_pose_step((rotation, translation), s))[0] for s in (step, -step)
         )
         np.testing.assert_allclose((ahead - back) / (2.0 * size), jacobian[..., k], rtol=1e-6, atol=1e-9)

@@ -17,8 +17,8 @@ from rigkit.coach.server import MAX_UPLOAD_BYTES
 from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.planning.candidates import Reach, held_boards
-from rigkit.planning.information import HeldBoards
+from rigkit.planning.candidates import Reach, board_poses_in_view
+from rigkit.planning.information import BoardPoses
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
@@ -71,18 +71,18 @@ def ask(port: int, method: str, path: str, body: bytes = b"", **headers: str) ->
     return answer.status, answer.read()
 
 
-def shared_boards(count: int) -> tuple[HeldBoards, HeldBoards]:
+def shared_boards(count: int) -> tuple[BoardPoses, BoardPoses]:
     """Return the first `count` poses in which both cameras see the whole board."""
     in_a = _shared_boards()
     chosen = in_a.chosen(np.arange(min(count, len(in_a))))
     rotation = MOUNT.rotation @ chosen.rotation
     translation = chosen.translation_mm @ MOUNT.rotation.T + MOUNT.translation_mm
-    return chosen, HeldBoards(chosen.points_mm, rotation, translation, chosen.seen)
+    return chosen, BoardPoses(chosen.points_mm, rotation, translation, chosen.seen)
 
 
 @cache
-def _shared_boards() -> HeldBoards:
-    in_a = held_boards(CAMERA, BOARD, REACH)
+def _shared_boards() -> BoardPoses:
+    in_a = board_poses_in_view(CAMERA, BOARD, REACH)
     pixels = [CAMERA.project((MOUNT @ in_a.pose(k)).apply(BOARD.points()))[0] for k in range(len(in_a))]
     return in_a.chosen(np.flatnonzero([CAMERA.on_image(p).all() for p in pixels]))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from kernels.reference.tags import picture
 
-from rigkit.detection.tags.whole import WHOLE_ROUNDS, WHOLE_RULES
+from rigkit.detection.tags.whole_tags import WHOLE_ROUNDS, WHOLE_RULES
 from rigkit.kernels.tags import fit_tags
 
 SERIES_PX = 8e-3

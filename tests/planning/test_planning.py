@@ -18,10 +18,10 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.planning.candidates import MAX_SLANT_DEG, TILT_DEG, Reach, held_boards, outline_mm
+from rigkit.planning.candidates import MAX_SLANT_DEG, TILT_DEG, Reach, board_poses_in_view, outline_mm
 from rigkit.planning.goal import Goal, projection_goal, px_words, rays_within
 from rigkit.planning.guess import guessed_camera
-from rigkit.planning.information import CornerError, HeldBoards, Knowledge
+from rigkit.planning.information import BoardPoses, CornerError, Knowledge
 from rigkit.planning.plan import choose_views, covariance_of, plan_views
 from rigkit.planning.words import placement
 
@@ -31,7 +31,7 @@ PREDICTED_WITHIN = 0.2
 """The rms of 40 errors in some eight directions is known to 6 %; three of that."""
 
 
-def _seen(camera: Camera, held: HeldBoards, rng: np.random.Generator) -> list[BoardView]:
+def _seen(camera: Camera, held: BoardPoses, rng: np.random.Generator) -> list[BoardView]:
     points = held.points_mm @ np.swapaxes(held.rotation, 1, 2) + held.translation_mm[:, None]
     pixels, valid = camera.project(points)
     assert valid.all()
@@ -42,7 +42,7 @@ def _seen(camera: Camera, held: HeldBoards, rng: np.random.Generator) -> list[Bo
 @pytest.mark.parametrize("name", ["reg", "fish"])
 def test_the_error_promised_is_the_error_found(name: str, rng: np.random.Generator) -> None:
     camera, field_deg = lens(name), 2.0 * REACH_DEG[name]
-    held = held_boards(camera, BOARD, Reach(field_deg=field_deg))
+    held = board_poses_in_view(camera, BOARD, Reach(field_deg=field_deg))
     held = held.chosen(rng.choice(len(held), 10, replace=False))
     known = Knowledge.guessed(camera, CornerError(NOISE_PX)).with_views(held)
     promised = projection_goal(camera, field_deg).error(covariance_of(known.information))
@@ -83,7 +83,7 @@ def test_a_calibration_is_known_as_its_own_views_say(rng: np.random.Generator) -
 
 def test_views_that_share_their_errors_count_less() -> None:
     camera = lens("reg")
-    held = held_boards(camera, BOARD, Reach()).chosen(np.arange(5))
+    held = board_poses_in_view(camera, BOARD, Reach()).chosen(np.arange(5))
     alone = Knowledge.guessed(camera, CornerError(0.2)).with_views(held)
     shared = Knowledge.guessed(camera, CornerError(0.2, rho=0.1)).with_views(held)
     goal = projection_goal(camera)
@@ -94,7 +94,7 @@ def test_views_that_share_their_errors_count_less() -> None:
 @pytest.mark.parametrize("name", ["reg", "wide", "fish"])
 def test_boards_are_held_wholly_in_view_and_as_tilted_as_hands_do(name: str) -> None:
     camera, reach = lens(name), Reach(nearest_mm=150.0, farthest_mm=900.0, field_deg=2.0 * REACH_DEG[name])
-    held = held_boards(camera, BOARD, reach)
+    held = board_poses_in_view(camera, BOARD, reach)
     assert len(held) > 100
     paper = outline_mm(BOARD)
     points = paper @ np.swapaxes(held.rotation, 1, 2) + held.translation_mm[:, None]
@@ -110,7 +110,7 @@ def test_boards_are_held_wholly_in_view_and_as_tilted_as_hands_do(name: str) -> 
 
 def test_a_board_too_far_to_be_seen_is_refused() -> None:
     with pytest.raises(DegenerateError, match="nowhere completely in view"):
-        held_boards(lens("reg"), BOARD, Reach(nearest_mm=1e5))
+        board_poses_in_view(lens("reg"), BOARD, Reach(nearest_mm=1e5))
 
 
 def test_greedy_takes_the_view_that_helps_most_each_once() -> None:
@@ -151,7 +151,7 @@ def test_planned_views_beat_views_anyhow(rng: np.random.Generator) -> None:
     for _ in range(20):
         _, rotation, translation = random_views(camera, 6, rng, reach_deg=REACH_DEG["reg"])
         seen = np.ones((6, BOARD.corner_count), dtype=bool)
-        views = known.with_views(HeldBoards(BOARD.points(), rotation, translation, seen))
+        views = known.with_views(BoardPoses(BOARD.points(), rotation, translation, seen))
         unplanned.append(float(goal.error(covariance_of(views.information))))
     assert plan.views[-1].error < 0.6 * np.median(unplanned)
     with pytest.raises(InputError, match="at least one board"):
@@ -206,7 +206,7 @@ def test_a_board_that_may_bow_is_shown_turned() -> None:
     information = np.zeros((p + WARP_UNKNOWNS, p + WARP_UNKNOWNS))
     information[:p, :p], information[p:, p:] = known.information, np.diag(warp.sigma**-2)
     unsure = replace(known, information=information, warped=(BOARD.board_id,))
-    held = held_boards(camera, BOARD, Reach())
+    held = board_poses_in_view(camera, BOARD, Reach())
     level = np.abs(held.rotation[:, 0, 0]) > np.abs(held.rotation[:, 1, 0])
     half = 6
     same = held.chosen(np.flatnonzero(level)[: 2 * half])
@@ -214,7 +214,7 @@ def test_a_board_that_may_bow_is_shown_turned() -> None:
     ratio = np.zeros(p)
     ratio[:2] = 1.0, -1.0
 
-    def unknown(knowledge: Knowledge, views: HeldBoards) -> float:
+    def unknown(knowledge: Knowledge, views: BoardPoses) -> float:
         covariance = covariance_of(knowledge.with_views(views, BOARD.board_id).information)[:p, :p]
         return float(np.sqrt(ratio @ covariance @ ratio))
 
@@ -230,5 +230,5 @@ def test_boards_are_pushed_until_they_are_in_the_image(monkeypatch: pytest.Monke
     counts = []
     for moves in (1, 5):
         monkeypatch.setattr("rigkit.planning.candidates.MOVES", moves)
-        counts.append(len(held_boards(camera, board, Reach())))
+        counts.append(len(board_poses_in_view(camera, board, Reach())))
     assert counts[1] > 1.1 * counts[0]

@@ -13,7 +13,7 @@ from rigkit.calibration.solving.radial_alignment import align
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import FloatArray, Mat3, Points
-from rigkit.geometry.board_pose import stepped
+from rigkit.geometry.board_pose import after_pose_step
 from rigkit.geometry.rotation import log_so3, nearest_rotation
 from rigkit.optim.batched import BatchedProblem, minimise_each
 from rigkit.optim.damping import Damping, Stop
@@ -61,13 +61,13 @@ def refine_each(
         return BatchedProblem(normal.pp, normal.p, normal.costs)
 
     stop = Stop(steps=MAX_POSE_ITERATIONS, predicted_gain=tolerance)
-    found, cost = minimise_each((rotation, translation_mm), around, stepped, VIEW_DAMPING, stop)
+    found, cost = minimise_each((rotation, translation_mm), around, after_pose_step, VIEW_DAMPING, stop)
     return found[0], found[1], cost
 
 
 def steps_between(before: tuple[Mat3, Points], after: tuple[Mat3, Points]) -> FloatArray:
     """Return the steps (N, 6) from poses `before` to poses `after`, (N, 3, 3) and (N, 3) each: the inverse of
-    `stepped`."""
+    `after_pose_step`."""
     return np.concatenate([log_so3(after[0] @ np.swapaxes(before[0], -1, -2)), after[1] - before[1]], axis=1)
 
 

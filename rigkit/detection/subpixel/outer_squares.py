@@ -70,7 +70,7 @@ def fitted_beside_paper(
 ) -> EdgeFit:
     """Return the `fit` of N corners, of boards `owner` (N,), after fitting those again whose windows extend beyond
     their board; the same `fit` if none do. `wanted` (N,) limits these corners, `fitted` fits them."""
-    again = beside_paper(geometry, fit, owner)
+    again = windows_beyond_board(geometry, fit, owner)
     again = again if wanted is None else again & wanted
     moving = again
     for _ in range(PAPER_ROUNDS if again.any() else 0):
@@ -84,7 +84,7 @@ def fitted_beside_paper(
     return fit
 
 
-def beside_paper(geometry: Geometry, fit: EdgeFit, owner: IntArray) -> BoolArray:
+def windows_beyond_board(geometry: Geometry, fit: EdgeFit, owner: IntArray) -> BoolArray:
     """Return which of N corners, of boards `owner` (N,), may have windows extending beyond their board."""
     good = fit.valid & (fit.contrast > 0.0)
     soft = np.zeros(int(owner.max(initial=-1)) + 1, np.bool_)

@@ -6,7 +6,7 @@ noise.
 If small squares fill the corners between tags, the corners are saddles like those of chessboards, but their lines are
 unevenly spaced: the neighbours are a side of a tag away in one direction, and the gap to the next tag in the other. The
 edge model is fitted in windows that reach half way to the neighbours, and are narrow enough to end before the tag's
-code. Tags that are too small for that are fitted as a whole (`rigkit.detection.tags.whole`).
+code. Tags that are too small for that are fitted as a whole (`rigkit.detection.tags.whole_tags`).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from rigkit.detection.subpixel.subpixel import FIRST_BLUR, FIRST_PASS, LAST_PASS
 from rigkit.detection.tags.codes import MIN_CODE_CONTRAST, MIN_PREDICTED_LIKENESS
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import MAX_LEVERAGE, NEAREST_DEPTH, POINTS_A_TERM, SmoothMap, seen_surface
-from rigkit.detection.tags.whole import NARROW_BLURS, WHOLE_ROUNDS, with_whole_tags
+from rigkit.detection.tags.whole_tags import NARROW_BLURS, WHOLE_ROUNDS, with_whole_tags
 from rigkit.kernels.edges import TagWindow
 from rigkit.kernels.surface import HARDLY_MORE, TagSurface
 from rigkit.kernels.tag_board import CORNER_COLUMNS, TagBoardFit, TagCornerRules

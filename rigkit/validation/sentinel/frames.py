@@ -11,7 +11,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.planning.candidates import CANDIDATES_KEPT, Reach, board_in_view, held_boards
+from rigkit.planning.candidates import CANDIDATES_KEPT, Reach, board_in_view, board_poses_in_view
 from rigkit.planning.goal import Goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, Proposal, choose_views, covariance_of
@@ -57,7 +57,7 @@ class Frames:
     @classmethod
     def _frames_of_camera(cls, monitored: Monitored, c: int, board: Board, number: int, reach: Reach) -> Frames:
         """Return frames in which camera `c` sees the board, spread evenly, as is every leading part of them."""
-        held = held_boards(monitored.cameras[c], board, reach)
+        held = board_poses_in_view(monitored.cameras[c], board, reach)
         held = held.chosen(np.arange(min(len(held), -(-CANDIDATES_KEPT // len(monitored.cameras)))))
         in_rig = held.transformed(monitored.cam_from_rig[c].inverse())
         seen = np.stack(

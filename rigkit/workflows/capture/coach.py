@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from rigkit.cameras.base import Camera
 from rigkit.coach.coach import Coach, Image, Take, ignored
+from rigkit.coach.full_rig_calibration import remaining_errors_of_rig
 from rigkit.coach.guide import GuideOptions, errors_in_words
 from rigkit.coach.keeper import Keeper, folder_of
 from rigkit.coach.look import FrameObservation
-from rigkit.coach.rig_whole import remaining_errors_of_rig
 from rigkit.coach.server import LOCAL, address_in_network, coach_app, new_token, serve
 from rigkit.coach.sources import Frame, device_frames, frames_of_folders
 from rigkit.core.errors import DegenerateError, InputError, RigkitError

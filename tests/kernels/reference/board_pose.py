@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.core.arrays import FloatArray, Mat3, Points, Rays
-from rigkit.geometry.board_pose import stepped
+from rigkit.geometry.board_pose import after_pose_step
 from rigkit.geometry.rotation import skew
 from rigkit.optim.batched import BatchedProblem, minimise_each
 from rigkit.optim.damping import Damping, Stop
@@ -44,5 +44,5 @@ def refine(
         return BatchedProblem(transposed @ jacobian, descent, (residual**2).sum(axis=1))
 
     damping, stop = Damping(start=1e-4, floor=1e-12, ceiling=1e6), Stop(steps=max_steps)
-    (rotation, translation), cost = minimise_each(start, linearise, stepped, damping, stop)
+    (rotation, translation), cost = minimise_each(start, linearise, after_pose_step, damping, stop)
     return rotation, translation, cost

@@ -46,7 +46,7 @@ from rigkit.detection.tags.corners import (
 )
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import SmoothMap, seen_surface
-from rigkit.detection.tags.whole import NARROW_BLURS, WHOLE_ROUNDS, with_whole_tags
+from rigkit.detection.tags.whole_tags import NARROW_BLURS, WHOLE_ROUNDS, with_whole_tags
 from rigkit.kernels.edges import Rules, TagWindow
 from rigkit.kernels.surface import TagSurface
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH

@@ -18,7 +18,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.candidates import Reach, board_in_view
 from rigkit.planning.goal import projection_goal
-from rigkit.planning.information import CornerError, HeldBoards, Knowledge
+from rigkit.planning.information import BoardPoses, CornerError, Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.report.pages.plan_page import plan_words
 from rigkit.validation.sentinel.change_aim import informative_views
@@ -106,7 +106,7 @@ def test_pictures_for_a_rig_find_what_was_promised_and_more_than_those_for_one_l
     for_left, _ = informative_views(replace(left, covariance=rig.covariance[:8, :8]), [BOARD], FRESH)
     poses = [view.cam_from_board for view in for_left.views]
     rotation, shift = np.array([p.rotation for p in poses]), np.array([p.translation_mm for p in poses])
-    held = HeldBoards(BOARD.points(), rotation, shift, np.ones((FRESH, BOARD.corner_count), bool))
+    held = BoardPoses(BOARD.points(), rotation, shift, np.ones((FRESH, BOARD.corner_count), bool))
     whole = board_in_view(rig.cameras[1], BOARD, held.transformed(MOUNT), Reach())
     seen = [held.seen, whole[:, None] & held.seen]
     others = _powers(rig, board_information(rig, BOARD, rotation, shift, seen))

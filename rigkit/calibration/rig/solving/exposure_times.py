@@ -19,7 +19,7 @@ from rigkit.calibration.certainty.covariance import PoseJacobians
 from rigkit.calibration.solving.normal_equations import NormalEquations
 from rigkit.calibration.solving.poses import steps_between
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
-from rigkit.geometry.board_pose import stepped
+from rigkit.geometry.board_pose import after_pose_step
 
 POINTS, MIN_POINTS = 5, 3
 """Poses that a trajectory passes through, the frame's own included. For swings of 1.5 s at six frames a second, a
@@ -68,7 +68,7 @@ class ExposureTimes:
     def targets(self, c: int, key: IntArray, poses: tuple[Mat3, Points]) -> tuple[Mat3, Points]:
         """Return rig_from_target of views (V,) of camera `c` at their own times, from the `poses` of their keys."""
         powers = self._times(c, key) ** np.arange(1.0, self.trajectories.shape[1] + 1.0)
-        rotation, place = stepped(poses, np.einsum("vks,vk->vs", self.trajectories[key], powers))
+        rotation, place = after_pose_step(poses, np.einsum("vks,vk->vs", self.trajectories[key], powers))
         return rotation, place
 
     def speeds(self, c: int, key: IntArray) -> FloatArray:

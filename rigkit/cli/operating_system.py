@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 MAKE_ROOM, PATH = "make room or choose another folder", "correct the path"
-SURROUNDINGS = {
+SYSTEM_ERRORS = {
     getattr(errno, name): remedy
     for remedy, names in (
         (MAKE_ROOM, ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")),

@@ -17,11 +17,11 @@ from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.coach.full_calibration import STEADY, FullCalibration
+from rigkit.coach.full_rig_calibration import RigKnown, full_rig_calibration, remaining_errors_of_rig
 from rigkit.coach.guide import CHECKING, GuideOptions
 from rigkit.coach.look import FrameObservation
 from rigkit.coach.rig import MAX_HELP, RigGuide
-from rigkit.coach.rig_whole import RigKnown, full_rig_calibration, remaining_errors_of_rig
-from rigkit.coach.whole import STEADY, FullCalibration
 from rigkit.core.errors import DegenerateError
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.planning.goal import projection_goal
@@ -221,7 +221,7 @@ def test_frames_of_a_rig_are_calibrated_by_their_moments(
     frames: list[list[FrameObservation]], rig: RigCalibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "rigkit.coach.rig_whole.calibrate_rig",
+        "rigkit.coach.full_rig_calibration.calibrate_rig",
         lambda views, sizes, model, board, begun: calibrate_rig(views, sizes, model="brown", degree=5, folds=0),
     )
     views = [[frame_observation.view for frame_observation in seen] for seen in frames]

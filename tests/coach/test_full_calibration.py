@@ -17,14 +17,14 @@ from helpers.coach_scenes import BOARD, CAMERA, SIZE
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.coach.coach import Coach
+from rigkit.coach.full_calibration import STEADY, FullCalibration, FullCalibrations, full_calibration
 from rigkit.coach.guide import CHECKING, MIN_GAIN_TO_CONTINUE, CaptureGuide, GuideOptions
 from rigkit.coach.keeper import Keeper
 from rigkit.coach.look import FrameObservation
-from rigkit.coach.whole import STEADY, FullCalibration, FullCalibrations, full_calibration
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.manifests.session import Session
-from rigkit.planning.candidates import Reach, held_boards
+from rigkit.planning.candidates import Reach, board_poses_in_view
 from rigkit.planning.goal import Goal, projection_goal
 from rigkit.workflows.calibration.calibrate import SessionCalibration
 from rigkit.workflows.capture.coach import CoachOptions, finished_words, open_coach
@@ -35,7 +35,7 @@ EMPTY = FrameObservation(size_px=SIZE, view=None)
 
 @pytest.fixture(scope="module")
 def views() -> list[BoardView]:
-    rng, held = np.random.default_rng(8), held_boards(CAMERA, BOARD, Reach(nearest_mm=250.0))
+    rng, held = np.random.default_rng(8), board_poses_in_view(CAMERA, BOARD, Reach(nearest_mm=250.0))
     return [noisy_view(CAMERA, held.pose(10 * k), f"{k}", rng, NOISE_PX, board=BOARD) for k in range(FRAMES)]
 
 
@@ -83,7 +83,7 @@ def test_a_capture_ends_only_after_a_whole_calibration(views: list[BoardView], w
     assert now.enough and not now.waits and now.words.startswith("Enough: ")
     assert [own.error for own in now.left] == pytest.approx([stated])
     # Another frame makes it better, but nobody has calibrated it.
-    pose = held_boards(CAMERA, BOARD, Reach(nearest_mm=250.0)).pose(7)
+    pose = board_poses_in_view(CAMERA, BOARD, Reach(nearest_mm=250.0)).pose(7)
     guide.add(noisy_view(CAMERA, pose, "more", np.random.default_rng(9), NOISE_PX, board=BOARD), SIZE)
     after = guide.advise(EMPTY)
     assert after.waits and not after.enough and after.left[0].error < now.left[0].error
