@@ -29,7 +29,8 @@ from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.reconstruction.reconstruct import reconstruct_from
 from rigkit.validation.planes import fit_plane, normal_errors
 from rigkit.validation.tables import best_of
-from rigkit.workflows.reconstruction.datasets import DatasetOptions, PairJob, over_pairs
+from rigkit.workflows.options.clouds import DatasetOptions
+from rigkit.workflows.reconstruction.datasets import PairJob, over_pairs
 from rigkit.workflows.reconstruction.pairs import geometry_of, match_images
 from rigkit.workflows.validation.paper import load_paper_tables
 

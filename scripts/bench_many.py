@@ -26,7 +26,7 @@ from rigkit.io.calibrations.calibration_file import save_camera
 from rigkit.synthetic.pairs import trihedral_pair
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics
-from rigkit.workflows.validation.validate import ValidateOptions
+from rigkit.workflows.options.clouds import ValidateOptions
 from rigkit.workflows.validation.validate_many import ManyValidation, validate_datasets
 
 CAMERA = Brown((480, 360), np.array([300.0, 300.5, 241.0, 179.0, -0.05, 0.01, 0.0, 0.0, 0.0]))

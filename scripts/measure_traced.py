@@ -27,7 +27,8 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.workflows.calibration.calibrate import CalibrateOptions, SessionCalibration
 from rigkit.workflows.calibration.calibrate_any import FolderOptions, calibrate_sources
-from rigkit.workflows.validation.validate import ValidateOptions, validate_dataset
+from rigkit.workflows.options.clouds import ValidateOptions
+from rigkit.workflows.validation.validate import validate_dataset
 
 NEAR_PX = 3.0
 """A detected corner this far from the nearest one of the board belongs to something else in the room."""

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigkit.cli.board_identify import identify
+from rigkit.cli.console import add_options
 from rigkit.core.errors import InputError
+from rigkit.workflows.options.cameras import PrintOptions
 
 if TYPE_CHECKING:
     from rigkit.core.patterns.base import Pattern
@@ -34,9 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="only with BOARD = identify: images or folders that show the board",
     )
     parser.add_argument("--square-mm", type=float, metavar="MM", help="side of a square (with COLUMNSxROWS)")
-    parser.add_argument("--paper", default="a4", help="a4 (default), a3, a2, a1, a0, letter or tabloid")
+    add_options(parser, PrintOptions, paper="")
     parser.add_argument("-o", "--output", metavar="NAME", help="write NAME.pdf, NAME.svg and NAME.toml")
-    parser.add_argument("--force", action="store_true", help="replace existing files")
+    add_options(parser, PrintOptions, force="")
     charuco = parser.add_argument_group("ChArUco", "markers in the white squares (with COLUMNSxROWS)")
     charuco.add_argument("--charuco", metavar="DICTIONARY", help="name of an OpenCV dictionary, such as DICT_5X5_100")
     charuco.add_argument("--marker-mm", type=float, metavar="MM", help="side of a marker (default: 3/4 of a square)")
@@ -54,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.core.boards import Board
     from rigkit.io.boards.board_words import board_in_words
-    from rigkit.workflows.capture.print_board import PrintOptions, print_board
+    from rigkit.workflows.capture.print_board import print_board
 
     if args.size == "identify":
         return identify(args)

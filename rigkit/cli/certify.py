@@ -8,6 +8,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from rigkit.cli.console import add_options, note_written, options_of, print_json, print_statement
+from rigkit.workflows.options.cameras import CertifyOptions
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("calibration", type=Path, metavar="RIG_OR_CALIBRATION", help="rig.json or calibration.json")
@@ -22,30 +25,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--distance-sigma", type=float, default=0.0, metavar="MM", help="one camera: standard deviation of the distance"
     )
-    parser.add_argument("--limit", type=float, metavar="X", help="largest error allowed, mm (deg for angles)")
     parser.add_argument(
         "--confidence", type=float, default=95.0, metavar="PERCENT", help="confidence level of the bound (default: 95)"
     )
-    parser.add_argument(
-        "--sigma-px",
-        type=float,
-        metavar="PX",
-        help="standard deviation of the image points to be measured, per coordinate",
-    )
-    parser.add_argument("--cameras", nargs=2, metavar="NAME", help="two cameras of the rig (default: the first two)")
-    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write an HTML report")
-    parser.add_argument("--pdf", type=Path, metavar="FILE.pdf", help="write a certificate to sign (A4)")
-    parser.add_argument("--force", action="store_true", help="replace existing files")
+    add_options(parser, CertifyOptions, limit="X", sigma_px="PX", cameras="NAME", report="-r FILE.html", pdf="FILE.pdf")
+    add_options(parser, CertifyOptions, force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note_written, options_of, print_json, print_statement
     from rigkit.core.errors import ExitCode, InputError
     from rigkit.report.pages.certificate_page import basis, causes_table
     from rigkit.report.tables import tables_to_text
     from rigkit.validation.certificate.contracts import Quantity, Task
-    from rigkit.workflows.checks.certify import CertifyOptions, certify_file
+    from rigkit.workflows.checks.certify import certify_file
 
     quantity = next(q for q in Quantity if getattr(args, q) is not None)
     if args.sigma_px is not None and not 0.0 < args.sigma_px < float("inf"):

@@ -9,7 +9,17 @@ import argparse
 from pathlib import Path
 
 from rigkit.cli.aim_arguments import add_board_argument, length_of
+from rigkit.cli.console import (
+    add_options,
+    note,
+    note_written,
+    options_of,
+    print_json,
+    print_statement,
+    progress_on_stderr,
+)
 from rigkit.core.errors import ExitCode, InputError
+from rigkit.workflows.options.cameras import CheckOptions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,48 +32,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="new images; of a rig one folder per camera, one folder with all, or images",
     )
     add_board_argument(parser, "board in the images (default: those of the calibration)")
-    parser.add_argument(
-        "--scene", action="store_true", help="without a board: match features of any textured scene (rigs)"
-    )
-    parser.add_argument(
-        "--before",
-        nargs="+",
-        default=[],
-        type=Path,
-        metavar="IMAGE|FOLDER",
-        help="reference images of when it held: report changes since then only",
-    )
+    add_options(parser, CheckOptions, scene="", before="IMAGE|FOLDER...")
     parser.add_argument("--length", type=float, metavar="MM", help="also state the error of a length of MM")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance (with --length)")
-    parser.add_argument(
-        "--fix", type=Path, metavar="FILE.json", help="if it does not hold: write the corrected calibration"
-    )
-    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write an HTML report")
-    parser.add_argument(
-        "--register", type=Path, metavar="FILE.jsonl", help="append the check to this register (see rigkit history)"
-    )
-    parser.add_argument(
-        "--temperature", type=float, metavar="C", help="temperature during the capture, for the register"
-    )
-    parser.add_argument("--force", action="store_true", help="replace existing files")
+    add_options(parser, CheckOptions, fix="FILE.json", report="-r FILE.html", history="--register FILE.jsonl")
+    add_options(parser, CheckOptions, temperature_c="--temperature C", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, note_written, options_of, print_json, print_statement, progress_on_stderr
     from rigkit.io.boards.board_words import board_files, board_of_words
     from rigkit.io.disk.writing import ensure_writable
     from rigkit.report.pages.check_page import check_table, check_to_dict
     from rigkit.report.tables import tables_to_text
-    from rigkit.workflows.checks.check import CheckOptions, check_pictures
+    from rigkit.workflows.checks.check import check_pictures
 
     length = length_of(args, "check")
-    if args.temperature is not None and args.register is None:
+    if args.temperature_c is not None and args.history is None:
         raise InputError("check: --temperature is only kept in a register; add --register FILE.jsonl")
     ensure_writable((args.fix, args.report), force=args.force, inputs=board_files(args.board))
     boards = tuple(board_of_words(words) for words in args.board)
-    given = {"boards": boards, "length": length, "history": args.register, "temperature_c": args.temperature}
-    options = options_of(CheckOptions, args, **given)
+    options = options_of(CheckOptions, args, boards=boards, length=length)
     done = check_pictures(args.calibration, args.images, options, progress=progress_on_stderr())
     check = done.check
     if args.json:

@@ -6,7 +6,9 @@ import argparse
 from pathlib import Path
 
 from rigkit.cli.aim_arguments import add_board_argument, add_reach_arguments, length_of, reach_of
+from rigkit.cli.console import add_options, options_of, progress_on_stderr
 from rigkit.core.errors import ExitCode, InputError
+from rigkit.workflows.options.cameras import CoachOptions
 
 MAX_CAMERAS = 8
 """Of a browser: more streams than this no machine carries."""
@@ -28,38 +30,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance")
     parser.add_argument("--goal-mm", type=float, metavar="MM", help="standard deviation to reach for that length")
     source = parser.add_mutually_exclusive_group()
-    source.add_argument(
-        "--cameras", type=int, default=1, metavar="N", help="number of cameras of the browser (default: 1)"
-    )
-    each = "; repeat it for each camera of a rig"
-    source.add_argument(
-        "--watch",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FOLDER",
-        help=f"use images that another program writes into it{each}",
-    )
-    source.add_argument(
-        "--video",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help=f"choose the best frames of a recording{each}",
-    )
-    source.add_argument(
-        "--device", type=int, action="append", default=[], metavar="N", help=f"use camera N of this machine{each}"
-    )
-    parser.add_argument("--lan", action="store_true", help="serve the page to the local network, unencrypted")
-    parser.add_argument("--port", type=int, default=8137, help="port of the page (default: 8137)")
+    add_options(source, CoachOptions, cameras="N", watch="FOLDER", video="FILE", device="N")
+    add_options(parser, CoachOptions, lan="", port="")
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import options_of, progress_on_stderr
     from rigkit.coach.guide import GuideOptions
     from rigkit.io.boards.board_words import board_of_words
-    from rigkit.workflows.capture.coach import CoachOptions, run_coach
+    from rigkit.workflows.capture.coach import run_coach
 
     if not 0.0 < args.goal < float("inf"):
         raise InputError(f"--goal {args.goal}: it must be positive")

@@ -1,20 +1,23 @@
-"""Common functions of the verbs: progress on stderr, results on stdout, options from arguments."""
+"""Common functions of the verbs: progress on stderr, results on stdout, arguments of options and options from them."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import logging
 import re
 import sys
 import time
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, TypeVar
+from dataclasses import MISSING, Field, fields
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from rigkit.core.errors import InputError, printable
 from rigkit.core.progress import Progress
+from rigkit.io.disk.schema_words import attributes_of
 
 if TYPE_CHECKING:
-    from argparse import Namespace
     from collections.abc import Iterable
     from pathlib import Path
 
@@ -66,11 +69,50 @@ def note_written(paths: Iterable[Path]) -> None:
         note(f"{path} written")
 
 
-def options_of(kind: type[Options], args: Namespace, /, **others: Any) -> Options:
-    """Return a workflow's options from `others` and from the arguments with the names of its other fields."""
-    from dataclasses import fields
+def add_options(parser: argparse._ActionsContainer, kind: type, /, **spelled: str) -> None:
+    """Add arguments for fields of a workflow's options, which `options_of` reads.
 
-    own = {f.name for f in fields(kind) if f.name not in others}  # type: ignore[arg-type]
+    Type, choices and default are those of the field, the help is its description in the docstring. `spelled` has the
+    flags (--name if there is no long one) and the placeholders of values: output="-o FILE", before="IMAGE...". With the
+    dots a list takes several values at once, without them the argument is repeated.
+    """
+    own, words = {field.name: field for field in fields(kind)}, attributes_of(kind)
+    for name, spelling in spelled.items():
+        flags = [word for word in spelling.split() if word.startswith("-")]
+        places = [word for word in spelling.split() if word not in flags]
+        if not any(flag.startswith("--") for flag in flags):
+            flags.append(f"--{name.replace('_', '-')}")
+        given = _argument_of(own[name], places)
+        text = words[name].rstrip(".")
+        if given.get("action") == "append":
+            text += " (repeatable)"
+        elif given.get("default") not in (None, []) and "default" not in text:
+            text += f" (default: {given['default']})"
+        parser.add_argument(*flags, dest=name, help=text.replace("%", "%%"), **given)
+
+
+def _argument_of(field: Field[Any], places: list[str]) -> dict[str, Any]:
+    """Return type, number of values, choices and default of the argument for a field, with placeholders of values."""
+    own = field.type
+    if get_origin(own) in (Union, UnionType):
+        own = next(one for one in get_args(own) if one is not NoneType)
+    if own is bool:
+        return {"action": argparse.BooleanOptionalAction if field.default is None else "store_true"}
+    out: dict[str, Any] = {"default": field.default} if field.default is not MISSING else {"required": True}
+    if places:
+        out["metavar"] = tuple(places) if len(places) > 1 else places[0].removesuffix("...")
+    if get_origin(own) is tuple:
+        own, *others = get_args(own)
+        if others != [...]:
+            out["nargs"] = 1 + len(others)
+        else:
+            out |= {"default": [], **({"nargs": "+"} if places[0].endswith("...") else {"action": "append"})}
+    return out | ({"choices": get_args(own)} if get_origin(own) is Literal else {"type": own})
+
+
+def options_of(kind: type[Options], args: argparse.Namespace, /, **others: Any) -> Options:
+    """Return a workflow's options from `others` and from the arguments with the names of its other fields."""
+    own = {field.name for field in fields(kind) if field.name not in others}  # type: ignore[arg-type]
     given = {name: tuple(v) if isinstance(v, list) else v for name, v in vars(args).items() if name in own}
     return kind(**given, **others)
 

@@ -11,6 +11,7 @@ from rigkit.cli.console import options_of, print_json, progress_on_stderr
 from rigkit.cli.dataset_arguments import add_dataset_arguments, exit_code_of, failed_pairs, results_folder
 from rigkit.cli.validation_words import note_skipped
 from rigkit.core.errors import ExitCode
+from rigkit.workflows.options.clouds import DatasetOptions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,7 +21,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.io.manifests.manifest import load_dataset
     from rigkit.report.tables import tables_to_text
-    from rigkit.workflows.reconstruction.datasets import DatasetOptions
     from rigkit.workflows.validation.crosscheck import crosscheck_dataset
 
     dataset = load_dataset(args.dataset)

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigkit.cli.console import note
+from rigkit.cli.console import add_options, note
+from rigkit.workflows.options.clouds import DatasetOptions
 
 if TYPE_CHECKING:
     from rigkit.workflows.reconstruction.datasets import PairFailure
@@ -20,19 +21,9 @@ def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = F
     parser.add_argument(
         "dataset", metavar="DATASET", nargs=number, help="folder with a dataset.toml, or the file itself"
     )
-    parser.add_argument(
-        "-p", "--pair", dest="pairs", action="append", default=[], metavar="ID", help="only this pair (repeatable)"
-    )
+    add_options(parser, DatasetOptions, pairs="-p --pair ID")
     parser.add_argument("-o", "--output", metavar="DIR", help="folder for results (default: a new one, out/<data set>)")
-    parser.add_argument("--force", action="store_true", help="replace existing results")
-    parser.add_argument("--recalibrate", action="store_true", help="calibrate from the images again")
-    parser.add_argument(
-        "--chain",
-        choices=("raw", "rectified"),
-        default="raw",
-        help="work on raw pixels (default) or rectified perspective views",
-    )
-    parser.add_argument("-j", "--jobs", type=int, metavar="N", help="number of processes (default: one per core)")
+    add_options(parser, DatasetOptions, force="", recalibrate="", chain="", jobs="-j N")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.aim_arguments import add_board_argument
+from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr
 from rigkit.core.errors import ExitCode, printable
+from rigkit.workflows.options.cameras import DetectOptions
 
 if TYPE_CHECKING:
     from rigkit.core.detections import BoardDetection
@@ -16,31 +18,15 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", nargs="+", metavar="IMAGE|FOLDER|VIDEO", help="images, folders, videos, camera:0")
     add_board_argument(parser, "a board to look for, such as 9x6x25 (repeatable; default: chessboards of any size)")
-    parser.add_argument(
-        "--camera",
-        metavar="CALIBRATION.json",
-        help="the camera of all images: finds corners that were missed on the boards given, and places all more finely",
-    )
-    parser.add_argument("-o", "--output", metavar="CORNERS.csv", help="write the corners file")
-    parser.add_argument("--overlay", metavar="DIR", help="write each image with its corners drawn in")
-    parser.add_argument(
-        "--min-corners",
-        type=int,
-        default=12,
-        metavar="N",
-        help="without --board: fewest corners of a chessboard (default 12)",
-    )
-    parser.add_argument("-j", "--jobs", type=int, metavar="N", help="number of processes (default: one per core)")
-    parser.add_argument("--force", action="store_true", help="replace existing files")
+    add_options(parser, DetectOptions, camera="CALIBRATION.json", output="-o CORNERS.csv", overlay="DIR")
+    add_options(parser, DetectOptions, min_corners="N", jobs="-j N", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, options_of, print_json, progress_on_stderr
-    from rigkit.workflows.detect import DetectOptions, detect_in_images
+    from rigkit.workflows.detect import detect_in_images
 
-    places = {name: Path(given) if (given := getattr(args, name)) else None for name in ("camera", "output", "overlay")}
-    options = options_of(DetectOptions, args, boards=tuple(map(Path, args.board)), **places)
+    options = options_of(DetectOptions, args, boards=tuple(map(Path, args.board)))
     done = detect_in_images(args.images, options, progress=progress_on_stderr())
     for error in done.failures.values():
         note(f"left out: {error}")

@@ -5,26 +5,23 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from rigkit.cli.console import add_options, options_of, print_json
 from rigkit.core.errors import ExitCode
+from rigkit.workflows.options.cameras import DiffOptions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("a", type=Path, metavar="A.json", help="a calibration, a rig, or rigidly mounted boards")
     parser.add_argument("b", type=Path, metavar="B.json", help="the other one, of the same camera, rig or boards")
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="MAP.png", help="write a map of the difference over the image"
-    )
-    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write an HTML report")
-    parser.add_argument("--force", action="store_true", help="replace an existing map or page")
+    add_options(parser, DiffOptions, output="-o MAP.png", report="-r FILE.html", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import print_json
-    from rigkit.workflows.checks.diff import DiffOptions, diff
+    from rigkit.workflows.checks.diff import diff
     from rigkit.workflows.checks.diff_words import facts_of, figures_of, words_of, write_diff_page
 
-    options = DiffOptions(output=args.output, force=args.force, report=args.report)
+    options = options_of(DiffOptions, args)
     done = diff(args.a, args.b, options)
     if args.report is not None:
         write_diff_page(args.report, done, (args.a, args.b), force=args.force)

@@ -5,17 +5,19 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import size_of_words
+from rigkit.cli.console import add_options, options_of, progress_on_stderr, size_of_words
 from rigkit.cli.dataset_arguments import add_planes_argument
 from rigkit.core.errors import InputError
 from rigkit.workflows.inputs.formats import CAMERA_FORMATS, CLOUD_FORMATS, PLY_FORMATS, READ_FORMATS
+from rigkit.workflows.options.cameras import ExportCameraOptions
+from rigkit.workflows.options.clouds import ExportCloudOptions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source", type=Path, metavar="SOURCE", help="a camera file, a rig, a cloud as PLY, or a data set (then --pair)"
     )
-    parser.add_argument("-o", "--output", type=Path, required=True, help="file to write (a folder for a COLMAP model)")
+    add_options(parser, ExportCloudOptions, output="-o")
     parser.add_argument(
         "--to", choices=sorted({*CAMERA_FORMATS, *CLOUD_FORMATS}), help="format of OUTPUT (default: by its ending)"
     )
@@ -27,16 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--names", nargs="+", metavar="CAMERA", help="cameras of a rig, in this order (default: all)")
     parser.add_argument("--size", metavar="WxH", help="image size, px, if SOURCE does not state it")
-    parser.add_argument("-p", "--pair", help="pair of the data set whose cloud is exported")
-    parser.add_argument("--method", default="3SDIR", help="affine estimator of the normals (default 3SDIR)")
+    add_options(parser, ExportCloudOptions, pair="-p", method="")
     add_planes_argument(parser, "points and normals of a pair")
-    parser.add_argument(
-        "--float",
-        dest="single_precision",
-        action="store_true",
-        help="write a PLY in single precision (PCL reads no other)",
-    )
-    parser.add_argument("--force", action="store_true", help="replace existing files")
+    add_options(parser, ExportCloudOptions, single_precision="--float", force="")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,10 +41,9 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("export: --float is for PLY clouds; leave it out")
     import numpy as np
 
-    from rigkit.cli.console import options_of
     from rigkit.rectification.targets import field_across
     from rigkit.workflows.inputs.camera_files import is_rig
-    from rigkit.workflows.outputs.export_camera import ExportCameraOptions, export_camera, export_rig
+    from rigkit.workflows.outputs.export_camera import export_camera, export_rig
 
     size_px = None if args.size is None else size_of_words(args.size)
     passed_on = {"kind": args.to, "source_kind": args.source_format, "size_px": size_px}
@@ -69,8 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _export_cloud(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import options_of, progress_on_stderr
-    from rigkit.workflows.reconstruction.export_cloud import ExportCloudOptions, export_cloud, export_ply
+    from rigkit.workflows.reconstruction.export_cloud import export_cloud, export_ply
 
     kind = args.to or args.output.suffix.lstrip(".") or "colmap"
     is_ply = args.source.suffix == ".ply"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
+from rigkit.cli.console import add_options, note, options_of, pose_in_words, progress_on_stderr
 from rigkit.core.errors import ExitCode
+from rigkit.workflows.options.cameras import HandEyeOptions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -13,20 +14,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "poses", metavar="POSES.csv", help="image (or timestamp_ns),x_mm,y_mm,z_mm,qx,qy,qz,qw: base_from_hand"
     )
     parser.add_argument("images", metavar="IMAGES", nargs="+", help="images of the board, or a folder of them")
-    parser.add_argument("--camera", type=Path, required=True, metavar="CALIB", help="the camera's calibration")
-    parser.add_argument("--board", type=Path, required=True, metavar="CxRxMM|BOARD.toml", help="such as 9x6x25")
-    parser.add_argument("--board-on-hand", action="store_true", help="the hand carries the board, the camera is fixed")
-    parser.add_argument("--inverse", action="store_true", help="the poses are hand_from_base")
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE.json", help="write the result")
-    parser.add_argument("--force", action="store_true", help="replace an existing file")
+    add_options(parser, HandEyeOptions, camera="CALIB", board="CxRxMM|BOARD.toml", board_on_hand="", inverse="")
+    add_options(parser, HandEyeOptions, output="-o FILE.json", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     import numpy as np
 
-    from rigkit.cli.console import note, options_of, pose_in_words, progress_on_stderr
-    from rigkit.workflows.handeye import POSE_NAMES, HandEyeOptions, calibrate_hand_eye, hand_eye_text
+    from rigkit.workflows.handeye import POSE_NAMES, calibrate_hand_eye, hand_eye_text
 
     options = options_of(HandEyeOptions, args)
     done = calibrate_hand_eye(args.poses, args.images, options, progress=progress_on_stderr())

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import options_of, print_json, progress_on_stderr
+from rigkit.cli.console import add_options, options_of, print_json, progress_on_stderr
 from rigkit.core.errors import ExitCode
+from rigkit.workflows.options.clouds import MeshOptions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,26 +18,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="point cloud with normals, of `rigkit reconstruct` or any other program",
     )
     parser.add_argument("-o", "--output", type=Path, metavar="MESH.ply", help="default: CLOUD-mesh.ply beside it")
-    parser.add_argument("--depth", type=int, default=9, help="depth of the octree: 2^DEPTH cells per side (default 9)")
-    parser.add_argument(
-        "--cut",
-        type=float,
-        default=0.02,
-        metavar="SHARE",
-        help="part of the surface to cut off where points are sparsest (default .02)",
-    )
-    parser.add_argument(
-        "--one-view",
-        action=argparse.BooleanOptionalAction,
-        help="all points were seen from the origin: build no surface between foreground and background (default: as "
-        "the header of CLOUD.ply says)",
-    )
-    parser.add_argument("--force", action="store_true", help="replace an existing file")
+    add_options(parser, MeshOptions, depth="", cut="SHARE", one_view="", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.workflows.reconstruction.mesh import MeshOptions, mesh_cloud
+    from rigkit.workflows.reconstruction.mesh import mesh_cloud
 
     output = args.output or args.cloud.parent / f"{args.cloud.stem}-mesh.ply"
     options = options_of(MeshOptions, args, output=output)

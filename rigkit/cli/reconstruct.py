@@ -17,6 +17,7 @@ from rigkit.cli.dataset_arguments import (
 )
 from rigkit.cli.reconstruct_scene import add_scene_arguments, is_scene, run_scene
 from rigkit.core.errors import ExitCode, InputError
+from rigkit.workflows.options.clouds import ReconstructOptions
 
 if TYPE_CHECKING:
     from rigkit.workflows.reconstruction.reconstruct import PairReconstruction
@@ -44,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
         return run_scene(args)
     from rigkit.io.manifests.manifest import load_dataset
     from rigkit.report.tables import measured_words
-    from rigkit.workflows.reconstruction.reconstruct import ReconstructOptions, reconstruct_dataset
+    from rigkit.workflows.reconstruction.reconstruct import reconstruct_dataset
 
     dataset = load_dataset(args.dataset)
     out = results_folder(args, dataset.name)

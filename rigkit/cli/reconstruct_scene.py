@@ -6,10 +6,11 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from rigkit.cli.console import note, options_of, print_json, progress_on_stderr
+from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr
 from rigkit.cli.dataset_arguments import results_folder
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.core.posetype import PoseType
+from rigkit.workflows.options.clouds import RigSceneOptions, SceneOptions
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,48 +22,21 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="IMAGE",
         help="match affine features of two images; with --rig three or more, whose pairwise clouds are fused",
     )
-    group.add_argument(
-        "--correspondences",
-        type=Path,
-        metavar="FILE",
-        help="CSV, NPZ or AffineExtractor text with affinities or directions, a matcher's NPZ or COLMAP's database; "
-        "with --images affinities are estimated for points that have none, and the cloud is dense and coloured",
-    )
-    group.add_argument("--camera", type=Path, metavar="CALIB", help="calibration of the camera (of image A)")
-    group.add_argument(
-        "--camera2", type=Path, metavar="CALIB", help="calibration of image B (default: that of image A)"
-    )
-    group.add_argument(
-        "--rig",
-        type=Path,
-        metavar="RIG",
-        help="the rig that took the images, instead of --camera; its extrinsics are kept fixed",
-    )
+    add_options(group, SceneOptions, correspondences="FILE", camera="CALIB", camera2="CALIB", rig="RIG")
     group.add_argument(
         "--names",
         nargs="+",
         metavar="CAMERA",
         help="which cameras of the rig took the images, in order (default: the first ones)",
     )
-    group.add_argument(
-        "--pose", type=Path, metavar="FILE", help="known cam2_from_cam1, 3x4 or 4x4 numbers, mm; kept fixed"
-    )
-    group.add_argument(
-        "--baseline-mm", type=float, metavar="MM", help="measured baseline (default: lengths are in baselines)"
-    )
+    add_options(group, SceneOptions, pose="FILE", baseline_mm="MM")
     group.add_argument(
         "--pose-type",
         choices=tuple(map(str, PoseType)),
         help="motion between the images (default: general, or that of a rectified pair)",
     )
     group.add_argument("--sparse", dest="grow", action="store_false", help="keep matched features only; no dense cloud")
-    group.add_argument(
-        "--float", dest="single_precision", action="store_true", help="write the cloud in single precision"
-    )
-    group.add_argument("--confidence", action="store_true", help="scale normals by their confidence")
-    group.add_argument(
-        "--level-sigma-deg", type=float, metavar="DEG", help="standard deviation of the angles that the pose type fixes"
-    )
+    add_options(group, SceneOptions, single_precision="--float", confidence="", level_sigma_deg="DEG")
 
 
 def is_scene(args: argparse.Namespace) -> bool:
@@ -81,7 +55,7 @@ def is_scene(args: argparse.Namespace) -> bool:
 def run_scene(args: argparse.Namespace) -> int:
     if args.images and len(args.images) > 2:
         return _run_rig(args)
-    from rigkit.workflows.reconstruction.reconstruct_scene import CLOUD, SceneOptions, reconstruct_views
+    from rigkit.workflows.reconstruction.reconstruct_scene import CLOUD, reconstruct_views
 
     for option, given in (("--images", args.images), ("--names", args.names)):
         if given and len(given) != 2:
@@ -109,7 +83,7 @@ def _show(name: str, cloud: Path, summary: str, figures: dict[str, Any], *, json
 
 
 def _run_rig(args: argparse.Namespace) -> int:
-    from rigkit.workflows.reconstruction.reconstruct_rig import RigSceneOptions, reconstruct_rig_views
+    from rigkit.workflows.reconstruction.reconstruct_rig import reconstruct_rig_views
     from rigkit.workflows.reconstruction.reconstruct_scene import CLOUD
 
     if not args.rig:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import size_of_words
+from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr, size_of_words
 from rigkit.cli.rectification_words import grouped_by_description, image_to_dict
 from rigkit.core.errors import ExitCode, InputError
+from rigkit.workflows.options.cameras import RectifyOptions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,15 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="taken at the same time by another camera of the rig: rectifies a stereo pair",
     )
     parser.add_argument("--camera", metavar="CALIB", help="the camera's calibration.json")
-    parser.add_argument(
-        "-o",
-        "--output",
-        required=True,
-        metavar="OUT",
-        help="image (.png, .tif, .jpg) or folder to write",
-    )
-    parser.add_argument("--maps", type=Path, metavar="FILE.npz", help="also write K, P, Q and maps for cv2.remap")
-    parser.add_argument("--force", action="store_true", help="replace an existing file")
+    add_options(parser, RectifyOptions, output="-o OUT", maps="FILE.npz", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     stereo = parser.add_argument_group(
         "stereo",
@@ -39,37 +32,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--names", nargs=2, metavar=("ONE", "TWO"), help="cameras of the two images (default: the rig's first two)"
     )
     view = parser.add_argument_group("view")
-    view.add_argument("--projection", choices=("perspective", "cylindrical", "equirectangular"), default="perspective")
-    view.add_argument(
-        "--hfov-deg", type=float, metavar="DEG", help="horizontal field of view (default: that of the camera)"
-    )
+    add_options(view, RectifyOptions, projection="", hfov_deg="DEG")
     view.add_argument("--yaw-deg", type=float, default=0.0, metavar="DEG", help="look to the right")
     view.add_argument("--pitch-deg", type=float, default=0.0, metavar="DEG", help="look up")
     view.add_argument("--roll-deg", type=float, default=0.0, metavar="DEG", help="turn the view clockwise")
     view.add_argument(
         "--size", metavar="WxH", help="image size of the result, px (default: keeps the source's resolution)"
     )
-    view.add_argument(
-        "--crop",
-        action="store_true",
-        help="crop to the largest rectangle without empty pixels (in both images of a pair)",
-    )
-    view.add_argument(
-        "--interpolation",
-        choices=("spline", "lanczos", "linear", "nearest"),
-        default="spline",
-        help="spline (default) shifts points by less than 0.001 px; linear is fast",
-    )
+    add_options(view, RectifyOptions, crop="", interpolation="")
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, options_of, print_json, progress_on_stderr
-    from rigkit.workflows.rectify import RectifyOptions, holds_several, rectify_image, rectify_stereo_images
+    from rigkit.workflows.rectify import holds_several, rectify_image, rectify_stereo_images
 
     options = options_of(
         RectifyOptions,
         args,
-        output=Path(args.output),
         angles_deg=(args.yaw_deg, args.pitch_deg, args.roll_deg),
         size_px=None if args.size is None else size_of_words(args.size),
     )

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from rigkit.cli.console import note, options_of, progress_on_stderr
+from rigkit.cli.console import add_options, note, options_of, progress_on_stderr
 from rigkit.cli.dataset_arguments import (
     add_dataset_arguments,
     add_direction_arguments,
@@ -19,9 +18,7 @@ from rigkit.cli.dataset_arguments import (
 )
 from rigkit.cli.validation_words import show, show_paper
 from rigkit.core.errors import InputError
-
-if TYPE_CHECKING:
-    from rigkit.workflows.validation.validate import ValidateOptions
+from rigkit.workflows.options.clouds import PaperOptions, ValidateOptions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,16 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="run the paper's own pipeline instead (chords, equal weights, linear solvers, no refinement): its tables "
         "beside the printed ones, and whether its claims hold",
     )
-    parser.add_argument(
-        "--own-solvers",
-        action="store_true",
-        help="with --paper: use the solvers of standard and forward motion for such pairs, not the planar one",
-    )
+    add_options(parser, PaperOptions, own_solvers="")
 
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.io.manifests.manifest import load_dataset
-    from rigkit.workflows.validation.paper import PaperOptions, validate_as_paper
+    from rigkit.workflows.validation.paper import validate_as_paper
     from rigkit.workflows.validation.validate import validate_dataset
 
     if len(args.dataset) > 1:
@@ -78,7 +71,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _options(args: argparse.Namespace, output: Path) -> ValidateOptions:
-    from rigkit.workflows.validation.validate import ValidateOptions
 
     return options_of(ValidateOptions, args, output=output, pdf=args.figures == "pdf")
 

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
     from rigkit.validation.checks import ValidationReport
     from rigkit.validation.crosscheck import CrossCheckReport
-    from rigkit.workflows.validation.paper import PaperOptions, PaperValidation
+    from rigkit.workflows.options.clouds import PaperOptions
+    from rigkit.workflows.validation.paper import PaperValidation
     from rigkit.workflows.validation.validate import DatasetValidation
 
 

@@ -18,22 +18,11 @@ from rigkit.io.manifests.manifest import load_dataset
 from rigkit.synthetic.demo import build_demo
 from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibrate_session
 from rigkit.workflows.inputs.corners import Cache
-from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.validation.validate import DatasetValidation, ValidateOptions, validate_dataset
+from rigkit.workflows.options.cameras import DemoOptions
+from rigkit.workflows.options.clouds import ValidateOptions
+from rigkit.workflows.validation.validate import DatasetValidation, validate_dataset
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DemoOptions(NamesFiles):
-    """Options of the demo."""
-
-    output: Path = Path("rigkit-demo")
-    """New or empty folder for the capture; the results go into its subfolder `out`."""
-    seed: int = 1
-    """Seed of the random scene."""
-    jobs: int | None = None
-    """Number of processes; None: one a core."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -38,27 +38,7 @@ from rigkit.report.pictures.overlay import draw_boards
 from rigkit.workflows.inputs.camera_files import import_camera
 from rigkit.workflows.inputs.frames import VideoFrames, frames_folder, frames_of_videos
 from rigkit.workflows.inputs.identify_board import suggestion, why_not_detected
-from rigkit.workflows.inputs.paths import NamesFiles
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DetectOptions(NamesFiles):
-    """The boards that images may show, and where the results go."""
-
-    boards: tuple[Path, ...] = ()
-    """Board files, or words such as 9x6x25; empty: chessboards of every size are detected."""
-    camera: Path | None = None
-    """Calibration of the camera of all images: finds corners that were missed on `boards`, places all more finely."""
-    min_corners: int = 12
-    """Fewest corners of a board whose size is not given."""
-    output: Path | None = None
-    """Corners file to write, or None."""
-    overlay: Path | None = None
-    """Folder for a picture of each image with its corners, or None."""
-    force: bool = False
-    """Replace files that exist; what was read is never replaced."""
-    jobs: int | None = None
-    """Processes; None: one a core."""
+from rigkit.workflows.options.cameras import DetectOptions
 
 
 @dataclass(frozen=True, eq=False, slots=True)

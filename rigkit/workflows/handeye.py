@@ -32,31 +32,13 @@ from rigkit.io.media.images import read_image_of
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_near_camera
 from rigkit.workflows.inputs.identify_board import why_not_detected
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.cameras import HandEyeOptions
 
 HAND_EYE_SCHEMA = "rigkit.hand_eye/1"
 POSE_NAMES = (("cam_from_hand", "base_from_board"), ("cam_from_base", "hand_from_board"))
 """Names of the two poses if the hand carries the camera, and if it carries the board."""
 PLANAR_AMBIGUITY = 1.5
 """Two poses of one board whose errors differ by less than this factor are ambiguous."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HandEyeOptions(NamesFiles):
-    """Camera, board and conventions of a hand-eye calibration."""
-
-    camera: Path
-    """The camera's calibration, of rigkit or another tool."""
-    board: Path
-    """The board's file, or words such as 9x6x25."""
-    board_on_hand: bool = False
-    """The hand carries the board and the camera is fixed, not the reverse."""
-    inverse: bool = False
-    """The robot's poses are hand_from_base, not base_from_hand."""
-    output: Path | None = None
-    """JSON file for the result."""
-    force: bool = False
-    """Replace a file that exists."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,8 +28,8 @@ from rigkit.rectification.targets import target_camera
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_camera, import_pair
 from rigkit.workflows.inputs.folder_session import cameras_in, images_of_camera
-from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.moments import grouped_by_moment
+from rigkit.workflows.options.cameras import RectifyOptions
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -52,31 +52,6 @@ Jobs = list[tuple[list[tuple[Path | _VideoFrame, Path]], RectifyMap]]
 _log = logging.getLogger(__name__)
 
 EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".webp")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RectifyOptions(NamesFiles):
-    """The ideal camera, and where to write. For a stereo pair only the projection can be chosen."""
-
-    output: Path
-    """Image to write (for a pair: NAME-1 and NAME-2), or a folder (a name without an ending). In a folder, images keep
-    their names, frames of a video are 000000.png, 000001.png, ..., and a rig has a folder for each camera."""
-    projection: Literal["perspective", "cylindrical", "equirectangular"] = "perspective"
-    """Projection of the ideal camera."""
-    hfov_deg: float | None = None
-    """Horizontal field of view; None: chosen for the lens."""
-    angles_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Yaw (to the right), pitch (up) and roll (clockwise) of the ideal camera."""
-    size_px: tuple[int, int] | None = None
-    """Width and height; None: keeps the resolution of the source."""
-    interpolation: Literal["spline", "lanczos", "linear", "nearest"] = "spline"
-    """Interpolation: spline keeps positions to a thousandth of a pixel, linear is fast."""
-    crop: bool = False
-    """Crop to the largest rectangle that the camera (of a pair: both cameras) sees completely."""
-    maps: Path | None = None
-    """npz file for the geometry: K and rotation of the ideal camera, maps for cv2.remap, for a pair P1, P2, Q (mm)."""
-    force: bool = False
-    """Replace existing files; input files are never replaced."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

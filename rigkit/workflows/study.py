@@ -10,7 +10,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,28 +28,10 @@ from rigkit.report.pictures.study_figure import study_figure
 from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import Study, chunk_count, run_chunk
 from rigkit.study.table import StudyTable, tabulate
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.cameras import StudyOptions
 from rigkit.workflows.outputs.provenance import software_facts
 
 Errors = NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StudyOptions(NamesFiles):
-    """How to run studies, and where their tables and figures go."""
-
-    output: Path | None = None
-    """Folder for tables, figures and the finished chunks of an interrupted run; None: nothing is written."""
-    trials: int | None = None
-    """Number of trials; None: that of the file."""
-    jobs: int = 1
-    """Number of processes; results do not depend on it."""
-    dask: str | None = None
-    """Address of a Dask scheduler to use instead of processes."""
-    figure: Literal["png", "pdf", "svg"] = "png"
-    """Format of the figures."""
-    force: bool = False
-    """Replace existing files; the study files are never replaced."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

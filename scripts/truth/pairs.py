@@ -17,8 +17,9 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibrations.calibration_file import save_camera
 from rigkit.io.corners.correspondences import correspondences_text
 from rigkit.io.media.images import read_image
-from rigkit.workflows.reconstruction.reconstruct_scene import SceneOptions, reconstruct_views
-from rigkit.workflows.validation.validate import ValidateOptions, validate_dataset
+from rigkit.workflows.options.clouds import SceneOptions, ValidateOptions
+from rigkit.workflows.reconstruction.reconstruct_scene import reconstruct_views
+from rigkit.workflows.validation.validate import validate_dataset
 from truth import peers
 from truth.cameras import PEER_FAILURES, kept_views
 from truth.colmap import colmap_pair, colmap_rig

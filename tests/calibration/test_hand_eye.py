@@ -23,7 +23,8 @@ from rigkit.io.calibrations.calibration_file import save_camera
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import place_board, sees_paper
-from rigkit.workflows.handeye import HandEyeOptions, calibrate_hand_eye
+from rigkit.workflows.handeye import calibrate_hand_eye
+from rigkit.workflows.options.cameras import HandEyeOptions
 
 X = Rigid3(exp_so3(np.array([0.3, -1.2, 0.4])), [30.0, -60.0, 90.0])
 Z = Rigid3(exp_so3(np.array([2.0, 0.4, -0.3])), [400.0, 120.0, -15.0])

@@ -27,7 +27,8 @@ from rigkit.interop.mrcal import read_cameramodel
 from rigkit.io.calibrations.calibration_file import camera_to_json, load_calibration, load_camera, save_camera
 from rigkit.io.ply import read_ply
 from rigkit.workflows.inputs.camera_files import import_rig
-from rigkit.workflows.outputs.export_camera import ExportCameraOptions, export_camera, foreign_files
+from rigkit.workflows.options.cameras import ExportCameraOptions
+from rigkit.workflows.outputs.export_camera import export_camera, foreign_files
 from rigkit.workflows.reconstruction.pairs import find_boards
 
 CAMERAS = REPOSITORY / "calib" / "cameras"

@@ -29,7 +29,8 @@ from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard, place_board, sees_paper
-from rigkit.workflows.capture.coach import CoachOptions, open_coach
+from rigkit.workflows.capture.coach import open_coach
+from rigkit.workflows.options.cameras import CoachOptions
 
 SIZE = (640, 480)
 LEFT = Pinhole(SIZE, np.array([520.0, 520.0, 321.3, 236.1]))

@@ -27,7 +27,8 @@ from rigkit.io.manifests.session import Session
 from rigkit.planning.candidates import Reach, board_poses_in_view
 from rigkit.planning.goal import Goal, projection_goal
 from rigkit.workflows.calibration.calibrate import SessionCalibration
-from rigkit.workflows.capture.coach import CoachOptions, finished_words, open_coach
+from rigkit.workflows.capture.coach import finished_words, open_coach
+from rigkit.workflows.options.cameras import CoachOptions
 
 FRAMES, NOISE_PX = 10, 0.05
 EMPTY = FrameObservation(size_px=SIZE, view=None)

@@ -43,7 +43,8 @@ from rigkit.planning.candidates import board_poses_in_view
 from rigkit.planning.information import CornerError
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
 from rigkit.validation.certificate.contracts import Quantity, Task
-from rigkit.workflows.capture.coach import CoachOptions, open_coach
+from rigkit.workflows.capture.coach import open_coach
+from rigkit.workflows.options.cameras import CoachOptions
 
 DRAWS = 120
 

@@ -22,9 +22,10 @@ from rigkit.coach.sources import frames_of_folders
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.io.calibrations.history_file import load_history
-from rigkit.workflows.capture.coach import CoachOptions, open_coach
-from rigkit.workflows.handeye import HandEyeOptions, calibrate_hand_eye
+from rigkit.workflows.capture.coach import open_coach
+from rigkit.workflows.handeye import calibrate_hand_eye
 from rigkit.workflows.inputs.frames import frames_of_videos
+from rigkit.workflows.options.cameras import CoachOptions, HandEyeOptions
 
 BOARD = Board("small", 5, 4, 30.0, 30.0)
 CHECK = ["check", "calibration.json", "--board", "floor.toml"]

@@ -31,7 +31,8 @@ from rigkit.workflows.checks.check import fixed_text, load_monitored
 from rigkit.workflows.checks.diff import CameraPair, diff
 from rigkit.workflows.handeye import _with_fixed_pupil
 from rigkit.workflows.inputs.camera_files import import_camera, import_near_camera
-from rigkit.workflows.outputs.export_camera import ExportCameraOptions, export_camera
+from rigkit.workflows.options.cameras import ExportCameraOptions
+from rigkit.workflows.outputs.export_camera import export_camera
 
 NEAR = Board("near", 9, 6, 12.0, 12.0)
 TRUE = NearCamera.of(lens("fish"), (2.0, 0.3))

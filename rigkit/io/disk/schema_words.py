@@ -95,7 +95,7 @@ def of_dataclass(cls: type, *, only: Sequence[str] = (), without: Sequence[str] 
 
     Numbers may be null, which stands for NaN in files.
     """
-    hints, words = get_type_hints(cls), _attributes(cls)
+    hints, words = get_type_hints(cls), attributes_of(cls)
     properties = {}
     for field in dataclasses.fields(cls):
         if field.name not in without and (not only or field.name in only):
@@ -115,10 +115,10 @@ def _of_type(hint: Any) -> Schema:
     return PLAIN_KINDS.get(hint, {})
 
 
-def _attributes(cls: type) -> dict[str, str]:
-    """Return the descriptions of the fields in the docstring's section "Attributes"."""
+def attributes_of(cls: type) -> dict[str, str]:
+    """Return the descriptions of the fields, also inherited ones, in the docstring's section "Attributes"."""
     lines = cleandoc(cls.__doc__ or "").partition("----------")[2].splitlines()
-    out: dict[str, str] = {}
+    out = {name: words for base in cls.__bases__ for name, words in attributes_of(base).items()}
     names: list[str] = []
     for line in lines:
         begins = re.match(r"^(\w+(?:, \w+)*) : (.*)$", line)

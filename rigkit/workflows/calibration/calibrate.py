@@ -31,8 +31,8 @@ from rigkit.workflows.inputs.corners import (
 from rigkit.workflows.inputs.folder_session import Known
 from rigkit.workflows.inputs.identify_board import why_misplaced
 from rigkit.workflows.inputs.interlaced import interlaced
-from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.inputs.wrong_print import wrong_print
+from rigkit.workflows.options.base import NamesFiles
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths
 from rigkit.workflows.outputs.provenance import provenance_of
 

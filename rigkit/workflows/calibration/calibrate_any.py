@@ -34,7 +34,7 @@ from rigkit.workflows.inputs.frames import (
     with_frames,
 )
 from rigkit.workflows.inputs.layout_evidence import cameras_by_name, cameras_seen
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.base import NamesFiles
 
 _log = logging.getLogger(__name__)
 

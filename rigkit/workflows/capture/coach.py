@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -35,14 +35,13 @@ from rigkit.io.manifests.session import SESSION_NAME
 from rigkit.io.media.video import Video
 from rigkit.planning.goal import Goal
 from rigkit.planning.guess import check_field
-from rigkit.validation.certificate.contracts import Task
 from rigkit.workflows.calibration.calibrate import CalibrateOptions, SessionCalibration
 from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.inputs.folder_session import session_of_future_images
 from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos, timestamps_next_to
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.cameras import CoachOptions
 
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 LAN_WARNING = (
@@ -50,30 +49,6 @@ LAN_WARNING = (
     "not use it in a public network"
 )
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CoachOptions(NamesFiles):
-    """Where the session goes, what is shown, and where frames come from."""
-
-    folder: Path
-    """Of the session: new, or one to go on with."""
-    boards: tuple[str, ...]
-    """COLUMNSxROWSxMM, or files of boards."""
-    guide: GuideOptions
-    length: Task | None = None
-    """A length at a distance that is to be measured as well as `guide.goal_mm` says."""
-    cameras: int = 1
-    """Of the page's own, whose frames are taken together."""
-    watch: tuple[Path, ...] = ()
-    """Folders in which pictures appear, one a camera."""
-    video: tuple[Path, ...] = ()
-    device: tuple[int, ...] = ()
-    """Cameras of this machine; without all three the page's own are used."""
-    port: int = 8137
-    """0: any that is free."""
-    lan: bool = False
-    """Other machines in this network may use the page."""
 
 
 def open_coach(

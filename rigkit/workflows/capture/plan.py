@@ -34,7 +34,7 @@ from rigkit.workflows.calibration.next_pictures import NEXT_VIEWS, goal_of, next
 from rigkit.workflows.checks.check import load_monitored
 from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad, warn_of_pupil
 from rigkit.workflows.inputs.corners import Cache
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.base import NamesFiles
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
 
 TYPICAL_SIGMA_PX = 0.15

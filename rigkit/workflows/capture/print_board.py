@@ -12,7 +12,7 @@ from rigkit.io.boards.board_file import board_text, load_layout
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import write_atomic, write_together
 from rigkit.report.pictures.board_sheet import board_sheet, pdf_bytes, svg_text
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.cameras import PrintOptions
 
 MAX_UNEVEN = 1.05
 """Maximum ratio of the scales along and across a sheet: printers differ by a per cent, misread rulers by more."""
@@ -20,18 +20,6 @@ MAX_STRETCH = 2.0
 """Maximum scale of a print, and its inverse: larger ones are misread rulers."""
 ENDINGS = (".pdf", ".svg", ".toml")
 """Endings of written files, which are removed from a given name."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PrintOptions(NamesFiles):
-    """Output of a board to print."""
-
-    output: Path
-    """Name of the files, to which .pdf, .svg and, for a new board, .toml are appended."""
-    paper: str = "a4"
-    """a4, a3, a2, a1, a0, letter or tabloid."""
-    force: bool = False
-    """Replace existing files; the board's file that was read is never replaced."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

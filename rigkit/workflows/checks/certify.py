@@ -20,26 +20,8 @@ from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task
 from rigkit.workflows.checks.check import load_monitored
 from rigkit.workflows.inputs.camera_files import bad_verdict_in_file
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.cameras import CertifyOptions
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CertifyOptions(NamesFiles):
-    """The limit to compare with, and the files to write."""
-
-    limit: float | None = None
-    """Largest error allowed, in the unit of the task."""
-    sigma_px: float | None = None
-    """Standard deviation of the corners to be measured, per coordinate; None: that of the calibration's corners."""
-    cameras: tuple[str, str] | None = None
-    """Two cameras of a rig; None: its first two."""
-    report: Path | None = None
-    """File for the page; None: no page."""
-    pdf: Path | None = None
-    """File for a sheet of A4 to sign; None: none."""
-    force: bool = False
-    """Replace files that exist; the calibration is never replaced."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

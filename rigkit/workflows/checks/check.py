@@ -41,7 +41,6 @@ from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.media.images import read_image_of
 from rigkit.report.pages.check_page import check_facts, check_page
 from rigkit.report.pages.page_facts import PageFacts
-from rigkit.validation.certificate.contracts import Task
 from rigkit.validation.sentinel.baseline import check_since
 from rigkit.validation.sentinel.epipolar import evidence_of_matches, matches_of_scenes
 from rigkit.validation.sentinel.evidence import SAME_BOARD, FreshView, Monitored, evidence_of
@@ -51,38 +50,12 @@ from rigkit.validation.sentinel.watch import monitored_camera, with_moving_pupil
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad
 from rigkit.workflows.inputs.identify_board import why_not_detected
-from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.moments import moments_of
+from rigkit.workflows.options.cameras import CheckOptions
 from rigkit.workflows.outputs.provenance import digest_line, digest_of, digest_of_images, software_facts
 
 NO_PARTNER = "the other cameras have no image of its name or number"
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CheckOptions(NamesFiles):
-    """What the images show, which errors matter, and the files to write."""
-
-    boards: tuple[Board, ...] = ()
-    """Boards that may be in the images; (): those of the calibration."""
-    before: tuple[Path, ...] = ()
-    """Images from the time when the calibration was trusted, given as the fresh ones are: errors that they show are not
-    reported as a change. (): fresh images are compared with the file."""
-    scene: bool = False
-    """The images show any textured scene instead of boards (rigs)."""
-    length: Task | None = None
-    """A length at a distance: the effect of a change is stated for it, in mm."""
-    fix: Path | None = None
-    """File for the calibration with the smallest change that explains the images, written where the calibration does
-    not hold and a change explains them; None: none is written."""
-    report: Path | None = None
-    """File for the page; None: no page."""
-    history: Path | None = None
-    """Register to which the check is added; None: none."""
-    temperature_c: float | None = None
-    """Temperature when the images were taken, for the register."""
-    force: bool = False
-    """Replace existing files; input files are never replaced, and the register is only appended to."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

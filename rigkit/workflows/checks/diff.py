@@ -17,21 +17,9 @@ from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.report.pictures.figures import difference_png
 from rigkit.workflows.inputs.camera_files import calibration_of_file, import_camera, is_rig, rig_of_file, warn_if_bad
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.cameras import DiffOptions
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DiffOptions(NamesFiles):
-    """Where to write the map of the difference of two cameras."""
-
-    output: Path | None = None
-    """File for the map; None: no map."""
-    report: Path | None = None
-    """The page that `write_diff_page` will write; its path is checked before the work."""
-    force: bool = False
-    """Replace an existing map."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -28,28 +28,12 @@ from rigkit.workflows.inputs.camera_files import (
     warn_of_pupil,
 )
 from rigkit.workflows.inputs.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.cameras import ExportCameraOptions
 
 RIG_ENDINGS = {"colmap": ".json"}
 """File endings of rigs that differ from those of cameras."""
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExportCameraOptions(NamesFiles):
-    """The format of an exported camera, and where to write it."""
-
-    output: Path
-    """File to write."""
-    kind: str | None = None
-    """Format, one of `CAMERA_FORMATS`; None: rigkit's, for a name that ends in .json."""
-    source_kind: str | None = None
-    """Format of the source; None: recognised by its content."""
-    size_px: tuple[int, int] | None = None
-    """Image size, for files that do not state it (py-OCamCalib)."""
-    force: bool = False
-    """Replace an existing file; the source is never replaced."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

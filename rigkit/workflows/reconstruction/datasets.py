@@ -14,9 +14,8 @@ import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, Literal, TypeVar
+from typing import Generic, TypeVar
 
-from rigkit.affine.directions import Support
 from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
@@ -29,7 +28,7 @@ from rigkit.io.disk.reading import about
 from rigkit.io.manifests.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.workflows.calibration.calibrate_rig import calibrate_camera
 from rigkit.workflows.inputs.camera_files import warn_if_bad
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.clouds import DatasetOptions
 from rigkit.workflows.outputs.results import CALIBRATIONS, require_folder, write_results
 
 Result = TypeVar("Result")
@@ -38,28 +37,6 @@ MAX_FOLDER_BYTES = 200
 """Names of folders have at most 255 bytes, and temporary files need some of them."""
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DatasetOptions(NamesFiles):
-    """Options of every workflow on a data set."""
-
-    pairs: tuple[str, ...] = ()
-    """Names of the pairs to use; empty: all."""
-    output: Path | None = None
-    """Folder for the results; None: nothing is written."""
-    force: bool = False
-    """Replace existing results; input files are never replaced."""
-    recalibrate: bool = False
-    """Calibrate the cameras from their sessions even if their calibration files exist."""
-    chain: Literal["raw", "rectified"] = "raw"
-    """Use captured pixels, or perspective views of them."""
-    support: Support = "patch"
-    """Corners that directions are estimated from, see `direction_field`."""
-    det_scale: str = "area"
-    """Scale of DET3UDIR, see `affines_from_directions`."""
-    jobs: int | None = None
-    """Number of processes; None: one a core."""
 
 
 Options = TypeVar("Options", bound=DatasetOptions)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError
-from rigkit.core.planes import Planes
 from rigkit.core.progress import Progress, silent
 from rigkit.interop.colmap_model import colmap_model
 from rigkit.interop.las import las_bytes
@@ -20,32 +18,12 @@ from rigkit.io.disk.writing import ensure_writable, npz_bytes
 from rigkit.io.manifests.manifest import Dataset, load_dataset
 from rigkit.io.ply import ply_bytes, ply_unit, read_ply
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.clouds import ExportCloudOptions
 from rigkit.workflows.outputs.results import write_results
 from rigkit.workflows.reconstruction.datasets import load_cameras
 from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_with, with_calibration_sigmas
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExportCloudOptions(NamesFiles):
-    """The cloud to export, its format, and where to write it."""
-
-    output: Path
-    """File to write; a folder for a COLMAP model."""
-    kind: str
-    """Format: ply, npz, las or colmap."""
-    pair: str | None = None
-    """Name of the pair; None: the only one."""
-    method: str = "3SDIR"
-    """Affine estimator of the normals."""
-    planes: Planes | None = None
-    """Planes that points and normals are computed on, as in `ReconstructOptions`; None: as in the manifest."""
-    single_precision: bool = False
-    """Write 32-bit numbers into a PLY, for programs that cannot read 64-bit ones."""
-    force: bool = False
-    """Replace existing files; input files are never replaced."""
 
 
 def export_cloud(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from rigkit.core.errors import InputError
@@ -12,27 +11,10 @@ from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.io.ply import mesh_bytes, read_ply
 from rigkit.reconstruction.lines_of_sight import with_lines_of_sight
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.clouds import MeshOptions
 
 MAX_OCTREE_DEPTH = 12
 """Each further level takes four times the memory; this one takes several GB."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MeshOptions(NamesFiles):
-    """Parameters of the surface."""
-
-    output: Path
-    """PLY file to write."""
-    depth: int = 9
-    """Depth of the octree: 2^depth cells along the longest side."""
-    cut: float = 0.02
-    """Fraction of the vertices that is removed, those with the lowest point density."""
-    one_view: bool | None = None
-    """The whole cloud was seen from its origin, as from one pair of images: no surface then connects the near and far
-    side of an occlusion boundary. None: as the file's header states."""
-    force: bool = False
-    """Replace an existing file; the cloud is never replaced."""
 
 
 def mesh_cloud(cloud: str | Path, options: MeshOptions, *, progress: Progress = silent) -> Mesh:

@@ -6,35 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigkit.core.planes import Planes
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.manifests.manifest import Dataset
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.pictures.figures import pair_pictures
-from rigkit.workflows.reconstruction.datasets import (
-    DatasetOptions,
-    PairFailure,
-    PairJob,
-    over_pairs,
-    ready_dataset,
-    write_for,
-)
+from rigkit.workflows.options.clouds import ReconstructOptions
+from rigkit.workflows.reconstruction.datasets import PairFailure, PairJob, over_pairs, ready_dataset, write_for
 from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_with, with_calibration_sigmas
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReconstructOptions(DatasetOptions):
-    """Options of a reconstruction of pairs."""
-
-    method: str = "3SDIR"
-    """Affine estimator of the normals."""
-    planes: Planes | None = None
-    """Each point and normal by itself ("free"), or on its board's plane, where the estimator does not matter; None: as
-    in the manifest."""
-    pictures: bool = True
-    """Draw corners, epipolar curves and the cloud."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,27 +26,16 @@ from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.pages.cloud_page import build_cloud_page
 from rigkit.report.pictures.figures import as_png, cloud_figure
 from rigkit.workflows.inputs.camera_files import rig_of_file, warn_if_bad, warn_of_pupils
+from rigkit.workflows.options.clouds import RigSceneOptions
 from rigkit.workflows.outputs.provenance import software_facts
 from rigkit.workflows.outputs.results import require_folder, write_results
-from rigkit.workflows.reconstruction.reconstruct_scene import CLOUD, SCENE_PAGE, CloudOptions
+from rigkit.workflows.reconstruction.reconstruct_scene import CLOUD, SCENE_PAGE
 
 PARTNERS = 3
 """Each view is paired with so many nearest ones."""
 MAX_AXES_DEG = 60.0
 """Maximum angle between the axes of views to be paired; beyond it surfaces look too different to match. Views of wide
 lenses are paired beyond it if there are no others."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RigSceneOptions(CloudOptions):
-    """The rig and the images of a scene."""
-
-    rig: Path
-    """Rig with the cameras' poses: rigkit's file, a Kalibr camchain, or a stereo pair of OpenCV or MATLAB."""
-    images: tuple[Path, ...]
-    """One image for each camera."""
-    names: tuple[str, ...] | None = None
-    """Cameras of the images; None: the rig's first ones, in its order."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

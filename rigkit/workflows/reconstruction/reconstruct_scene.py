@@ -43,7 +43,7 @@ from rigkit.workflows.inputs.camera_files import (
     import_pair,
     rig_of_file,
 )
-from rigkit.workflows.inputs.paths import NamesFiles
+from rigkit.workflows.options.clouds import SceneOptions
 from rigkit.workflows.outputs.provenance import software_facts
 from rigkit.workflows.outputs.results import require_folder, write_results
 
@@ -54,60 +54,6 @@ MAPS = "maps.npz"
 """Depth, range and normal maps of the first image."""
 
 Images: TypeAlias = tuple[NDArray[Any], NDArray[Any]]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CloudOptions(NamesFiles):
-    """Output of a cloud."""
-
-    output: Path | None = None
-    """Folder for the results; None: nothing is written."""
-    force: bool = False
-    """Replace existing results; input files are never replaced."""
-    single_precision: bool = False
-    """Write the cloud with 32-bit numbers, for programs that cannot read 64-bit ones."""
-    confidence: bool = False
-    """Scale the cloud's normals by their confidence (see `ply_bytes`)."""
-    pictures: bool = True
-    """Draw the cloud and the matched features."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SceneOptions(CloudOptions):
-    """Images or correspondences of a scene, its cameras, and options of the reconstruction."""
-
-    camera: Path | None = None
-    """Calibration of the camera (of the first image); None: from `rig`."""
-    camera2: Path | None = None
-    """Calibration of the second image's camera; None: the same as the first."""
-    rig: Path | None = None
-    """Calibrated rig that took both images; its relative pose is not estimated anew."""
-    names: tuple[str, str] | None = None
-    """Cameras of the two images; None: the rig's first two."""
-    pose: Path | None = None
-    """Measured cam2_from_cam1, 3 x 4 or 4 x 4 numbers, mm; it is not estimated."""
-    images: tuple[Path, Path] | None = None
-    """The two images. Their features are matched, or with `correspondences` they colour the cloud."""
-    correspondences: Path | None = None
-    """Correspondences with affinities or directions (CSV, NPZ, AffineExtractor's text), or a matcher's (NPZ, COLMAP's
-    database), whose affinities are estimated or refined in `images`."""
-    baseline_mm: float | None = None
-    """Measured baseline; None: the baseline is the unit of length."""
-    pose_type: str | None = None
-    """Pose type: general, planar, standard, forward or auto; None: general, or exactly standard if cameras and
-    matches are those of a rectified pair."""
-    level_sigma_deg: float | None = None
-    """Standard deviation of the views from that pose type."""
-    grow: bool = True
-    """Grow the correspondences over the surfaces of `images` into a dense cloud."""
-
-    @property
-    def name(self) -> str:
-        """Name of the scene: that of the correspondences, or of the first image, without its ending."""
-        source = self.correspondences or (self.images[0] if self.images else None)
-        if source is None:
-            raise InputError("a scene needs two images, or a file of correspondences")
-        return source.stem
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -13,14 +13,8 @@ from rigkit.io.manifests.manifest import Dataset
 from rigkit.report.pages.validation_page import crosscheck_table
 from rigkit.report.tables import table_files
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
-from rigkit.workflows.reconstruction.datasets import (
-    DatasetOptions,
-    PairFailure,
-    PairJob,
-    over_pairs,
-    ready_dataset,
-    write_for,
-)
+from rigkit.workflows.options.clouds import DatasetOptions
+from rigkit.workflows.reconstruction.datasets import PairFailure, PairJob, over_pairs, ready_dataset, write_for
 from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_other_chain, reconstruct_with, shifts_of
 
 FILES = ("crosscheck.md", "crosscheck.json")

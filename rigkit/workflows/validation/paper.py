@@ -27,15 +27,9 @@ from rigkit.validation.tables import (
     estimator_table,
     plane_table,
 )
+from rigkit.workflows.options.clouds import PaperOptions
 from rigkit.workflows.outputs.provenance import software_facts
-from rigkit.workflows.reconstruction.datasets import (
-    DatasetOptions,
-    PairFailure,
-    PairJob,
-    over_pairs,
-    ready_dataset,
-    write_for,
-)
+from rigkit.workflows.reconstruction.datasets import PairFailure, PairJob, over_pairs, ready_dataset, write_for
 from rigkit.workflows.reconstruction.pairs import match_images
 
 PAPER = "hajder2021"
@@ -49,16 +43,6 @@ PLANES_FILE = "planes.csv"
 BASELINES = "baselines.csv"
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PaperOptions(DatasetOptions):
-    """Options of the paper's pipeline."""
-
-    pictures: bool = True
-    """Write the page."""
-    own_solvers: bool = False
-    """Solve standard and forward pairs by their own constrained solvers, not by the planar one as in the paper."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

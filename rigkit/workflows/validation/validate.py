@@ -33,14 +33,8 @@ from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.validation.diagnose import diagnose, diagnose_cameras
 from rigkit.validation.fitted_planes import FittedPlanes
 from rigkit.validation.tables import best_report
-from rigkit.workflows.reconstruction.datasets import (
-    DatasetOptions,
-    PairFailure,
-    PairJob,
-    over_pairs,
-    ready_dataset,
-    write_for,
-)
+from rigkit.workflows.options.clouds import ValidateOptions
+from rigkit.workflows.reconstruction.datasets import PairFailure, PairJob, over_pairs, ready_dataset, write_for
 from rigkit.workflows.reconstruction.pairs import (
     find_boards,
     geometry_of,
@@ -52,20 +46,6 @@ from rigkit.workflows.reconstruction.pairs import (
 )
 from rigkit.workflows.validation.paper import printed_tables
 from rigkit.workflows.validation.validation_files import RESERVED, PairValidation, validation_files
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ValidateOptions(DatasetOptions):
-    """Options of a validation."""
-
-    pictures: bool = True
-    """Draw each pair and write the page."""
-    pdf: bool = False
-    """Write the pictures as PDF, too."""
-    planes: Planes | None = None
-    """Planes for the checks of angles, normals and baseline; None: as in the manifest."""
-    crosscheck: bool = True
-    """Compare with independent methods."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -18,9 +18,10 @@ from rigkit.io.manifests.manifest import load_dataset
 from rigkit.report.pages.page_facts import PageFacts, build_facts_page
 from rigkit.report.tables import table_files
 from rigkit.validation.tables import mean_normal_error
+from rigkit.workflows.options.clouds import ValidateOptions
 from rigkit.workflows.outputs.provenance import software_facts
 from rigkit.workflows.outputs.results import require_folder, write_results
-from rigkit.workflows.validation.validate import ValidateOptions, validate_dataset
+from rigkit.workflows.validation.validate import validate_dataset
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,8 +22,9 @@ from rigkit.report.tables import TABLE_WRITERS, table_files
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
 from rigkit.validation.tables import PaperTables, build_tables
+from rigkit.workflows.options.clouds import DatasetOptions
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
-from rigkit.workflows.reconstruction.datasets import DatasetOptions, LoadedCameras, PairFailure
+from rigkit.workflows.reconstruction.datasets import LoadedCameras, PairFailure
 
 PAGE = "report.html"
 RESERVED = (*(f"tables.{ending}" for ending in TABLE_WRITERS), PAGE)

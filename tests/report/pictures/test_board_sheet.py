@@ -21,7 +21,8 @@ from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.report.pages.plan_page import printed_outlines
 from rigkit.report.pictures.board_sheet import board_sheet, pdf_bytes, svg_text
-from rigkit.workflows.capture.print_board import PrintOptions, print_board
+from rigkit.workflows.capture.print_board import print_board
+from rigkit.workflows.options.cameras import PrintOptions
 
 POINTS_PER_MM = 72.0 / 25.4
 PDF_ROUNDING_MM = 1e-4

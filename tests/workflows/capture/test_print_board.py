@@ -10,7 +10,8 @@ from rigkit.cli.board_identify import without_scale
 from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.circles import Circles
-from rigkit.workflows.capture.print_board import PrintOptions, print_board
+from rigkit.workflows.capture.print_board import print_board
+from rigkit.workflows.options.cameras import PrintOptions
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,9 @@ import pytest
 
 from rigkit.cli.main import main
 from rigkit.core.errors import ExitCode
-from rigkit.workflows.validation.paper import PaperOptions, validate_as_paper
-from rigkit.workflows.validation.validate import ValidateOptions, validate_dataset
+from rigkit.workflows.options.clouds import PaperOptions, ValidateOptions
+from rigkit.workflows.validation.paper import validate_as_paper
+from rigkit.workflows.validation.validate import validate_dataset
 
 LAB = Path(__file__).parents[3] / "datasets" / "lab-a"
 PAIRS = ("regular-standard", "regular-forward")

@@ -1,0 +1,28 @@
+"""Base classes of the options of workflows."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+
+class NamesFiles:
+    """Base of option dataclasses: converts strings in fields of type Path."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if isinstance(value, str) and field.type in (Path, Path | None, "Path", "Path | None"):
+                object.__setattr__(self, field.name, Path(value))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrittenFiles(NamesFiles):
+    """Base of options that name files to write.
+
+    Attributes
+    ----------
+    force : replace existing files; input files are never replaced.
+    """
+
+    force: bool = False

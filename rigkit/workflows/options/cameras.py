@@ -1,0 +1,243 @@
+"""Options of the workflows on images and cameras.
+
+`rigkit.cli.console.add_options` makes arguments from them at once, so nothing heavy is imported, and annotations are
+evaluated.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from rigkit.workflows.options.base import NamesFiles, WrittenFiles
+
+if TYPE_CHECKING:
+    from rigkit.coach.guide import GuideOptions
+    from rigkit.core.boards import Board
+    from rigkit.validation.certificate.contracts import Task
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectOptions(WrittenFiles):
+    """The boards that images may show, and where the results go.
+
+    Attributes
+    ----------
+    boards : board files, or words such as 9x6x25; empty: chessboards of every size are detected.
+    camera : the camera of all images: finds corners that were missed on the boards given, and places all more finely.
+    min_corners : without --board: fewest corners of a chessboard.
+    output : write the corners file.
+    overlay : write each image with its corners drawn in into this folder.
+    jobs : number of processes (default: one per core).
+    """
+
+    boards: tuple[Path, ...] = ()
+    camera: Path | None = None
+    min_corners: int = 12
+    output: Path | None = None
+    overlay: Path | None = None
+    jobs: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RectifyOptions(WrittenFiles):
+    """The ideal camera, and where to write. For a stereo pair only the projection can be chosen.
+
+    Attributes
+    ----------
+    output : image (.png, .tif, .jpg) or folder to write. In a folder images keep their names, frames of a video are
+        000000.png, 000001.png, ..., and a rig has a folder for each camera.
+    projection : projection of the ideal camera.
+    hfov_deg : horizontal field of view (default: that of the camera).
+    angles_deg : yaw (to the right), pitch (up) and roll (clockwise) of the ideal camera.
+    size_px : image size of the result; None: keeps the source's resolution.
+    interpolation : spline (default) shifts points by less than 0.001 px; linear is fast.
+    crop : crop to the largest rectangle without empty pixels (in both images of a pair).
+    maps : also write K, P, Q (mm) and maps for cv2.remap.
+    """
+
+    output: Path
+    projection: Literal["perspective", "cylindrical", "equirectangular"] = "perspective"
+    hfov_deg: float | None = None
+    angles_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    size_px: tuple[int, int] | None = None
+    interpolation: Literal["spline", "lanczos", "linear", "nearest"] = "spline"
+    crop: bool = False
+    maps: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HandEyeOptions(WrittenFiles):
+    """Camera, board and conventions of a hand-eye calibration.
+
+    Attributes
+    ----------
+    camera : the camera's calibration.
+    board : the board, such as 9x6x25.
+    board_on_hand : the hand carries the board, the camera is fixed.
+    inverse : the poses are hand_from_base.
+    output : write the result.
+    """
+
+    camera: Path
+    board: Path
+    board_on_hand: bool = False
+    inverse: bool = False
+    output: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StudyOptions(WrittenFiles):
+    """How to run studies, and where their tables and figures go.
+
+    Attributes
+    ----------
+    output : folder for tables, figures and the finished chunks of an interrupted run; None: nothing is written.
+    trials : number of trials (default: that of the file).
+    jobs : number of processes; does not change the results.
+    dask : a Dask scheduler to use instead of processes.
+    figure : format of the figures.
+    """
+
+    output: Path | None = None
+    trials: int | None = None
+    jobs: int = 1
+    dask: str | None = None
+    figure: Literal["png", "pdf", "svg"] = "png"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoOptions(NamesFiles):
+    """Options of the demo.
+
+    Attributes
+    ----------
+    output : new folder for the capture, and for the results its subfolder `out`.
+    seed : seed of the random scene.
+    jobs : number of processes (default: one per core).
+    """
+
+    output: Path = Path("rigkit-demo")
+    seed: int = 1
+    jobs: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CertifyOptions(WrittenFiles):
+    """The limit to compare with, and the files to write.
+
+    Attributes
+    ----------
+    limit : largest error allowed, mm (deg for angles).
+    sigma_px : standard deviation of the image points to be measured, per coordinate (default: that of the corners).
+    cameras : two cameras of the rig (default: the first two).
+    report : write an HTML report.
+    pdf : write a certificate to sign (A4).
+    """
+
+    limit: float | None = None
+    sigma_px: float | None = None
+    cameras: tuple[str, str] | None = None
+    report: Path | None = None
+    pdf: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckOptions(WrittenFiles):
+    """What the images show, which errors matter, and the files to write.
+
+    Attributes
+    ----------
+    boards : boards that may be in the images; (): those of the calibration.
+    before : reference images of when it held: report changes since then only.
+    scene : without a board: match features of any textured scene (rigs).
+    length : a length at a distance: the effect of a change is stated for it, in mm.
+    fix : if it does not hold: write the corrected calibration, with the smallest change that explains the images.
+    report : write an HTML report.
+    history : append the check to this register (see rigkit history).
+    temperature_c : temperature during the capture, for the register.
+    """
+
+    boards: "tuple[Board, ...]" = ()
+    before: tuple[Path, ...] = ()
+    scene: bool = False
+    length: "Task | None" = None
+    fix: Path | None = None
+    report: Path | None = None
+    history: Path | None = None
+    temperature_c: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiffOptions(WrittenFiles):
+    """Where to write the map of the difference of two cameras.
+
+    Attributes
+    ----------
+    output : write a map of the difference over the image.
+    report : write an HTML report.
+    """
+
+    output: Path | None = None
+    report: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CoachOptions(NamesFiles):
+    """Where the session goes, what is shown, and where frames come from.
+
+    Attributes
+    ----------
+    folder : of the session: a new one, or one to continue.
+    boards : COLUMNSxROWSxMM, or files of boards.
+    guide : what to reach.
+    length : a length at a distance that is to be measured as well as `guide.goal_mm` says.
+    cameras : number of cameras of the browser, whose frames are taken together.
+    watch : use images that another program writes into it; one for each camera of a rig.
+    video : choose the best frames of a recording; one for each camera of a rig.
+    device : use camera N of this machine; one for each camera of a rig.
+    port : port of the page; 0: any that is free.
+    lan : serve the page to the local network, unencrypted.
+    """
+
+    folder: Path
+    boards: tuple[str, ...]
+    guide: "GuideOptions"
+    length: "Task | None" = None
+    cameras: int = 1
+    watch: tuple[Path, ...] = ()
+    video: tuple[Path, ...] = ()
+    device: tuple[int, ...] = ()
+    port: int = 8137
+    lan: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportCameraOptions(WrittenFiles):
+    """The format of an exported camera, and where to write it.
+
+    Attributes
+    ----------
+    output : file to write.
+    kind : format, one of `CAMERA_FORMATS`; None: by the ending.
+    source_kind : format of the source; None: by its content.
+    size_px : image size, for files that do not state it (py-OCamCalib).
+    """
+
+    output: Path
+    kind: str | None = None
+    source_kind: str | None = None
+    size_px: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrintOptions(WrittenFiles):
+    """Output of a board to print.
+
+    Attributes
+    ----------
+    output : write NAME.pdf, NAME.svg and, for a new board, NAME.toml.
+    paper : a4 (default), a3, a2, a1, a0, letter or tabloid.
+    """
+
+    output: Path
+    paper: str = "a4"

@@ -1,0 +1,77 @@
+"""Arguments made from the fields of option classes."""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from rigkit.cli.console import add_options, options_of
+from rigkit.workflows.options.base import WrittenFiles
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sample(WrittenFiles):
+    """Options of every type.
+
+    Attributes
+    ----------
+    output : file to write, 100 % new.
+    before : earlier images.
+    pairs : only this pair.
+    names : of two
+        cameras.
+    chain : pixels to use.
+    one_view : seen from one place.
+    depth : of a tree.
+    """
+
+    output: Path
+    before: tuple[Path, ...] = ()
+    pairs: tuple[str, ...] = ()
+    names: tuple[str, str] | None = None
+    chain: Literal["raw", "rectified"] = "raw"
+    one_view: bool | None = None
+    depth: int = 9
+
+
+@pytest.fixture
+def parser() -> argparse.ArgumentParser:
+    out = argparse.ArgumentParser()
+    add_options(out, Sample, output="-o FILE", before="IMAGE...", pairs="-p --pair ID", names="ONE TWO", chain="")
+    add_options(out, Sample, one_view="", depth="N", force="")
+    return out
+
+
+def test_arguments_have_the_types_of_the_fields(parser: argparse.ArgumentParser) -> None:
+    typed = "-o a.png --before b.png c.png --pair d -p e --names f g --chain rectified --no-one-view --depth 3 --force"
+    made = options_of(Sample, parser.parse_args(typed.split()))
+    assert made == Sample(
+        output=Path("a.png"),
+        before=(Path("b.png"), Path("c.png")),
+        pairs=("d", "e"),
+        names=("f", "g"),
+        chain="rectified",
+        one_view=False,
+        depth=3,
+        force=True,
+    )
+
+
+def test_arguments_left_out_have_the_defaults_of_the_fields(parser: argparse.ArgumentParser) -> None:
+    assert options_of(Sample, parser.parse_args(["-o", "a.png"])) == Sample(output=Path("a.png"))
+
+
+@pytest.mark.parametrize("typed", ["", "-o a --chain raws", "-o a --names f", "-o a --depth deep"])
+def test_what_a_field_cannot_hold_is_refused(parser: argparse.ArgumentParser, typed: str) -> None:
+    with pytest.raises(SystemExit):
+        parser.parse_args(typed.split())
+
+
+def test_help_is_the_description_of_the_field_with_its_default(parser: argparse.ArgumentParser) -> None:
+    words = " ".join(parser.format_help().split())
+    assert "--output FILE file to write, 100 % new --before IMAGE [IMAGE ...] earlier images" in words
+    assert "--pair ID only this pair (repeatable) --names ONE TWO of two cameras" in words
+    assert "--chain {raw,rectified} pixels to use (default: raw)" in words
+    assert "--depth N of a tree (default: 9) --force replace existing files; input files are never replaced" in words
