@@ -70,10 +70,8 @@ from rigkit.validation.checks import ValidationReport as ValidationReport
 from rigkit.validation.checks import validate as validate
 from rigkit.validation.crosscheck import CrossCheckReport as CrossCheckReport
 from rigkit.validation.crosscheck import crosscheck as crosscheck
-from rigkit.workflows.calibration.calibrate import CalibrateOptions as CalibrateOptions
 from rigkit.workflows.calibration.calibrate import SessionCalibration as SessionCalibration
 from rigkit.workflows.calibration.calibrate import calibrate_session as calibrate_session
-from rigkit.workflows.calibration.calibrate_any import FolderOptions as FolderOptions
 from rigkit.workflows.calibration.calibrate_any import calibrate_folders as calibrate_folders
 from rigkit.workflows.calibration.calibrate_any import calibrate_session_file as calibrate_session_file
 from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration as RigSessionCalibration
@@ -105,9 +103,10 @@ from rigkit.workflows.handeye import calibrate_hand_eye as calibrate_hand_eye
 from rigkit.workflows.handeye import camera_on_board as camera_on_board
 from rigkit.workflows.inputs.camera_files import import_camera as import_camera
 from rigkit.workflows.inputs.camera_files import import_rig as import_rig
-from rigkit.workflows.inputs.corners import Cache as Cache
 from rigkit.workflows.inputs.identify_board import IdentifiedBoard as IdentifiedBoard
 from rigkit.workflows.inputs.identify_board import identify_board as identify_board
+from rigkit.workflows.options.cameras import Cache as Cache
+from rigkit.workflows.options.cameras import CalibrateOptions as CalibrateOptions
 from rigkit.workflows.options.cameras import CertifyOptions as CertifyOptions
 from rigkit.workflows.options.cameras import CheckOptions as CheckOptions
 from rigkit.workflows.options.cameras import CoachOptions as CoachOptions
@@ -115,6 +114,7 @@ from rigkit.workflows.options.cameras import DemoOptions as DemoOptions
 from rigkit.workflows.options.cameras import DetectOptions as DetectOptions
 from rigkit.workflows.options.cameras import DiffOptions as DiffOptions
 from rigkit.workflows.options.cameras import ExportCameraOptions as ExportCameraOptions
+from rigkit.workflows.options.cameras import FolderOptions as FolderOptions
 from rigkit.workflows.options.cameras import HandEyeOptions as HandEyeOptions
 from rigkit.workflows.options.cameras import PrintOptions as PrintOptions
 from rigkit.workflows.options.cameras import RectifyOptions as RectifyOptions

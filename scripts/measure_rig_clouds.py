@@ -31,9 +31,9 @@ from rigkit.io.media.images import read_image
 from rigkit.reconstruction.growing.dense import grow_scene
 from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
-from rigkit.workflows.calibration.calibrate import CalibrateOptions
-from rigkit.workflows.calibration.calibrate_any import FolderOptions, calibrate_folders
+from rigkit.workflows.calibration.calibrate_any import calibrate_folders
 from rigkit.workflows.inputs.folder_session import cameras_in
+from rigkit.workflows.options.cameras import CalibrateOptions, FolderOptions
 
 Frame = tuple[Path, Path]
 

@@ -25,8 +25,9 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
-from rigkit.workflows.calibration.calibrate import CalibrateOptions, SessionCalibration
-from rigkit.workflows.calibration.calibrate_any import FolderOptions, calibrate_sources
+from rigkit.workflows.calibration.calibrate import SessionCalibration
+from rigkit.workflows.calibration.calibrate_any import calibrate_sources
+from rigkit.workflows.options.cameras import CalibrateOptions, FolderOptions
 from rigkit.workflows.options.clouds import ValidateOptions
 from rigkit.workflows.validation.validate import validate_dataset
 

@@ -31,9 +31,9 @@ from rigkit.calibration.result import Calibration
 from rigkit.core.errors import RigkitError
 from rigkit.io.boards.board_words import words_of_board
 from rigkit.io.media.images import read_image
-from rigkit.workflows.calibration.calibrate import CalibrateOptions, SessionCalibration
-from rigkit.workflows.calibration.calibrate_any import FolderOptions, calibrate_folders
-from rigkit.workflows.inputs.corners import Cache
+from rigkit.workflows.calibration.calibrate import SessionCalibration
+from rigkit.workflows.calibration.calibrate_any import calibrate_folders
+from rigkit.workflows.options.cameras import Cache, CalibrateOptions, FolderOptions
 
 AS_IT_IS = "as it is"
 WORSE = (

@@ -16,9 +16,8 @@ from rigkit.core.progress import Progress, silent
 from rigkit.io.disk.reading import usable_path
 from rigkit.io.manifests.manifest import load_dataset
 from rigkit.synthetic.demo import build_demo
-from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibrate_session
-from rigkit.workflows.inputs.corners import Cache
-from rigkit.workflows.options.cameras import DemoOptions
+from rigkit.workflows.calibration.calibrate import calibrate_session
+from rigkit.workflows.options.cameras import Cache, CalibrateOptions, DemoOptions
 from rigkit.workflows.options.clouds import ValidateOptions
 from rigkit.workflows.validation.validate import DatasetValidation, validate_dataset
 

@@ -21,8 +21,9 @@ from rigkit.core.errors import RigkitError
 from rigkit.core.identifiers import natural_key
 from rigkit.io.manifests.rig_session import RigSession, frames_of_images
 from rigkit.io.manifests.session import Session
-from rigkit.workflows.inputs.corners import Cache, session_corners, session_views
+from rigkit.workflows.inputs.corners import session_corners, session_views
 from rigkit.workflows.inputs.frames import with_frames
+from rigkit.workflows.options.cameras import Cache
 from rigkit.workflows.truth import public_sets
 
 RigViews = dict[str, list[tuple[str, BoardView]]]

@@ -25,12 +25,13 @@ from rigkit.io.corners.corner_cache import FoundCorners
 from rigkit.io.corners.corners_file import read_corners
 from rigkit.io.manifests.rig_session import load_rig_session
 from rigkit.io.manifests.session import load_session
-from rigkit.workflows.calibration.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
+from rigkit.workflows.calibration.calibrate import SessionCalibration, calibrate_session
 from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.inputs.camera_files import import_rig
 from rigkit.workflows.inputs.corners import first_camera
-from rigkit.workflows.inputs.folder_session import Known, cameras_in, session_of_folders
+from rigkit.workflows.inputs.folder_session import cameras_in, session_of_folders
 from rigkit.workflows.inputs.known_cameras import known_cameras, known_cameras_first
+from rigkit.workflows.options.cameras import CalibrateOptions, Known
 
 SAME_LENS_PX = 0.1
 """Projections of the camera found against the true one, where boards were: corners of JPEGs to about 0.03 px, 9 images;

@@ -11,9 +11,11 @@ import pytest
 
 from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.cameras import registry
-from rigkit.cli import calibrate_arguments, reconstruct
+from rigkit.cli import reconstruct
 from rigkit.cli.examples import EXAMPLES, FIRST_STEPS
 from rigkit.cli.main import VERBS, build_parser
+from rigkit.io.disk.schema_words import attributes_of
+from rigkit.workflows.options.cameras import FolderOptions
 
 MAX_WIDTH = 120
 """A terminal of usual width shows a line whole."""
@@ -50,5 +52,5 @@ def test_without_a_verb_the_first_steps_are_shown() -> None:
 
 
 def test_help_lists_the_camera_models_and_the_affine_estimators() -> None:
-    assert tuple(registry.MODELS) == calibrate_arguments.MODEL_NAMES
+    assert attributes_of(FolderOptions)["model"].startswith(f"{', '.join(registry.MODELS)} (")
     assert AFFINE_METHODS == reconstruct.METHODS

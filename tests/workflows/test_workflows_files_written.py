@@ -13,8 +13,8 @@ from helpers.data import REPOSITORY
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
 from rigkit.io.calibrations.calibration_file import load_calibration
-from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibrate_session
-from rigkit.workflows.inputs.corners import Cache
+from rigkit.workflows.calibration.calibrate import calibrate_session
+from rigkit.workflows.options.cameras import Cache, CalibrateOptions
 from rigkit.workflows.outputs.results import write_results
 
 LAB = REPOSITORY / "datasets" / "lab-a"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rigkit.calibration.calibrate import calibrate
@@ -20,43 +20,13 @@ from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.io.manifests.session import Session, files_of_session, load_session
 from rigkit.workflows.calibration.session_page import session_page
-from rigkit.workflows.inputs.corners import (
-    Cache,
-    SessionCorners,
-    given_corners,
-    named_images,
-    session_corners,
-    session_views,
-)
-from rigkit.workflows.inputs.folder_session import Known
+from rigkit.workflows.inputs.corners import SessionCorners, given_corners, named_images, session_corners, session_views
 from rigkit.workflows.inputs.identify_board import why_misplaced
 from rigkit.workflows.inputs.interlaced import interlaced
 from rigkit.workflows.inputs.wrong_print import wrong_print
-from rigkit.workflows.options.base import NamesFiles
+from rigkit.workflows.options.cameras import CalibrateOptions
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths
 from rigkit.workflows.outputs.provenance import provenance_of
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrateOptions(NamesFiles):
-    """Outputs of a calibration, and what is known beforehand."""
-
-    output: Path | None = None
-    """File for the calibration (for a rig: of the rig, with the cameras' files beside it); None: nothing is written."""
-    report: Path | None = None
-    """File for the HTML page, or None."""
-    force: bool = False
-    """Replace existing files; input files are never replaced."""
-    cache: Cache = Cache.READ
-    """How to use the corner cache beside the session."""
-    corners: Path | None = None
-    """File of corners (rigkit's or another detector's) to use; None: corners are detected."""
-    known: Known = field(default_factory=Known)
-    """For a rig: files of fixed lenses, or of a rig to which the session's other cameras are added."""
-    pupil: str = "auto"
-    """Entrance pupil: "auto", "central" or "moving", as for `rigkit.calibrate`."""
-    exports: tuple[str, ...] = ()
-    """Formats of other tools to write as well, beside `output` (`rigkit.workflows.inputs.formats`)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

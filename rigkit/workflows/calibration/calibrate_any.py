@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from rigkit.core.errors import InputError, RigkitError
@@ -19,7 +19,6 @@ from rigkit.io.manifests.session import SESSION_NAME, Session, beside_session, l
 from rigkit.io.media.images import IMAGE_ENDINGS
 from rigkit.io.media.video import is_video, videos_inside
 from rigkit.workflows.calibration.calibrate import (
-    CalibrateOptions,
     SessionCalibration,
     calibrate_session,
     results_of_camera,
@@ -34,25 +33,9 @@ from rigkit.workflows.inputs.frames import (
     with_frames,
 )
 from rigkit.workflows.inputs.layout_evidence import cameras_by_name, cameras_seen
-from rigkit.workflows.options.base import NamesFiles
+from rigkit.workflows.options.cameras import CalibrateOptions, FolderOptions
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FolderOptions(NamesFiles):
-    """Options for folders of images and videos."""
-
-    boards: tuple[str, ...] = ()
-    """COLUMNSxROWSxMM (inner corners, mm a square), or board files."""
-    square_mm: float | None = None
-    """Side of a square (of a tag, or the spacing of circles); the images show the rest of the board."""
-    model: str | None = None
-    """Camera model, or "auto"; None means "auto"."""
-    cameras: int | None = None
-    """Number of cameras whose images the folders hold; None: by names and boards."""
-    timestamps: Path | None = None
-    """File that synchronises several videos; None: timestamps.csv beside them, if it exists."""
 
 
 def calibrate_sources(

@@ -24,7 +24,7 @@ from rigkit.io.manifests.rig_session import RigSession, frames_of_images, is_rig
 from rigkit.io.manifests.session import Session, load_session
 from rigkit.validation.check import Check, compare_angle, compare_baseline, compare_distance
 from rigkit.validation.checks import COVERAGE
-from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibration_from, corners_of, session_inputs
+from rigkit.workflows.calibration.calibrate import calibration_from, corners_of, session_inputs
 from rigkit.workflows.calibration.rigid_boards import named_as_listed, named_by_rule, require_distinct
 from rigkit.workflows.calibration.session_page import rig_page
 from rigkit.workflows.inputs.camera_files import file_of_camera
@@ -32,6 +32,7 @@ from rigkit.workflows.inputs.corners import SessionCorners, named_images, sessio
 from rigkit.workflows.inputs.identify_board import why_misplaced
 from rigkit.workflows.inputs.known_cameras import known_cameras, known_cameras_first, with_known
 from rigkit.workflows.inputs.wrong_print import wrong_print
+from rigkit.workflows.options.cameras import CalibrateOptions
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
 from rigkit.workflows.outputs.provenance import provenance_of
 

@@ -35,13 +35,12 @@ from rigkit.io.manifests.session import SESSION_NAME
 from rigkit.io.media.video import Video
 from rigkit.planning.goal import Goal
 from rigkit.planning.guess import check_field
-from rigkit.workflows.calibration.calibrate import CalibrateOptions, SessionCalibration
+from rigkit.workflows.calibration.calibrate import SessionCalibration
 from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.calibration.next_pictures import length_goals
-from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.inputs.folder_session import session_of_future_images
 from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos, timestamps_next_to
-from rigkit.workflows.options.cameras import CoachOptions
+from rigkit.workflows.options.cameras import Cache, CalibrateOptions, CoachOptions
 
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 LAN_WARNING = (

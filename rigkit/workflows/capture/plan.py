@@ -29,12 +29,12 @@ from rigkit.validation.certificate.contracts import Task
 from rigkit.validation.sentinel.change_aim import informative_views
 from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.validation.sentinel.watch import monitored_camera
-from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibrate_session, session_inputs
+from rigkit.workflows.calibration.calibrate import calibrate_session, session_inputs
 from rigkit.workflows.calibration.next_pictures import NEXT_VIEWS, goal_of, next_frames, next_views
 from rigkit.workflows.checks.check import load_monitored
 from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad, warn_of_pupil
-from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.options.base import NamesFiles
+from rigkit.workflows.options.cameras import Cache, CalibrateOptions
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
 
 TYPICAL_SIGMA_PX = 0.15

@@ -7,7 +7,6 @@ import os
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from statistics import median
 
@@ -27,6 +26,7 @@ from rigkit.io.manifests.session import Session
 from rigkit.io.media.images import read_image
 from rigkit.workflows.inputs.identify_board import why_not_detected
 from rigkit.workflows.inputs.side_by_side import side_by_side_pictures
+from rigkit.workflows.options.cameras import Cache
 
 ODD_SIZES = 3
 """A few images of another size are left out; if they are one in three or more, the session is ambiguous."""
@@ -34,17 +34,6 @@ LOOSE = 1.5
 """A first calibration whose residuals exceed the corners' own sigmas by this factor does not fit the lens."""
 
 _log = logging.getLogger(__name__)
-
-
-class Cache(StrEnum):
-    """What to do with the corner cache beside a session. It saves time and never changes a result."""
-
-    OFF = "off"
-    """Neither read nor written."""
-    READ = "read"
-    """Read where it is valid."""
-    UPDATE = "update"
-    """Read where it is valid, and written."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -22,6 +22,7 @@ from rigkit.io.media.images import folder_of_images, images_below, images_of_fol
 from rigkit.io.media.video import is_video
 from rigkit.workflows.inputs.identify_board import Suggestion, suggestion
 from rigkit.workflows.inputs.layouts import CameraLayout, layouts_of
+from rigkit.workflows.options.cameras import Known
 
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
 """Common names of a rig's cameras."""
@@ -50,30 +51,6 @@ class FolderSession:
 
     path: Path
     files: Mapping[Path, str]
-
-
-@dataclass(frozen=True, slots=True)
-class Known:
-    """Files of known cameras: lenses (one for each camera in order, or one for all), and a rig."""
-
-    lenses: tuple[Path, ...] = ()
-    rig: Path | None = None
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """All files."""
-        return self.lenses if self.rig is None else (*self.lenses, self.rig)
-
-    def of_cameras(self, names: Sequence[str]) -> dict[str, Path]:
-        """Return the lens file of each camera; raises InputError if their number is neither 1 nor that of cameras."""
-        if not self.lenses:
-            return {}
-        if len(self.lenses) not in (1, len(names)):
-            raise InputError(
-                f"{len(self.lenses)} lenses for {len(names)} cameras ({', '.join(names)}); give one file a camera in "
-                "that order, or one rig"
-            )
-        return dict(zip(names, self.lenses * (len(names) if len(self.lenses) == 1 else 1), strict=True))
 
 
 def session_of_folders(

@@ -26,7 +26,7 @@ from rigkit.workflows.inputs.camera_files import (
     warn_of_pupil,
     warn_of_pupils,
 )
-from rigkit.workflows.inputs.folder_session import Known
+from rigkit.workflows.options.cameras import Known
 
 _log = logging.getLogger(__name__)
 

@@ -4,16 +4,108 @@
 evaluated.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from rigkit.core.errors import InputError
 from rigkit.workflows.options.base import NamesFiles, WrittenFiles
 
 if TYPE_CHECKING:
     from rigkit.coach.guide import GuideOptions
     from rigkit.core.boards import Board
     from rigkit.validation.certificate.contracts import Task
+
+
+class Cache(StrEnum):
+    """What to do with the corner cache beside a session. It saves time and never changes a result."""
+
+    OFF = "off"
+    """Neither read nor written."""
+    READ = "read"
+    """Read where it is valid."""
+    UPDATE = "update"
+    """Read where it is valid, and written."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """Files of known cameras.
+
+    Attributes
+    ----------
+    lenses : keep the intrinsics of these files (one per camera, or one rig); solve for the extrinsics only.
+    rig : keep intrinsics and extrinsics of this rig; add the other cameras to it.
+    """
+
+    lenses: tuple[Path, ...] = ()
+    rig: Path | None = None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All files."""
+        return self.lenses if self.rig is None else (*self.lenses, self.rig)
+
+    def of_cameras(self, names: Sequence[str]) -> dict[str, Path]:
+        """Return the lens file of each camera; raises InputError if their number is neither 1 nor that of cameras."""
+        if not self.lenses:
+            return {}
+        if len(self.lenses) not in (1, len(names)):
+            raise InputError(
+                f"{len(self.lenses)} lenses for {len(names)} cameras ({', '.join(names)}); give one file a camera in "
+                "that order, or one rig"
+            )
+        return dict(zip(names, self.lenses * (len(names) if len(self.lenses) == 1 else 1), strict=True))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrateOptions(WrittenFiles):
+    """Outputs of a calibration, and what is known beforehand.
+
+    Attributes
+    ----------
+    output : file for the calibration (for a rig: of the rig, with the cameras' files beside it); None: nothing is
+        written.
+    report : file for the HTML report; None: no report.
+    cache : how to use the corner cache beside the session.
+    corners : use these corners instead of detecting them: corners.csv, corners.json, .vnl (mrcal).
+    known : for a rig: files of known cameras.
+    pupil : entrance pupil fixed (a central camera), or moving with the angle of view (default: auto, moving where
+        images show it).
+    exports : formats of other tools to write as well, beside the output (`rigkit.workflows.inputs.formats`).
+    """
+
+    output: Path | None = None
+    report: Path | None = None
+    cache: Cache = Cache.READ
+    corners: Path | None = None
+    known: Known = field(default_factory=Known)
+    pupil: Literal["auto", "central", "moving"] = "auto"
+    exports: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FolderOptions(NamesFiles):
+    """Options for folders of images and videos.
+
+    Attributes
+    ----------
+    boards : 9x6x25 (inner corners, mm a square), circles:10x8x25,diameter_mm=15, or a board file.
+    square_mm : instead of boards: side of a square (tag; distance of circles); the images say which board it is.
+    model : pinhole, brown, kannala_brandt, scaramuzza, ucm, eucm, double_sphere (default: auto, the lowest held-out
+        error).
+    cameras : number of cameras whose images the folders hold (default: by the names of images and folders, and by the
+        boards in them); 1: all are of one camera.
+    timestamps : which frames of the videos were taken together (default: timestamps.csv beside them, if it exists).
+    """
+
+    boards: tuple[str, ...] = ()
+    square_mm: float | None = None
+    model: str | None = None
+    cameras: int | None = None
+    timestamps: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,13 +22,13 @@ from rigkit.io.media.images import read_image
 from rigkit.synthetic.photometry import Photometry, develop
 from rigkit.synthetic.render import Optics, radiance
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.workflows.calibration.calibrate import CalibrateOptions
-from rigkit.workflows.calibration.calibrate_any import FolderOptions, calibrate_folders
+from rigkit.workflows.calibration.calibrate_any import calibrate_folders
 from rigkit.workflows.detect import detect_in_images
 from rigkit.workflows.inputs.folder_session import boards_seen
 from rigkit.workflows.inputs.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
 from rigkit.workflows.inputs.frames import _FrameFolder, frames_of_videos
 from rigkit.workflows.inputs.identify_board import identify_board
+from rigkit.workflows.options.cameras import CalibrateOptions, FolderOptions
 
 BOARD = Board("b", 7, 5, 20.0, 20.0)
 CAMERA = Pinhole((320, 240), np.array([300.0, 300.0, 159.5, 119.5]))
