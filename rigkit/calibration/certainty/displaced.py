@@ -212,8 +212,7 @@ def with_modes(
         known.append(np.arange(end, end + camera.parameters.size))
         amounts.append(np.arange(end + camera.parameters.size, end + camera.parameters.size + count))
         end = int(known[-1][-1]) + 1 + count
-        parameters = np.append(camera.parameters, np.zeros(count))
-        out.append(DisplacedCamera(camera.size_px, parameters, camera, own.modes, own.turns) if count else camera)
+        out.append(with_amounts(camera, own.modes, own.turns))
     known.append(np.arange(end, end + len(covariance) - sum(len(own) for own in known)))
     at = np.concatenate(known)
     size = len(at) + sum(len(own) for own in amounts)
@@ -224,6 +223,12 @@ def with_modes(
         move[at], move[where] = own.moves, np.eye(len(where))
         whole += move @ move.T
     return tuple(out), whole
+
+
+def with_amounts(camera: Camera, modes: FloatArray, turns: FloatArray | None = None) -> Camera:
+    """Return a camera with the amounts of `modes` (J, M) as further parameters; unchanged if there are none."""
+    parameters = np.append(camera.parameters, np.zeros(modes.shape[1]))
+    return DisplacedCamera(camera.size_px, parameters, camera, modes, turns) if modes.shape[1] else camera
 
 
 def significant_modes(far: FarProjection) -> FloatArray:
