@@ -45,8 +45,9 @@ from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.synthetic.scene import place_board
 from rigkit.validation.certificate.certify import certify
-from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
+from rigkit.validation.certificate.contracts import Quantity, Task, instrument_of
 from rigkit.validation.certificate.propagation import gradients, measured_points, variances
+from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.validation.sentinel.watch import monitored_camera, monitored_rig
 
 SIZE_PX = (1280, 960)
@@ -129,10 +130,10 @@ def frames_of(
     raise DegenerateError("certificates: no board was placed where all cameras see it")
 
 
-def of_worst_way(found: Instrument, task: Task, points: np.ndarray, weights: np.ndarray, off: np.ndarray) -> np.ndarray:
+def of_worst_way(found: Monitored, task: Task, points: np.ndarray, weights: np.ndarray, off: np.ndarray) -> np.ndarray:
     """Return of errors of each way to hold the thing (N, ways) those (N,) of the way that the bound is of: that with
     the largest variance. The one that errs most often, looked for afterwards, would err by chance as well."""
-    by_corner, by_calibration, by_pixel, _ = gradients(found, points, weights)
+    by_corner, by_calibration, by_pixel, _ = gradients(found.cameras, found.cam_from_rig, points, weights)
     variance = sum(variances(found, task, points, by_corner, by_calibration, by_pixel).values())
     return np.asarray(np.abs(off)[np.arange(len(off)), np.argmax(variance, axis=1)])
 
@@ -151,7 +152,7 @@ def rig_trial(lenses: Sequence[Camera], session: Session, rng: np.random.Generat
     sizes = dict.fromkeys(views, SIZE_PX)
     named = {name: [(view.image, view) for view in own] for name, own in views.items()}
     rig = calibrate_rig(named, sizes, model=session.model, degree=session.degree, folds=session.folds)
-    found = Instrument.of(monitored_rig(rig))
+    found = instrument_of(monitored_rig(rig))
     for quantity, task in TASKS.items():
         certificate = certify(found, task, cells=CELLS)
         use = certificate.in_view & ~certificate.coarse
@@ -181,7 +182,7 @@ def alone_trial(lenses: Sequence[Camera], session: Session, rng: np.random.Gener
     lens = lenses[0]
     (views,) = frames_of((lens,), (Rigid3.identity(),), session, rng)
     found = calibrate(views, SIZE_PX, model=session.model, degree=session.degree, folds=session.folds, board="flat")
-    alone = Instrument.of(monitored_camera(found, "camera"))
+    alone = instrument_of(monitored_camera(found, "camera"))
     certificate = certify(alone, ALONE, cells=CELLS)
     use = certificate.in_view & ~certificate.coarse
     rays, _ = lens.unproject(certificate.pixels[use])

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rigkit.calibration.rig.projection import RigProjection
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
@@ -47,21 +48,12 @@ def _design(
 ) -> FloatArray:
     """Return the derivatives (2 N, G + 6) of the pixels of the points that camera `k` sees: by the parameters of the
     layout, and by a motion of the world."""
-    turned = points @ cam_from_rig.rotation.T
-    in_cam = turned + cam_from_rig.translation_mm
-    d_pixels_d_point = np.zeros((2, 3, len(points)))
-    d_pixels_d_parameters = np.zeros((2, camera.parameters.size, len(points)))
-    u, v, valid = camera.derivatives(in_cam[:, 0], in_cam[:, 1], in_cam[:, 2], d_pixels_d_point, d_pixels_d_parameters)
-    seen = valid & camera.on_image(np.stack([u, v], axis=-1))
+    found = RigProjection.of(camera, cam_from_rig, points, layout, k)
+    seen = found.seen
     if field_deg is not None:
+        in_cam = cam_from_rig.apply(points)
         seen &= in_cam[:, 2] >= np.cos(np.radians(0.5 * field_deg)) * np.linalg.norm(in_cam, axis=-1)
-    slope = d_pixels_d_point[..., seen].transpose(2, 0, 1)
-    out = np.zeros((len(slope), 2, layout.count + 6))
-    out[..., layout.cameras[k]] = d_pixels_d_parameters[..., seen].transpose(2, 0, 1)
-    # x = exp(w) R X + t + v of the mount; R (exp(W) X + T) + t of the world.
-    mount = layout.mounts[k]
-    if mount is not None:
-        out[..., mount] = np.concatenate([-slope @ skew(turned[seen]), slope], axis=-1)
-    by_world = slope @ cam_from_rig.rotation
-    out[..., layout.count :] = np.concatenate([-by_world @ skew(points[seen]), by_world], axis=-1)
-    return out.reshape(-1, layout.count + 6)
+    # x = R (exp(W) X + T) + t.
+    by_world = found.by_point[seen]
+    motion = np.concatenate([-by_world @ skew(points[seen]), by_world], axis=-1)
+    return np.concatenate([found.by_globals[seen], motion], axis=-1).reshape(-1, layout.count + 6)

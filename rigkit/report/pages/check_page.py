@@ -70,14 +70,14 @@ def check_facts(check: SentinelCheck) -> PageFacts:
             f"It moves the projection by {change.size_px:.3f} px rms{caveat}; after the correction "
             f"{check.rms_fixed_px:.3f} px remain.{_nearest_words(check, change)}"
         )
-    if not check.holds and check.baseline is None and len(check.monitored.cameras) > 1:
+    if not check.holds and check.baseline is None and check.monitored.is_rig:
         sentences.append(
             "Changed since, or wrong from the start? Compare with images from the time of the calibration: --before."
         )
     if check.holds and check.powers:
         worst = min(check.powers, key=lambda power: power.chance)
         sentences.append(_power_words(worst))
-        if worst.chance < FOUND and len(check.monitored.cameras) == 1:
+        if worst.chance < FOUND and not check.monitored.is_rig:
             sentences.append("For the images that would reveal most: rigkit plan CALIBRATION --check")
     return PageFacts(
         headline=headline,

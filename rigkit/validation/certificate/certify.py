@@ -17,7 +17,7 @@ from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
-from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task
+from rigkit.validation.certificate.contracts import Certificate, Quantity, Task
 from rigkit.validation.certificate.propagation import (
     OF_CORNERS,
     OF_DISTANCE,
@@ -28,6 +28,7 @@ from rigkit.validation.certificate.propagation import (
     measured_points,
     variances,
 )
+from rigkit.validation.sentinel.evidence import Monitored
 
 MAP_CELLS = (33, 25)
 """Columns and rows of the grid on which the bound is evaluated."""
@@ -38,12 +39,14 @@ AS_NORMAL = 1e6
 """Degrees of freedom from which Student's distribution counts as normal."""
 
 
-def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_CELLS) -> Certificate:
-    """Return the bound on the error of `task` over the image of the first camera.
+def certify(instrument: Monitored, task: Task, *, cells: tuple[int, int] = MAP_CELLS) -> Certificate:
+    """Return the bound on the error of `task` over the image of the first camera of an `instrument_of` a calibration.
 
-    Raises InputError for a depth, plane or angle with one camera; DegenerateError if all cameras see the measured
-    object nowhere.
+    Raises InputError for a depth, plane or angle with one camera, or corners without a standard deviation;
+    DegenerateError if all cameras see the measured object nowhere.
     """
+    if not (np.isfinite(instrument.sigma_px) and instrument.sigma_px > 0.0):
+        raise InputError(f"certificate: the corners' sigma must be positive, got {instrument.sigma_px} px")
     if not instrument.is_rig and task.quantity is not Quantity.LENGTH:
         raise InputError(
             f"certificate: one camera measures no {task.quantity}; give a rig, or a length at a known distance"
@@ -53,7 +56,7 @@ def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_
     shape = pixels.shape[:2]
     rays, valid = first.unproject(pixels.reshape(-1, 2))
     points, weights = measured_points(np.where(valid[:, None], rays, [0.0, 0.0, 1.0]), task, instrument.is_rig)
-    by_corner, by_calibration, by_pixel, seen = gradients(instrument, points, weights)
+    by_corner, by_calibration, by_pixel, seen = gradients(instrument.cameras, instrument.cam_from_rig, points, weights)
     seen &= valid
     if not seen.any():
         raise DegenerateError(

@@ -1,15 +1,15 @@
-"""Types of a certificate: the measurement task, the instrument, and the result."""
+"""A certificate: the instrument, the measurement task, and the result."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
-from rigkit.cameras.base import Camera
+from rigkit.cameras.uncertain import UncertainRig
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, without_nan
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
@@ -26,80 +26,27 @@ class Quantity(StrEnum):
     ANGLE = "angle"
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Instrument:
-    """One camera, or two of a rig, with their covariance.
+def instrument_of(known: Monitored, pair: tuple[str, str] | None = None) -> Monitored:
+    """Return the camera, or two of a rig in the frame of the first: the rig's first two, or a `pair` of names.
 
-    Attributes
-    ----------
-    names, cameras, cam_from_rig : of one or two cameras, in this order.
-    covariance : (P, P) of the intrinsics, camera by camera, including lens errors beyond the model
-        (`calibration.certainty.displaced`). For two cameras also of both extrinsics, six each: left perturbation in rad
-        and translation in mm; zero for the camera that is the rig's frame.
-    sigma_px : standard deviation of a measured corner per coordinate.
-    scale_sigma : relative standard deviation of all lengths, from that of the boards' squares; 0 if not stated.
-    freedom : degrees of freedom of `covariance`.
+    The certificate is drawn over the image of the first. Raises InputError for an unknown name, or the same twice.
     """
-
-    names: tuple[str, ...]
-    cameras: tuple[Camera, ...]
-    cam_from_rig: tuple[Rigid3, ...]
-    covariance: FloatArray
-    sigma_px: float
-    scale_sigma: float = 0.0
-    freedom: float = float("inf")
-
-    def __post_init__(self) -> None:
-        if not 1 <= len(self.cameras) == len(self.names) == len(self.cam_from_rig) <= 2:
-            raise InputError("certificate: one camera, or two of a rig, each with a name and a place")
-        size = self.intrinsic_count + (12 if self.is_rig else 0)
-        if np.shape(self.covariance) != (size, size) or not np.isfinite(self.covariance).all():
-            raise InputError(f"certificate: a finite covariance of {size} unknowns is needed, got {self.covariance!r}")
-        if not (np.isfinite(self.sigma_px) and self.sigma_px > 0.0):
-            raise InputError(f"certificate: the corners' sigma must be positive, got {self.sigma_px} px")
-        if not self.freedom > 0.0:
-            raise InputError(f"certificate: a covariance has degrees of freedom, got {self.freedom}")
-
-    @classmethod
-    def of(cls, known: Monitored, pair: tuple[str, str] | None = None) -> Instrument:
-        """Return a camera, or two of a rig: its first two, or a `pair` of names.
-
-        The certificate is drawn over the image of the first. Raises InputError for an unknown name, or the same twice.
-        """
-        names = known.names[:2] if pair is None else pair
-        if len(set(names) & set(known.names)) < len(names):
-            raise InputError(
-                f"certificate: two different cameras of {', '.join(known.names)} are needed, got {' and '.join(names)}"
-            )
-        order = [known.names.index(name) for name in names]
-        layout = known.layout
-        covariance = known.covariance[layout.cameras[order[0]], layout.cameras[order[0]]]
-        if len(order) == 2:
-            place, absent = np.arange(layout.count), np.full(6, -1)
-            rows = [place[layout.cameras[k]] for k in order] + [place[layout.mount(k)] if k else absent for k in order]
-            kept = np.concatenate(rows)
-            free = np.flatnonzero(kept >= 0)
-            covariance = np.zeros((len(kept), len(kept)))
-            covariance[np.ix_(free, free)] = known.covariance[np.ix_(kept[free], kept[free])]
-        return cls(
-            names=tuple(names),
-            cameras=tuple(known.cameras[k] for k in order),
-            cam_from_rig=tuple(known.cam_from_rig[k] for k in order),
-            covariance=covariance,
-            sigma_px=known.sigma_px,
-            scale_sigma=known.scale_sigma,
-            freedom=known.freedom,
+    names = known.names[:2] if pair is None else pair
+    if len(set(names) & set(known.names)) < len(names):
+        raise InputError(
+            f"certificate: two different cameras of {', '.join(known.names)} are needed, got {' and '.join(names)}"
         )
-
-    @property
-    def is_rig(self) -> bool:
-        """Whether there are two cameras."""
-        return len(self.cameras) == 2
-
-    @property
-    def intrinsic_count(self) -> int:
-        """Number of intrinsics of all cameras."""
-        return sum(camera.parameters.size for camera in self.cameras)
+    chosen = [known.names.index(name) for name in names]
+    cameras = tuple(known.cameras[k] for k in chosen)
+    if len(chosen) == 1:
+        own = known.layout.cameras[0]
+        return replace(known, cam_from_rig=(Rigid3.identity(),), covariance=known.covariance[own, own], warped=())
+    rig = UncertainRig(cameras=known.cameras, cam_from_rig=known.cam_from_rig, covariance=known.covariance)
+    both = rig.pair(chosen[0], chosen[1])
+    poses = (Rigid3.identity(), both.posed.cam2_from_cam1)
+    return replace(
+        known, names=tuple(names), cameras=cameras, cam_from_rig=poses, covariance=both.covariance, warped=()
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,7 +91,8 @@ class Certificate:
 
     Attributes
     ----------
-    task, instrument : of the measurement.
+    task : of the measurement.
+    instrument : one camera, or two in the frame of the first.
     pixels : (R, C, 2) image of the object's middle in the first camera.
     in_view : (R, C) mask of the places where all cameras see the whole object.
     bound : (R, C) the error that is exceeded with probability 1 - confidence, in `task.unit`; NaN out of view. It
@@ -156,7 +104,7 @@ class Certificate:
     """
 
     task: Task
-    instrument: Instrument
+    instrument: Monitored
     pixels: Pixels
     in_view: BoolArray
     bound: FloatArray

@@ -26,10 +26,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays
+from rigkit.calibration.rig.projection import RigProjection
+from rigkit.calibration.rig.solving.layout import Layout
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays, scaled_pinv
 from rigkit.core.errors import DegenerateError
-from rigkit.geometry.rotation import skew
-from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.validation.certificate.contracts import Quantity, Task
+from rigkit.validation.sentinel.evidence import Monitored
 
 PLANE_POINTS = 5
 """Points along each side of a measured plane."""
@@ -113,30 +117,19 @@ def _differences(pairs: Sequence[tuple[int, int]], count: int) -> FloatArray:
 
 
 def gradients(
-    instrument: Instrument, points: Points, weights: FloatArray
+    cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], points: Points, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Return d quantity / d pixel (N, M, K, 2 C) for C cameras, d quantity / d calibration (N, M, P), d point / d pixel
-    (N, K, 3, 2 C), and a mask (N,) of the places that all cameras see."""
-    size = len(instrument.covariance)
-    rig_from_first = instrument.cam_from_rig[0].inverse()
-    in_rig = rig_from_first.apply(points)
-    jacobians, designs, first = [], [], 0
-    seen = np.ones(len(points), dtype=bool)
-    for k, (camera, pose) in enumerate(zip(instrument.cameras, instrument.cam_from_rig, strict=True)):
-        in_cam = pose.apply(in_rig)
-        pixels, valid, d_pixels_d_point, d_pixels_d_parameters = camera.project_with_jacobians(in_cam)
-        seen &= (valid & camera.on_image(pixels)).all(axis=1)
-        design = np.zeros((*points.shape[:2], 2, size))
-        design[..., first : first + camera.parameters.size] = d_pixels_d_parameters
-        first += camera.parameters.size
-        if instrument.is_rig:
-            run = instrument.intrinsic_count + 6 * k
-            design[..., run : run + 3] = d_pixels_d_point @ -skew(in_cam - pose.translation_mm)
-            design[..., run + 3 : run + 6] = d_pixels_d_point
-        jacobians.append(d_pixels_d_point @ (pose.rotation @ rig_from_first.rotation))
-        designs.append(design)
-    J, D = (np.where(seen[:, None, None, None], np.concatenate(part, axis=2), 0.0) for part in (jacobians, designs))
-    if instrument.is_rig:
+    """Return d quantity / d pixel (N, M, K, 2 C) for C cameras, one or two, d quantity / d calibration (N, M, P) in the
+    order of `Layout.of_cameras`, d point / d pixel (N, K, 3, 2 C), and a mask (N,) of the places that all cameras
+    see. The rig's frame is that of the first camera."""
+    layout, placed = Layout.of_cameras(cameras), zip(cameras, cam_from_rig, strict=True)
+    each = [RigProjection.of(camera, pose, points, layout, k) for k, (camera, pose) in enumerate(placed)]
+    seen = np.all([own.seen for own in each], axis=(0, 2))
+    J, D = (
+        np.where(seen[:, None, None, None], np.concatenate(part, axis=2), 0.0)
+        for part in ([own.by_point for own in each], [own.by_globals for own in each])
+    )
+    if len(cameras) > 1:
         normal = np.swapaxes(J, -1, -2) @ J
         # Any invertible matrix will do out of view.
         normal[~seen] = np.eye(3)
@@ -155,7 +148,7 @@ def gradients(
 
 
 def variances(
-    instrument: Instrument,
+    instrument: Monitored,
     task: Task,
     points: Points,
     by_corner: FloatArray,
@@ -166,14 +159,11 @@ def variances(
 
     The part of the extrinsics' error that is correlated with the lenses counts as theirs: dm = C_ml C_ll^-1 dl + rest.
     """
-    split = instrument.intrinsic_count
+    split = instrument.layout.cameras[-1].stop
     covariance = instrument.covariance
     lens, mount = by_calibration[..., :split], by_calibration[..., split:]
     own = covariance[:split, :split]
-    # Parameters are scaled by their standard deviations, because they have different units.
-    sigma = np.sqrt(np.diag(own))
-    known = np.where(sigma > 0.0, sigma, 1.0)
-    follows = covariance[split:, :split] / known @ np.linalg.pinv(own / np.outer(known, known), hermitian=True) / known
+    follows = covariance[split:, :split] @ scaled_pinv(own)
     with_lens = lens + mount @ follows
     variance = {
         OF_CORNERS: instrument.sigma_px**2 * np.sum(by_corner**2, axis=(-1, -2)),

@@ -47,7 +47,6 @@ class ChangeAim:
     def of(cls, monitored: Monitored, inverse: FloatArray, of_all: FloatArray) -> ChangeAim:
         """Return the aim for all lenses and mounts, from the `inverse` (T, T) of their covariance. Hypotheses on which
         even `of_all` (T, T), the information of all candidate frames, has no effect are left out."""
-        several = len(monitored.cameras) > 1
         by_all, shown = covariance_of(inverse + of_all), []
         for hypothesis in hypotheses_of(monitored):
             metric = _metric(monitored, hypothesis)
@@ -59,7 +58,7 @@ class ChangeAim:
             one = (inverse @ by_px, by_px.T @ inverse @ by_px)
             if _explained_variances(*one, by_all).min() > NULL_RANK * np.trace(one[1]):
                 shown.append(one)
-        changes = "intrinsics or extrinsics" if several else "intrinsics"
+        changes = "intrinsics or extrinsics" if monitored.is_rig else "intrinsics"
         return cls(tuple(shown), f"standard error of a change of {changes}, over the image")
 
     def error(self, covariance: FloatArray) -> FloatArray:

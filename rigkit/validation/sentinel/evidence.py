@@ -72,6 +72,11 @@ class Monitored:
     warped: tuple[str, ...] = ()
 
     @property
+    def is_rig(self) -> bool:
+        """Whether there are several cameras."""
+        return len(self.cameras) > 1
+
+    @property
     def fresh_sigma_px(self) -> float:
         """Standard deviation of a corner in fresh views, overdispersion included. A factor below 1 is chance, and is
         not used."""

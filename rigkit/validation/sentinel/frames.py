@@ -98,5 +98,5 @@ class Frames:
             monitored.cam_from_rig[c] @ rig_from_board,
             error,
             monitored.cameras[c],
-            tuple(names) if len(monitored.names) > 1 else (),
+            tuple(names) if monitored.is_rig else (),
         )

@@ -55,10 +55,9 @@ class Hypothesis:
 
 def hypotheses_of(monitored: Monitored) -> list[Hypothesis]:
     """Return all hypotheses, those with the fewest amounts first."""
-    several = len(monitored.cameras) > 1
     layout, lenses, mounts = monitored.layout, [], []
     for c, (name, camera) in enumerate(zip(monitored.names, monitored.cameras, strict=True)):
-        own = name if several else None
+        own = name if monitored.is_rig else None
         whole = np.zeros((layout.count, 6))
         whole[layout.cameras[c]] = _lens_directions(camera)
         units: tuple[str, ...] = ("%", *("px",) * 5)
@@ -69,12 +68,12 @@ def hypotheses_of(monitored: Monitored) -> list[Hypothesis]:
             ("lens", slice(0, 6)),
         ):
             lenses.append(Hypothesis(kind, own, whole[:, part], units[part]))
-        if several and (c > 0 or len(monitored.cameras) > 2):
+        if monitored.is_rig and (c > 0 or len(monitored.cameras) > 2):
             turn = _mount_directions(monitored, c)
             mounts.append(Hypothesis("rotation", own, turn[:, :3], ("deg",) * 3))
             mounts.append(Hypothesis("shift", own, turn[:, 3:], ("mm",) * 3))
             mounts.append(Hypothesis("moved", own, turn, ("deg",) * 3 + ("mm",) * 3))
-    if several:
+    if monitored.is_rig:
         scale = np.zeros((layout.count, 1))
         for c, pose in enumerate(monitored.cam_from_rig[1:], start=1):
             scale[layout.mount(c)][3:, 0] = 0.01 * pose.translation_mm

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from rigkit.planning.goal import Goal, projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.planning.rig_goal import rig_goal
-from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
+from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import gradients, measured_points
 from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.validation.sentinel.frames import Frames
@@ -80,29 +79,23 @@ def goal_of(camera: Camera, reach: Reach, task: Task | None) -> Goal:
 
 
 def length_goal(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], task: Task) -> Goal:
-    """Return the goal of measuring a length with one camera or two, averaged over the image of the first.
+    """Return the goal of measuring a length with one camera or two, averaged over the image of the first, in whose
+    frame they are.
 
-    Its weight matrix is on the parameters of the cameras, then, of two, on both mounts (rad, mm). Raises InputError for
-    a task of one camera that is no length, DegenerateError if the length is nowhere in view.
+    Its weight matrix is on the parameters of `Layout.of_cameras`. Raises InputError for a task of one camera that is no
+    length, DegenerateError if the length is nowhere in view.
     """
-    if len(cameras) == 1 and task.quantity is not Quantity.LENGTH:
+    is_rig = len(cameras) > 1
+    if not is_rig and task.quantity is not Quantity.LENGTH:
         raise InputError(f"plan: one camera measures no {task.quantity}; give a length at a distance")
-    count = sum(camera.parameters.size for camera in cameras) + (12 if len(cameras) == 2 else 0)
-    instrument = Instrument(
-        names=tuple(f"{k}" for k in range(len(cameras))),
-        cameras=tuple(cameras),
-        cam_from_rig=tuple(cam_from_rig),
-        covariance=np.zeros((count, count)),
-        sigma_px=1.0,
-    )
     rays, valid = cameras[0].unproject(grid_pixels(cameras[0].size_px, TASK_CELLS).reshape(-1, 2))
-    _, by_calibration, _, seen = gradients(instrument, *measured_points(rays[valid], task, is_rig=instrument.is_rig))
+    _, by_calibration, _, seen = gradients(cameras, cam_from_rig, *measured_points(rays[valid], task, is_rig))
     if not seen.any():
         raise DegenerateError(
             f"nowhere is a length of {task.size_mm:g} mm at {task.distance_mm:g} mm in view; give a shorter "
             "length or another distance"
         )
-    rows = by_calibration[seen].reshape(-1, count)
+    rows = by_calibration[seen].reshape(-1, by_calibration.shape[-1])
     what = f"standard error of a length of {task.size_mm:g} mm at {task.distance_mm:g} mm"
     return Goal(rows.T @ rows / len(rows), "mm", what)
 
@@ -122,11 +115,7 @@ def length_goals(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], leng
         except DegenerateError as error:
             last = error
             continue
-        # The first mount is the rig's frame.
-        first = len(pair.weight) - 12
-        kept = np.r_[:first, first + 6 : first + 12]
-        own = replace(pair, weight=pair.weight[np.ix_(kept, kept)])
-        goals.append(own.among(np.r_[layout.cameras[0], layout.cameras[k], layout.mount(k)], layout.count))
+        goals.append(pair.among(np.r_[layout.cameras[0], layout.cameras[k], layout.mount(k)], layout.count))
     if last is not None and not goals:
         raise DegenerateError(f"of no two cameras: {last}") from last
     return goals

@@ -17,7 +17,8 @@ from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.report.pages.certificate_page import certificate_facts, certificate_page, certificate_pdf
 from rigkit.report.pages.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
-from rigkit.validation.certificate.contracts import Certificate, Instrument, Task
+from rigkit.validation.certificate.contracts import Certificate, Task, instrument_of
+from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.workflows.checks.check import load_monitored
 from rigkit.workflows.inputs.camera_files import bad_verdict_in_file
 from rigkit.workflows.options.cameras import CertifyOptions
@@ -66,7 +67,7 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
 
 def load_instrument(
     path: str | Path, cameras: tuple[str, str] | None = None, sigma_px: float | None = None
-) -> Instrument:
+) -> Monitored:
     """Return the camera of a calibration file, for points in mm, or two cameras of a rig's, with their covariance.
 
     Raises InputError for another file, or one without a covariance.
@@ -77,4 +78,4 @@ def load_instrument(
     known, _ = load_monitored(Path(path))
     if rig and len(known.names) < 2:
         raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
-    return Instrument.of(replace(known, sigma_px=sigma_px or known.sigma_px), cameras)
+    return instrument_of(replace(known, sigma_px=sigma_px or known.sigma_px), cameras)

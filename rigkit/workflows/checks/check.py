@@ -216,7 +216,7 @@ class _Pictures:
     def seen(self, frames: Sequence[Sequence[Path]], *, scene: bool) -> tuple[Look, list[FreshView]]:
         """Return the evidence of frames as a function of the cameras, and the boards in them; no boards for a scene."""
         if scene:
-            if len(self.monitored.cameras) < 2:
+            if not self.monitored.is_rig:
                 raise InputError("check: --scene needs a rig; one camera needs images of a board")
             read = [self._read(frame) for frame in frames]
             matches = matches_of_scenes(self.monitored, [images for images in read if images], progress=self.progress)
@@ -269,7 +269,7 @@ def _views(
     """Return the boards in all images; an image without any goes to `left_out`, with the reason."""
     out: list[FreshView] = []
     own = [without_lookalikes(found, boards) for found in seen]
-    whose = monitored.names if len(monitored.names) > 1 else (None,)
+    whose = monitored.names if monitored.is_rig else (None,)
     for k, frame in enumerate(frames):
         name = f"{k:04d}"
         for c, path in enumerate(frame):

@@ -9,11 +9,10 @@ from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
-
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.cameras.convert import refit_camera
+from rigkit.core.arrays import scaled_pinv
 from rigkit.core.errors import InputError
 from rigkit.io.calibrations.calibration_file import load_calibration
 from rigkit.io.calibrations.history_file import (
@@ -122,10 +121,8 @@ def _as_evidence(watched: Monitored, calibration: Calibration) -> FreshEvidence:
     pixels = grid_pixels(camera.size_px, RECALIBRATION_GRID).reshape(-1, 2)
     rays, valid = new.unproject(pixels)
     same = refit_camera(camera, rays[valid] @ difference.b_from_a, pixels[valid])
-    scale = np.sqrt(np.diag(calibration.covariance))
-    inverse = np.linalg.pinv(calibration.covariance / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
     share = (max(watched.sigma_px, MIN_SIGMA_PX) * watched.overdispersion) ** 2
-    information = share * inverse[None]
+    information = share * scaled_pinv(calibration.covariance)[None]
     score = information @ (same.parameters - camera.parameters)
     corners = calibration.corner_count
     return FreshEvidence(

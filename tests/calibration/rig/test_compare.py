@@ -140,7 +140,7 @@ def test_a_rig_file_says_what_lenses_may_do_beyond_their_models(rng: np.random.G
     lenses, _ = rig.with_departures
     instrument = load_instrument(path, ("reg", "fish"))
     assert [c.parameters.size for c in instrument.cameras] == [lenses[k].parameters.size for k in (0, 2)]
-    assert instrument.intrinsic_count > sum(rig.cameras[k].camera.parameters.size for k in (0, 2))
+    assert instrument.layout.cameras[-1].stop > sum(rig.cameras[k].camera.parameters.size for k in (0, 2))
     # What lenses may do moves mounts: a difference of theirs is less of a surprise.
     other = tmp_path / "other.json"
     other.write_text(rig_text(calibrated(rig_views(rng, 8))))
@@ -157,7 +157,8 @@ def test_a_rig_file_says_what_lenses_may_do_beyond_their_models(rng: np.random.G
         camera.pop("departures")
     path.write_text(json.dumps(data))
     assert load_saved_rig(path).departures == ()
-    assert load_instrument(path).intrinsic_count == sum(rig.cameras[k].camera.parameters.size for k in (0, 1))
+    own = load_instrument(path).layout.cameras[-1].stop
+    assert own == sum(rig.cameras[k].camera.parameters.size for k in (0, 1))
     damages: list[dict[str, object]] = [
         {"modes": [[1.0]], "moves": [[1.0]]},
         {"modes": []},

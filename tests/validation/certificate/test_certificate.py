@@ -21,7 +21,7 @@ from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.report.pages.certificate_page import bound_figure
 from rigkit.report.pictures.figures import _drawn
 from rigkit.validation.certificate.certify import certify
-from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task
+from rigkit.validation.certificate.contracts import Certificate, Quantity, Task, instrument_of
 from rigkit.validation.certificate.propagation import (
     OF_CORNERS,
     OF_LENSES,
@@ -78,8 +78,8 @@ def known_rig(name: str, joint: FloatArray, *, scale_sigma: float = 4e-4) -> Mon
     )
 
 
-def rig_of(name: str, joint: FloatArray, *, scale_sigma: float = 4e-4) -> Instrument:
-    return Instrument.of(known_rig(name, joint, scale_sigma=scale_sigma))
+def rig_of(name: str, joint: FloatArray, *, scale_sigma: float = 4e-4) -> Monitored:
+    return instrument_of(known_rig(name, joint, scale_sigma=scale_sigma))
 
 
 def places_of(certificate: Certificate, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -141,7 +141,7 @@ def test_what_noise_along_the_rays_does_to_second_order_is_counted(
     task = Task(quantity=quantity, size_mm=150.0, distance_mm=1500.0)
     rays, _ = rig.cameras[0].unproject(np.array([[620.0, 500.0], [800.0, 300.0]]))
     points, weights = measured_points(rays, task, True)
-    by_corner, by_calibration, by_pixel, _ = gradients(rig, points, weights)
+    by_corner, by_calibration, by_pixel, _ = gradients(rig.cameras, rig.cam_from_rig, points, weights)
     stated = variances(rig, task, points, by_corner, by_calibration, by_pixel)[OF_CORNERS]
     off = rig.sigma_px * np.einsum("nkip,snkp->snki", by_pixel, rng.normal(size=(8000, *by_pixel.shape[:2], 4)))
     moved = read_off(quantity, (points + off).reshape(-1, *points.shape[1:])).reshape(8000, len(points), -1)
@@ -155,7 +155,7 @@ def test_what_noise_along_the_rays_does_to_second_order_is_counted(
 def test_bounds_of_one_camera_hold_as_often_as_they_say(rng: np.random.Generator) -> None:
     camera = lens("kannala_brandt")
     covariance = covariance_of(camera, rng)
-    alone = Instrument(
+    alone = Monitored(
         names=("cam",),
         cameras=(camera,),
         cam_from_rig=(Rigid3.identity(),),
@@ -222,7 +222,7 @@ def test_what_is_not_counted_in_is_said(rng: np.random.Generator) -> None:
 def test_the_first_camera_may_be_any_of_the_rig(rng: np.random.Generator) -> None:
     """A rig's frame is no camera's affair: seen from the other side the same length is as uncertain."""
     joint = rig_covariance(lens("brown"), rng)
-    forth, back = (Instrument.of(known_rig("brown", joint), pair) for pair in (None, ("right", "left")))
+    forth, back = (instrument_of(known_rig("brown", joint), pair) for pair in (None, ("right", "left")))
     task = Task(quantity=Quantity.DEPTH, size_mm=1.0, distance_mm=1500.0)
     one, other = certify(forth, task, cells=(21, 17)), certify(back, task, cells=(21, 17))
     # Not the same lines of sight, but over the whole field much the same.
@@ -231,7 +231,7 @@ def test_the_first_camera_may_be_any_of_the_rig(rng: np.random.Generator) -> Non
 
 def test_refusals(rng: np.random.Generator) -> None:
     camera = lens("brown")
-    alone = Instrument(
+    alone = Monitored(
         names=("cam",),
         cameras=(camera,),
         cam_from_rig=(Rigid3.identity(),),
@@ -246,9 +246,9 @@ def test_refusals(rng: np.random.Generator) -> None:
         Task(quantity=Quantity.LENGTH, size_mm=0.0, distance_mm=1000.0)
     one_place = replace(known_rig("brown", rig_covariance(camera, rng)), cam_from_rig=(Rigid3.identity(),) * 2)
     with pytest.raises(DegenerateError, match="look from one place"):
-        certify(Instrument.of(one_place), Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=1000.0))
+        certify(instrument_of(one_place), Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=1000.0))
     with pytest.raises(InputError, match="two different cameras of left, right"):
-        Instrument.of(known_rig("brown", rig_covariance(camera, rng)), ("left", "left"))
+        instrument_of(known_rig("brown", rig_covariance(camera, rng)), ("left", "left"))
 
 
 def test_the_bound_is_drawn_with_and_without_places_where_it_is_a_lower_one(rng: np.random.Generator) -> None:

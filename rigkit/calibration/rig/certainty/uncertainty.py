@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.certainty.uncertainty import worst_direction
+from rigkit.calibration.rig.projection import RigProjection
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.core.arrays import BoolArray, FloatArray, Points
-from rigkit.geometry.rotation import skew
 
 TRANSFER_POINTS = 40
 """Number of corners, spread over all views, at which the transfer is evaluated."""
@@ -57,31 +57,20 @@ def transfer_uncertainty(rig: RigCalibration, a: str, b: str) -> Transfer | None
 
 def transfer_covariance(rig: RigCalibration, a: str, b: str, points: Points) -> tuple[FloatArray, BoolArray]:
     """Return the covariance (N, 2, 2), px^2, of the pixels in camera `b` of `points` (N, 3) mm in camera `a`, given
-    their pixels in `a` and their distances, and which points (N,) are in both images."""
+    their pixels in `a` and their distances, and which points (N,) project into `a` and are in the image of `b`."""
     i, j = rig.index(a), rig.index(b)
     cameras, known = rig.quoted
-    first, second = cameras[i], cameras[j]
-    motion = rig.cam2_from_cam1(a, b)
-    there = motion.apply(points)
-    _, seen1, d_pixels1_d_point, d_pixels1_d_parameters = first.project_with_jacobians(points)
-    pixels, seen2, d_pixels2_d_point, d_pixels2_d_parameters = second.project_with_jacobians(there)
-    rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
-    # The third row keeps the given distance.
-    system = np.concatenate([d_pixels1_d_point, rays[:, None, :]], axis=1)
-    held = np.concatenate(
-        [-d_pixels1_d_parameters, np.zeros((len(points), 1, d_pixels1_d_parameters.shape[-1]))], axis=1
+    layout, rays = Layout.of_cameras(cameras), points / np.linalg.norm(points, axis=-1, keepdims=True)
+    mounts = [rig.cameras[k].cam_from_rig for k in (i, j)]
+    in_rig = mounts[0].inverse().apply(points)
+    first, second = (
+        RigProjection.of(cameras[k], mount, in_rig, layout, k) for k, mount in zip((i, j), mounts, strict=True)
     )
-    by_own = np.linalg.solve(system, held)
-    layout = Layout.of_cameras(cameras)
-    design = np.zeros((len(points), 2, len(known)))
-    turned = d_pixels2_d_point @ motion.rotation
-    design[:, :, layout.cameras[i]] += turned @ by_own
-    design[:, :, layout.cameras[j]] += d_pixels2_d_parameters
-    for k, x, by_x, sign in ((i, points, turned, -1.0), (j, there, d_pixels2_d_point, 1.0)):
-        if k > 0:
-            lever = skew(x - rig.cameras[k].cam_from_rig.translation_mm)
-            run = design[:, :, layout.mount(k)]
-            run[..., :3] += sign * by_x @ -lever
-            run[..., 3:] += sign * by_x
-    covariance = design @ known @ np.swapaxes(design, -1, -2)
-    return covariance, seen1 & seen2 & second.on_image(pixels)
+    # The third row keeps the given distance.
+    system = np.concatenate([first.by_point, rays[:, None] @ mounts[0].rotation], axis=1)
+    held = np.concatenate([-first.by_globals, np.zeros((len(points), 1, layout.count))], axis=1)
+    if (mount := layout.mounts[i]) is not None:
+        lever = points - mounts[0].translation_mm
+        held[:, 2, mount] = -np.concatenate([np.cross(lever, rays), rays], axis=-1)
+    design = second.by_globals + second.by_point @ np.linalg.solve(system, held)
+    return design @ known @ np.swapaxes(design, -1, -2), first.valid & second.seen
