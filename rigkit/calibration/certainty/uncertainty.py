@@ -30,6 +30,7 @@ from rigkit.calibration.certainty.series import TERMS, Remainder
 from rigkit.calibration.result import Calibration, CalibrationCorners, Rival
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
+from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays, scaled_pinv, symmetric_pinv
 from rigkit.geometry.rotation import exp_so3, skew
 
@@ -343,7 +344,11 @@ def _projected(camera: Camera, rays: FloatArray, range_mm: float) -> tuple[Pixel
 
 def step_to_lens(camera: Camera, other: Camera, rays: Rays, sigmas: FloatArray) -> tuple[FloatArray, Mat3]:
     """Return the change of the parameters (P,) of a camera that fits it to another one along `rays` (N, 3), and the
-    rotation other_from_camera (3, 3) of the rays fitted with it; `sigmas` (P,) scale the parameters."""
+    rotation other_from_camera (3, 3) of the rays fitted with it; `sigmas` (P,) scale the parameters. A moving pupil
+    moves along the axis of its own lens: its terms are compared directly."""
+    if isinstance(camera, NearCamera) and isinstance(other, NearCamera):
+        step, turn = step_to_lens(camera.lens, other.lens, rays, sigmas[: camera.lens.parameters.size])
+        return np.append(step, other.pupil - camera.pupil), turn
     pixels, valid = camera.project(rays)
     rays, pixels = rays[valid], pixels[valid]
     turn = best_rotation(rays, pixels, np.ones(len(rays)), other)

@@ -125,17 +125,14 @@ def between_models(
         return out
     points, _ = chosen.state.points_in_cam(observations)
     rays = spread_rays(points[chosen.kept])
-    here, far = chosen.state, far_camera(chosen.state.camera)
+    here = chosen.state
     for one in rivals:
-        step, turn = step_to_lens(far, one.rival.camera, rays, sigmas[: far.parameters.size])
-        # The pupil moves along the axis of its own lens: its terms are compared directly.
-        terms = one.state.camera.parameters[one.rival.camera.parameters.size :]
-        pupil = terms - here.camera.parameters[far.parameters.size :]
+        step, turn = step_to_lens(here.camera, one.state.camera, rays, sigmas)
         # Poses in the frame of the chosen lens.
         there = (turn.T @ one.state.rotation, one.state.translation_mm @ turn)
         moved = steps_between((here.rotation, here.translation_mm), there)
         motions = motion_of_world(here.translation_mm) @ moved[..., None]
-        direction = np.concatenate([step, pupil, motions[chosen.kept.any(axis=1), :, 0].mean(axis=0)])
+        direction = np.concatenate([step, motions[chosen.kept.any(axis=1), :, 0].mean(axis=0)])
         out += one.rival.likely * np.outer(direction, direction)
     return out
 

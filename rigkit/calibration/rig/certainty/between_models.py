@@ -18,7 +18,7 @@ from rigkit.calibration.rig.solving.solver import solve_rig
 from rigkit.calibration.rig.solving.state import RigState
 from rigkit.calibration.solving.poses import steps_between
 from rigkit.calibration.solving.solver import FROM_OPTIMUM
-from rigkit.cameras.moving_pupil import far_camera, with_pupil_of
+from rigkit.cameras.moving_pupil import with_pupil_of
 from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.core.errors import DegenerateError, InputError
 
@@ -39,16 +39,9 @@ def between_rig_models(joint: JointRig, sigmas: FloatArray) -> FloatArray:
     def fitted_to(there: RigState) -> tuple[list[FloatArray], list[Mat3]]:
         """Return the change of each camera's parameters that fits it to that of another state, and the rotations
         there_from_here of the rays."""
-        steps, turns = [], []
-        for camera, other, own, run in zip(here.cameras, there.cameras, rays, layout.cameras, strict=True):
-            far, far_other = far_camera(camera), far_camera(other)
-            p = far.parameters.size
-            step, turn = step_to_lens(far, far_other, own, sigmas[run][:p])
-            # The pupil moves along the axis of its own lens: its terms are compared directly.
-            pupil = other.parameters[far_other.parameters.size :] - camera.parameters[p:]
-            steps.append(np.concatenate([step, pupil]))
-            turns.append(turn)
-        return steps, turns
+        both = zip(here.cameras, there.cameras, rays, layout.cameras, strict=True)
+        found = [step_to_lens(camera, other, own, sigmas[run]) for camera, other, own, run in both]
+        return [step for step, _ in found], [turn for _, turn in found]
 
     others = [rival.name for one in single for rival in one.rivals if not same_model(rival.camera, one.camera)]
     for name in dict.fromkeys(others):
