@@ -19,11 +19,11 @@ import numpy as np
 
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.shape import in_enough_views, released_sigma
-from rigkit.calibration.solving.state import State
+from rigkit.calibration.solving.state import State, with_views_changed
 from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3
 from rigkit.core.boards import Board
-from rigkit.core.detections import grid_turned
+from rigkit.core.detections import BoardView, grid_turned
 from rigkit.geometry.rigid3 import Rigid3
 
 SURE = 10.0
@@ -52,18 +52,12 @@ def with_boards_renumbered(
 ) -> tuple[Observations, State]:
     """Return observations and state with the boards of the chosen `views` (V,) numbered from another corner. Residuals
     of flat boards do not change."""
-    rotation, translation, corner = state.rotation.copy(), state.translation_mm.copy(), observations.corner.copy()
-    turned = list(observations.views)
-    for i in np.flatnonzero(views).tolist():
-        view = turned[i]
+
+    def renumbered(view: BoardView, pose: Rigid3) -> tuple[BoardView, Rigid3]:
         grid = grid_turned(view.grid, view.board.size, quarter_turns)
-        turned[i] = replace(view, grid=grid)
-        corner[i, : len(grid)] = observations.first_row[observations.board[i]] + view.board.index(grid)
-        back = board_turn(view.board, quarter_turns).inverse()
-        translation[i] += rotation[i] @ back.translation_mm
-        rotation[i] = rotation[i] @ back.rotation
-    observations = replace(observations, views=tuple(turned), corner=corner)
-    return observations, replace(state, rotation=rotation, translation_mm=translation)
+        return replace(view, grid=grid), pose @ board_turn(view.board, quarter_turns).inverse()
+
+    return with_views_changed(observations, state, views, renumbered)
 
 
 def misnumbered_views(observations: Observations, fit: Fit, quarter_turns: int) -> BoolArray:

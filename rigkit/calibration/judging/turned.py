@@ -9,8 +9,9 @@ boards that compensate by their tilt, do not show clearly.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,10 +23,14 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.poses import START_TOLERANCE, refine_poses
 from rigkit.calibration.solving.solver import solve
-from rigkit.calibration.solving.state import State, evaluate, weighted_squares
+from rigkit.calibration.solving.state import State, evaluate, weighted_squares, with_views_changed
+from rigkit.calibration.views.flips import FLIP_SIGNS, Flip
 from rigkit.calibration.views.observations import Observations
+from rigkit.cameras.base import image_center
 from rigkit.core.arrays import BoolArray, IntArray
+from rigkit.core.detections import BoardView
 from rigkit.core.findings import Finding
+from rigkit.geometry.rigid3 import Rigid3
 
 TOLERANCE = 1e-4
 """Relative cost at which the solver stops: if flipping is the cause, the cost falls by a factor."""
@@ -38,18 +43,12 @@ ROUNDS = 4
 MIN_FIRST_GAIN = 0.1
 """Part of the squares that flipping views back must explain, with lens and boards held, before it is solved for: 0.4 to
 0.6 for REAL and SIMULATED sessions with every fourth image mirrored, 0 to 0.01 for the unchanged sessions."""
-WAYS = {
-    "rotated by 180 degrees": np.array([-1.0, -1.0]),
-    "mirrored left to right": np.array([-1.0, 1.0]),
-    "mirrored top to bottom": np.array([1.0, -1.0]),
-}
-"""Kinds of flips, as signs of the pixel coordinates (u, v) relative to the image centre."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Back:
-    """Observations with the images of the views `at` (V,) flipped back in one of the `WAYS`, their solution, and its
-    sum of squares."""
+    """Observations with the images of the views `at` (V,) flipped back in one `way`, their solution, and its sum of
+    squares."""
 
     way: str
     at: BoolArray
@@ -75,7 +74,7 @@ def flipped_images(
     before = float(weighted_squares(fit.state, observations, fit.weight(observations)).sum())
     tried = [
         _alternated(way, at, turns, observations, fit, before)
-        for way in WAYS
+        for way in FLIP_SIGNS
         for at, turns in _initial_flips(way, evidence if shifted else None, observations, fit)
     ]
     if not tried or not before > 0.0:
@@ -139,7 +138,7 @@ def _fitting_better_flipped(
     for turns in (0, 2):
         flipped, start = _flipped(way, every, np.full(len(every), turns), observations, state)
         cost = refine_poses(flipped, start, weight, tolerance=START_TOLERANCE)[1]
-        numbered = turns == 2 and WAYS[way].prod() > 0.0
+        numbered = turns == 2 and math.prod(FLIP_SIGNS[way]) > 0.0
         costs.append(np.where([numbered and not view.board.looks_same_turned for view in flipped.views], np.inf, cost))
     best = np.min(costs, axis=0)
     better = best < now
@@ -150,25 +149,15 @@ def _fitting_better_flipped(
 def _flipped(
     way: str, at: BoolArray, turns: IntArray, observations: Observations, state: State
 ) -> tuple[Observations, State]:
-    """Return observations and poses with the images of the views `at` (V,) flipped in one of the `WAYS`, and their
-    boards renumbered by so many quarter `turns` (V,)."""
-    signs, middle = WAYS[way], 0.5 * (np.array(state.camera.size_px) - 1.0)
-    pixels, corner, views = observations.pixels.copy(), observations.corner.copy(), list(observations.views)
-    pixels[at] = middle + signs * (pixels[at] - middle)
-    rotation, translation = state.rotation.copy(), state.translation_mm.copy()
-    for k in np.flatnonzero(at).tolist():
-        view, picture = views[k], np.append(signs, 1.0)
-        grid, board = view.grid, np.ones(3)
-        if signs.prod() < 0.0:
-            # To stay right-handed, a mirrored board is numbered backwards along its columns.
-            grid, board = np.stack([view.board.columns - 1 - grid[:, 0], grid[:, 1]], axis=-1), np.array([-1.0, 1, 1])
-            across = (view.board.columns - 1) * view.board.square_x_mm
-            translation[k] += rotation[k] @ np.array([across, 0.0, 0.0])
-        views[k] = replace(view, grid=grid, pixels=middle + signs * (view.pixels - middle))
-        corner[k, : len(grid)] = observations.first_row[observations.board[k]] + view.board.index(grid)
-        rotation[k], translation[k] = picture[:, None] * rotation[k] * board, picture * translation[k]
-    out = replace(observations, pixels=pixels, corner=corner, views=tuple(views))
-    state = replace(state, rotation=rotation, translation_mm=translation)
+    """Return observations and poses with the images of the views `at` (V,) flipped in one `way`, and their boards
+    renumbered by so many quarter `turns` (V,)."""
+    signs, middle = FLIP_SIGNS[way], image_center(state.camera.size_px)
+    flip = Flip(signs, 0 if math.prod(signs) < 0.0 else None)
+
+    def flipped(view: BoardView, pose: Rigid3) -> tuple[BoardView, Rigid3]:
+        return flip.view(view, middle), flip.pose(pose, view.board)
+
+    out, state = with_views_changed(observations, state, at, flipped)
     return with_boards_renumbered(out, state, at & (turns == 2), 2)
 
 

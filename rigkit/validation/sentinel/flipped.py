@@ -11,19 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.cameras.base import Camera
+from rigkit.calibration.views.flips import FLIP_SIGNS, Flip
+from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.detections import BoardView, grid_turned
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_of
 from rigkit.validation.sentinel.judge import check_views, exceeds_expected, unchanged_px
 
-FLIP_SIGNS = {
-    "rotated by 180 degrees": (-1.0, -1.0),
-    "mirrored left to right": (-1.0, 1.0),
-    "mirrored top to bottom": (1.0, -1.0),
-}
-"""The flips of an image, and the signs of its axes after each."""
 MIN_SHARE_FLIPPED = 0.01
 """Smallest displacement of the principal point by a flip, of the longer side: a knock could cause a smaller one. REAL
 lenses are 0.1 to 3.5 % off centre (camodocal-fisheye, bouguet-stereo), and a flip doubles that."""
@@ -56,8 +51,8 @@ def _fitting_flips(monitored: Monitored, views: Sequence[FreshView], which: tupl
         if not together and max(_moved(camera, signs) for camera in cameras) < MIN_SHARE_FLIPPED:
             continue
         # The colours of a mirrored board's ends make its columns or its rows count backwards.
-        flips = (0, 1) if np.prod(signs) < 0.0 else (None,)
-        if any(_fits(monitored, _all_unflipped(monitored, views, which, signs, flip)) for flip in flips):
+        ways = [Flip(signs, backwards) for backwards in ((0, 1) if np.prod(signs) < 0.0 else (None,))]
+        if any(_fits(monitored, _all_unflipped(monitored, views, which, flip)) for flip in ways):
             fit.append(words)
     return fit
 
@@ -69,17 +64,14 @@ def _moved(camera: Camera, signs: tuple[float, float]) -> float:
 
 
 def _all_unflipped(
-    monitored: Monitored,
-    views: Sequence[FreshView],
-    which: tuple[int, ...],
-    signs: tuple[float, float],
-    backwards: int | None,
+    monitored: Monitored, views: Sequence[FreshView], which: tuple[int, ...], flip: Flip
 ) -> list[FreshView]:
     """Return all views with the flip of some cameras undone; their boards are numbered as other cameras number them."""
     out = [view for view in views if view.camera not in which]
     for view in views:
         if view.camera in which:
-            put = _unflipped(view, signs, monitored.cameras[view.camera].size_px, backwards)
+            middle = image_center(monitored.cameras[view.camera].size_px)
+            put = replace(view, view=flip.view(view.view, middle))
             out.append(consistently_numbered(monitored, put, out))
     return out
 
@@ -114,15 +106,3 @@ def _fits(monitored: Monitored, views: Sequence[FreshView]) -> bool:
         return fit and check_views(monitored, views).holds
     except (DegenerateError, InputError):
         return False
-
-
-def _unflipped(
-    one: FreshView, signs: tuple[float, float], size_px: tuple[int, int], backwards: int | None
-) -> FreshView:
-    """Return a view with its flip undone, its columns (0) or rows (1) counted backwards."""
-    view = one.view
-    pixels = np.where(np.array(signs) < 0.0, np.array(size_px) - 1.0 - view.pixels, view.pixels)
-    grid = view.grid.copy()
-    if backwards is not None:
-        grid[:, backwards] = view.board.size[backwards] - 1 - grid[:, backwards]
-    return replace(one, view=replace(view, pixels=pixels, grid=grid))

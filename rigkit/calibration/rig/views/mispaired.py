@@ -22,7 +22,8 @@ import numpy as np
 from rigkit.calibration.rig.solving.state import Key
 from rigkit.calibration.rig.views.disagree import shared_keys
 from rigkit.calibration.rig.views.frames import mounts_of, view_distances_px, with_common_orientation
-from rigkit.calibration.rig.views.observations import FrameObservations, Observation, RigViews
+from rigkit.calibration.rig.views.observations import FrameObservations, RigViews
+from rigkit.calibration.views.flips import FLIP_SIGNS, Flip
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
@@ -92,7 +93,7 @@ def mixups_of_frames(views: RigViews, mounts: Sequence[Rigid3], left_out: Iterab
             (trial, f"'{names[i]}' and '{names[j]}' are exchanged", "exchanging them back", "correct their names")
         )
     for k, camera in enumerate(views.cameras):
-        trial = those.with_camera(k, _rotated_by_180(own[k], camera))
+        trial = those.with_camera(k, _flipped(own[k], camera, Flip(FLIP_SIGNS["rotated by 180 degrees"])))
         remedy = "use the image files as the camera wrote them"
         tried.append((trial, f"'{names[k]}' are rotated by 180 degrees", "rotating them back", remedy))
     out = []
@@ -142,8 +143,8 @@ def mixup_of_all_frames(views: RigViews) -> Finding | None:
                     "cameras agree; an image is missing, or the cameras did not start together",
                     "give simultaneous images the same number",
                 )
-        for axis in (0, 1):
-            mirrored = {key: _mirrored(entry, camera, axis) for key, entry in seen[k].items()}
+        for backwards in (0, 1):
+            mirrored = _flipped(seen[k], camera, Flip(FLIP_SIGNS["mirrored left to right"], backwards))
             if typical_px(views.with_camera(k, mirrored)) <= limit:
                 # Of two cameras either may be the mirrored one.
                 who = f"'{names[k]}'" if len(seen) > 2 else f"'{names[0]}' or those of '{names[1]}'"
@@ -151,7 +152,7 @@ def mixup_of_all_frames(views: RigViews) -> Finding | None:
                     f"the images of {who} are mirrored: undoing that makes the cameras agree",
                     "use the image files as the camera wrote them",
                 )
-        turned = _rotated_by_180(seen[k], camera)
+        turned = _flipped(seen[k], camera, Flip(FLIP_SIGNS["rotated by 180 degrees"]))
         for sides in _frames_better_changed(views, k, turned):
             some = {key: turned[key] if key[0] in sides else entry for key, entry in seen[k].items()}
             if sides and typical_px(views.with_camera(k, some)) <= limit:
@@ -222,34 +223,16 @@ def _with_offset(seen: Sequence[FrameObservations], k: int, step: int) -> FrameO
     }
 
 
-def _rotated_by_180(own: FrameObservations, camera: Camera) -> FrameObservations:
-    """Return a camera's observations in images rotated by 180 degrees about the optical axis."""
-    half = Rigid3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+def _flipped(own: FrameObservations, camera: Camera, flip: Flip) -> FrameObservations:
+    """Return a camera's observations in images flipped about the optical axis."""
     return {
         key: replace(
             entry,
-            view=replace(entry.view, pixels=2.0 * camera.axis_px - entry.view.pixels),
-            cam_from_board=half @ entry.cam_from_board,
+            view=flip.view(entry.view, camera.axis_px),
+            cam_from_board=flip.pose(entry.cam_from_board, entry.view.board),
         )
         for key, entry in own.items()
     }
-
-
-def _mirrored(entry: Observation, camera: Camera, axis: int) -> Observation:
-    """Return an observation in the image mirrored left to right at the optical axis. The board is right-handed again
-    with columns (`axis` 0) or rows (1) numbered from the other end; which of both depends on the colours of its
-    squares.
-    """
-    view, board = entry.view, entry.view.board
-    pixels, grid = view.pixels.copy(), view.grid.copy()
-    pixels[:, 0] = 2.0 * camera.axis_px[0] - pixels[:, 0]
-    grid[:, axis] = board.size[axis] - 1 - grid[:, axis]
-    image, on_board = np.array([-1.0, 1.0, 1.0]), np.ones(3)
-    on_board[axis] = -1.0
-    old, far = entry.cam_from_board, np.zeros(3)
-    far[axis] = (board.size[axis] - 1) * (board.square_x_mm, board.square_y_mm)[axis]
-    pose = Rigid3(image[:, None] * old.rotation * on_board, image * old.apply(far))
-    return replace(entry, view=replace(view, pixels=pixels, grid=grid), cam_from_board=pose)
 
 
 def _same_image(one: BoardView, other: BoardView) -> bool:
