@@ -40,7 +40,7 @@ def drifting(calibration: Calibration, evidence: ViewEvidence) -> Finding | None
     places = np.array(
         [
             (
-                np.linalg.norm(view.pixels[view.kept].mean(axis=0) - centre),
+                np.linalg.norm(view.pixels.mean(axis=0) - centre),
                 np.linalg.norm(view.cam_from_board.translation_mm),
                 view.cam_from_board.rotation[2, 2],
             )
@@ -50,7 +50,7 @@ def drifting(calibration: Calibration, evidence: ViewEvidence) -> Finding | None
     rows = np.column_stack([np.ones(len(views)), shown[number] / (len(images) - 1.0), places, amounts])
     each = np.stack([np.bincount(number, column) for column in rows.T], axis=1) / np.bincount(number)[:, None]
     system, amount = each[:, :-1], each[:, -1]
-    system[:, 2:] /= np.abs(system[:, 2:]).max(axis=0)
+    system[:, 2:] /= np.maximum(np.abs(system[:, 2:]).max(axis=0), np.finfo(float).tiny)
     step, _, rank, _ = np.linalg.lstsq(system, amount, rcond=None)
     if rank < system.shape[1]:
         return None

@@ -13,6 +13,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging.drift import drifting
 from rigkit.calibration.judging.view_evidence import view_evidence
 from rigkit.calibration.result import Calibration
+from rigkit.cameras.base import image_center
 from rigkit.core.arrays import FloatArray
 from rigkit.core.findings import Severity
 
@@ -56,3 +57,15 @@ def test_one_focal_length_does_not_drift(rng: np.random.Generator) -> None:
     result = zoomed(np.ones(20), rng)
     evidence = view_evidence(result)
     assert evidence is not None and drifting(result, evidence) is None
+
+
+def test_views_without_kept_corners_or_all_at_one_place_are_no_error(rng: np.random.Generator) -> None:
+    result = zoomed(np.linspace(1.0, 0.98, 20), rng)
+    evidence = view_evidence(result)
+    assert evidence is not None
+    first, *others = result.views
+    without = replace(result, views=(replace(first, kept=np.zeros_like(first.kept)), *others))
+    assert drifting(without, evidence) is not None
+    middle = image_center(SIZE)
+    at_one = tuple(replace(view, pixels=np.tile(middle, (len(view.pixels), 1))) for view in result.views)
+    assert drifting(replace(result, views=at_one), evidence) is None
