@@ -20,6 +20,7 @@ from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.io.manifests.session import Session, files_of_session, load_session
 from rigkit.workflows.calibration.session_page import session_page
+from rigkit.workflows.inputs.black_borders import black_borders
 from rigkit.workflows.inputs.corners import SessionCorners, given_corners, named_images, session_corners, session_views
 from rigkit.workflows.inputs.identify_board import why_misplaced
 from rigkit.workflows.inputs.interlaced import interlaced
@@ -128,7 +129,12 @@ def calibration_from(
                 raise
             raise InputError(f"{shown} ({error})") from error
     images = named_images(session)
-    also = [*suggest_rigid_boards(views, result), *interlaced(result, images), *wrong_print(views, images)]
+    also = [
+        *suggest_rigid_boards(views, result),
+        *interlaced(result, images),
+        *black_borders(result, images),
+        *wrong_print(views, images),
+    ]
     verdicts = diagnose_session(result, dropped, also)
     if verdicts[0].severity is Severity.BAD:
         shown = why_misplaced(session.images, session.boards)
