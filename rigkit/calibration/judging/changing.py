@@ -30,6 +30,9 @@ MIN_VARIANCE_RATIO = 6.0
 MIN_SHARE_EXPLAINED = 0.5
 """Part of the sum of squares that it must explain; less may be a side effect of another cause. A board held by hand in
 front of two cameras is bent according to the residuals of one, sheared according to the other, a third each."""
+MIN_RATIO_TO_OTHERS = 3.0
+"""Variance ratio, over the largest one of the other kinds, from which it may explain less: an error of the lens or
+board model explains about as much by every kind, for each degree of freedom."""
 MIN_NEIGHBOUR_CORRELATION = 0.1
 """All kinds of change are smooth over a board: if one explains half of the squares, the residuals of neighbouring
 corners have a correlation of 0.25 and more. That of noise is 0, slightly less after fitting a pose."""
@@ -150,12 +153,18 @@ def changing(
 def _leads(changes: Mapping[str, ViewChange], kind: str, but: Collection[str] = ()) -> bool:
     """Return whether a kind of change explains most of the residuals, far better than all others except `but`."""
     found = changes[kind]
-    others = [0.0, *(change.criterion for name, change in changes.items() if name != kind and name not in but)]
+    others = [change for name, change in changes.items() if name != kind and name not in but]
     lead = max(MIN_LEAD_OF_CRITERION, -MIN_LEAD_OF_GAIN * found.criterion)
     return (
         found.ratio >= MIN_VARIANCE_RATIO
-        and found.share >= MIN_SHARE_EXPLAINED
-        and min(others) - found.criterion >= lead
+        and (
+            found.share >= MIN_SHARE_EXPLAINED
+            or (
+                found.share >= MIN_SHARE_TRIED
+                and found.ratio >= MIN_RATIO_TO_OTHERS * max(other.ratio for other in others)
+            )
+        )
+        and min(0.0, *(other.criterion for other in others)) - found.criterion >= lead
     )
 
 

@@ -12,7 +12,7 @@ from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 from helpers.session_scenes import NOISE_PX, poses, seen
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.judging.changing import MIN_NEIGHBOUR_CORRELATION, changing
+from rigkit.calibration.judging.changing import CHANGES, MIN_NEIGHBOUR_CORRELATION, changing
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.judging.view_evidence import neighbour_correlation, view_evidence
 from rigkit.calibration.result import Calibration
@@ -255,6 +255,17 @@ def test_what_changes_from_image_to_image(way: str, words: str, rng: np.random.G
     named = [result for result in results if changing_in(result)]
     assert len(named) >= 3
     assert all(words in str(result.verdicts) for result in named), [str(result.verdicts[0]) for result in named]
+
+
+def test_a_zoom_beneath_noise_is_named(rng: np.random.Generator) -> None:
+    """It explains less than half of the squares, but for each degree of freedom far more than what is no change of the
+    lens."""
+    views = [
+        replace(view, pixels=np.clip(view.pixels + 0.2 * rng.normal(size=view.pixels.shape), 0.0, np.array(SIZE) - 1.0))
+        for view in changed_views("focus", rng)
+    ]
+    found = changing_in(calibrate(views, SIZE, model="brown", board="flat", folds=0))
+    assert [CHANGES["focus"].message in finding.message for finding in found] == [True]
 
 
 @pytest.mark.parametrize(
