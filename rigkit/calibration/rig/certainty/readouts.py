@@ -2,7 +2,8 @@
 
 For each camera the rig is solved again with its readout one standard deviation longer. `readout_steps` holds all but
 the poses of views; the rest of the rig follows and explains a part of the residuals, which lowers the information on
-the readout by the same part.
+this readout, and changes what the other cameras say of theirs. So readouts are correlated, and their covariance is the
+inverse of the information on all of them.
 """
 
 from __future__ import annotations
@@ -13,28 +14,33 @@ from rigkit.calibration.rig.certainty.between_models import globals_between
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solving.shutters import readout_steps, with_longer_readouts
 from rigkit.calibration.rig.solving.solver import solve_rig
+from rigkit.calibration.solving.clustered import widening
 from rigkit.calibration.solving.solver import FROM_OPTIMUM
 from rigkit.core.arrays import FloatArray
 
 MIN_LEFT = 0.05
-"""Least part of the information on a readout that remains: less is rounding error."""
+"""Least part of the information on readouts that remains, in any direction: less is rounding error."""
 
 
 def readout_error(joint: JointRig) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance (G, G) of all globals due to the errors of the readouts, to be added, and the standard
-    deviations (n,) of the readouts; zeros where none was solved for."""
+    """Return the covariance (G, G) of all globals due to the errors of the readouts, to be added, and the quoted
+    standard deviations (n,) of the readouts; zeros where none was solved for."""
     observations, state = joint.observations, joint.solution.state
     layout, cameras = state.layout(observations), len(state.cameras)
-    out, sigmas = np.zeros((layout.count, layout.count)), np.zeros(cameras)
+    sigmas = np.zeros(cameras)
     if state.exposures is None or not state.exposures.readouts.any():
-        return out, sigmas
-    before, alone, _ = readout_steps(observations, state)
-    for c in np.flatnonzero(alone).tolist():
+        return np.zeros((layout.count, layout.count)), sigmas
+    before, alone, freedom = readout_steps(observations, state)
+    known = np.flatnonzero(alone)
+    followed, left = np.zeros((layout.count, len(known))), np.zeros((len(known), len(known)))
+    for k, c in enumerate(known.tolist()):
         step = np.where(np.arange(cameras) == c, alone, 0.0)
         moved = with_longer_readouts(observations, state, step)
         there = solve_rig(moved, state, joint.sigma_px, FROM_OPTIMUM).state
-        left = float((before - readout_steps(moved, there)[0])[c] / alone[c])
-        followed = globals_between(layout, state, there) / np.sqrt(max(left, MIN_LEFT))
-        out += np.outer(followed, followed)
-        sigmas[c] = alone[c] / np.sqrt(max(left, MIN_LEFT))
-    return out, sigmas
+        left[:, k] = (before - readout_steps(moved, there)[0])[known] / alone[known]
+        followed[:, k] = globals_between(layout, state, there)
+    values, axes = np.linalg.eigh(0.5 * (left + left.T))
+    root = axes / np.sqrt(np.maximum(values, MIN_LEFT))
+    widened = [widening(own) for own in freedom[known].tolist()]
+    sigmas[known] = widened * alone[known] * np.linalg.norm(root, axis=1)
+    return (followed @ root) @ (followed @ root).T, sigmas

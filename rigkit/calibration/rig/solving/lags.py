@@ -42,6 +42,9 @@ CHANCE = 0.01
 """Significance level: the part of triggered rigs that get lags by mistake, which are then consistent with zero."""
 MAX_ROUNDS, SETTLED = 8, 0.01
 """Trajectories and times of images are recomputed until the cost changes by less than this part."""
+MAX_READOUT_ROUNDS, SETTLED_SIGMAS, MAX_RELAXATION = 16, 0.1, 10.0
+"""A step of readouts holds the rig, which follows and leaves a part of the error: steps are lengthened by Aitken's
+relaxation (U. Kuettler, W. A. Wall, Comput. Mech. 43, 2008) until they are this small a part of their sigmas."""
 FIRST_SPREAD, MIN_SPREAD, SPREAD_ROUNDS = 0.1, 1e-4, 50
 """Standard deviation of the lags of a camera's images, in the time between frames: the initial value, the least one
 that is distinguishable from zero, and the number of iterations."""
@@ -131,15 +134,19 @@ def _with_readouts(
     size = np.abs(step) / np.where(sigma > 0.0, sigma, np.inf)
     if 2.0 * float(stdtr(np.maximum(freedom, 1.0), -size).min()) * len(step) > CHANCE:
         return observations, lagging
-    for _ in range(MAX_ROUNDS):
-        state, before = lagging.state, lagging.normal.cost
+    relaxation = 1.0
+    for _ in range(MAX_READOUT_ROUNDS):
+        state, now = lagging.state, relaxation * step
         assert state.exposures is not None
-        observations = with_longer_readouts(observations, state, step)
-        exposures = replace(state.exposures, readouts=state.exposures.readouts + step)
+        observations = with_longer_readouts(observations, state, now)
+        exposures = replace(state.exposures, readouts=state.exposures.readouts + now)
         lagging = replace(lagging, state=replace(state, exposures=exposures))
         lagging = _solved_again(observations, lagging, sigma_px, times, own_times=True)
-        step = readout_steps(observations, lagging.state)[0]
-        if abs(before - lagging.normal.cost) < SETTLED * before:
+        before, (step, sigma, _) = step, readout_steps(observations, lagging.state)
+        change = before - step
+        relaxation *= float(before @ change) / max(float(change @ change), np.finfo(float).tiny)
+        relaxation = min(max(relaxation, 1.0), MAX_RELAXATION)
+        if (np.abs(relaxation * step) <= SETTLED_SIGMAS * sigma).all():
             break
     return observations, lagging
 

@@ -18,7 +18,7 @@ from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.lags import Timing, cost_of_own_times, times_of
-from rigkit.calibration.rig.solving.shutters import with_longer_readouts
+from rigkit.calibration.rig.solving.shutters import readout_steps, with_longer_readouts
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
@@ -143,8 +143,8 @@ def test_without_heldout_errors_the_rig_is_solved_once(monkeypatch: pytest.Monke
     assert solved == ["lags"]
 
 
-def test_heldout_frames_do_not_choose_their_readouts() -> None:
-    """Readouts of each fold are those of the other frames: one that a single frame asks for predicts it badly."""
+def joint_with_readouts(seed: int) -> JointRig:
+    """Return the solution of boards in hand whose images are read row by row."""
     joints = list[JointRig]()
 
     def kept(joint: JointRig, folds: int) -> tuple[None, tuple[None, None]]:
@@ -153,8 +153,20 @@ def test_heldout_frames_do_not_choose_their_readouts() -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("rigkit.calibration.rig.calibrate.heldout_rms", kept)
-        rig_of(0.05, 0, readout=0.05, time=lambda k: 0.5 * k)
-    joint = joints[0]
+        rig_of(0.05, seed, readout=0.05, time=lambda k: 0.5 * k)
+    return joints[0]
+
+
+def test_readouts_are_solved_for_until_they_settle() -> None:
+    """A step holds the rig, which has followed the error of the readouts: most of it is left."""
+    joint = joint_with_readouts(0)
+    step, sigma, _ = readout_steps(joint.observations, joint.solution.state)
+    assert (np.abs(step) <= 0.1 * sigma).all()
+
+
+def test_heldout_frames_do_not_choose_their_readouts() -> None:
+    """Readouts of each fold are those of the other frames: one that a single frame asks for predicts it badly."""
+    joint = joint_with_readouts(0)
     assert joint.timing == "readouts"
     found, _ = heldout_rms(joint, 5)
     state = joint.solution.state
