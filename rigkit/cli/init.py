@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cameras",
         **repeatable,
-        metavar="PAIRS=ONE,TWO",
-        help="cameras of the two images of pairs whose names match, such as 'fisheye-*=f,f' (repeatable)",
+        metavar="PAIRS=ONE,TWO|N",
+        help="cameras of the two images of pairs whose names match, such as 'fisheye-*=f,f' (repeatable); with "
+        "--session, the number of cameras whose images the folder holds",
     )
     parser.add_argument(
         "--pose-type",
@@ -72,15 +74,31 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _session(args: argparse.Namespace) -> int:
-    from rigkit.io.disk.writing import write_together
-    from rigkit.workflows.inputs.folder_session import session_of_folders
+    from rigkit.cli.console import progress_on_stderr
+    from rigkit.io.disk.writing import ensure_writable, write_together
+    from rigkit.workflows.calibration.calibrate_any import FolderOptions, new_session
 
-    of_manifests = ("calibration", "cameras", "pose_type", "baseline_mm", "angle_deg")
-    if args.square_mm is not None or any(getattr(args, name) for name in of_manifests):
-        raise InputError("init --session: only --board and --model apply; leave the other options out")
+    of_manifests = ("calibration", "pose_type", "baseline_mm", "angle_deg")
+    if any(getattr(args, name) for name in of_manifests):
+        raise InputError(
+            "init --session: only --board, --square-mm, --cameras and --model apply; leave the other options out"
+        )
     path = args.output or args.folder / "session.toml"
-    made = session_of_folders([args.folder], args.board, path, model=args.model or "auto")
+    ensure_writable([path], force=args.force)
+    options = FolderOptions(
+        boards=tuple(args.board), square_mm=args.square_mm, model=args.model, cameras=_number_of_cameras(args.cameras)
+    )
+    made = new_session(args.folder, options, path, progress=progress_on_stderr())
     write_together(dict(made.files), force=args.force)
     for written in made.files:
         print(written)
     return ExitCode.WELL
+
+
+def _number_of_cameras(given: Sequence[str]) -> int | None:
+    """Return N of `--cameras N`; None without the option."""
+    if not given:
+        return None
+    if len(given) > 1 or not given[0].isdecimal() or int(given[0]) < 1:
+        raise InputError(f"init --session: --cameras {' '.join(given)}: give the number of cameras, such as 2")
+    return int(given[0])

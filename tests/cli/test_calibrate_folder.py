@@ -378,3 +378,16 @@ def test_a_missing_folder_is_named(
 ) -> None:
     assert main(["calibrate", str(tmp_path / "photos"), *options]) == 2
     assert f"'{tmp_path / 'photos'}' does not exist" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [(), ("--board", "9x6x30"), ("--square-mm", "25"), ("--cameras", "1")])
+def test_images_instead_of_their_folder(
+    options: tuple[str, ...], pictures: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a shell expands photos/*.jpg."""
+    images = [str(path) for path in sorted(pictures.glob("left*.jpg"))]
+    for given in (images[:1], images):
+        assert main(["calibrate", *given, *options]) == 2
+        assert capsys.readouterr().err.endswith(
+            f"'{images[0]}' is an image; give the folder that holds it instead, '{pictures}'\n"
+        )

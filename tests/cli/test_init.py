@@ -17,6 +17,7 @@ from rigkit.io.calibrations.calibration_file import load_calibration_or_camera
 from rigkit.io.manifests.manifest import load_dataset
 from rigkit.io.manifests.manifest_writer import ImageBoards, group_pairs
 from rigkit.io.manifests.rig_session import load_rig_session
+from rigkit.io.manifests.session import load_session
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "images"
 CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
@@ -199,6 +200,24 @@ def test_a_session_of_two_cameras_is_written_and_loads(tmp_path: Path, capsys: p
     assert session.cameras["left"].boards[0].square_x_mm == 50.0
     assert main(command) == 2
     assert main([*command, "--square-mm", "50", "--force"]) == 2
+    assert main([*command, "--pose-type", "general", "--force"]) == 2
+    assert "only --board, --square-mm, --cameras and --model apply" in capsys.readouterr().err
+
+
+def test_a_session_of_as_many_cameras_as_are_known(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for k in range(3):
+        (tmp_path / f"{k}").mkdir()
+        for view, name in (("view1", "A"), ("view2", "B")):
+            shutil.copy(IMAGES / "regular-general" / f"{view}.jpg", tmp_path / f"{k}" / f"{name}.jpg")
+    command = ["init", str(tmp_path), "--session", "--board", "8x6x50", "--cameras"]
+    assert main([*command, "2"]) == 0
+    session = load_rig_session(tmp_path / "session.toml")
+    assert [len(own.images) for own in session.cameras.values()] == [3, 3]
+    for number, words in (("3", "not of 3 cameras"), ("0", "give the number"), ("f-*=a,b", "give the number")):
+        assert main([*command, number, "--force"]) == 2
+        assert words in capsys.readouterr().err
+    assert main(["init", str(tmp_path), "--session", "--square-mm", "50", "--cameras", "1", "--force"]) == 0
+    assert len(load_session(tmp_path / "session.toml").images) == 6
 
 
 @pytest.mark.parametrize("declared", ["90", "first=90+-x", "190+-1", "90+-0"])

@@ -8,6 +8,7 @@ import pytest
 
 from rigkit.core.errors import InputError
 from rigkit.workflows.inputs.folder_session import cameras_in
+from rigkit.workflows.inputs.layouts import layouts_of
 from rigkit.workflows.moments import moments_of
 
 NAMES = ("left", "right")
@@ -132,6 +133,16 @@ def test_layouts_of_well_known_datasets(first: str, second: str, cameras: list[s
     found = cameras_in([tmp_path])
     assert list(found) == cameras
     assert [sorted(p for folder, one in found[name] for p in folder.glob(one)) for name in cameras] == own
+
+
+@pytest.mark.parametrize(("digits", "either"), [(6, [3, 4]), (10, [4])])
+def test_fewer_moments_than_cameras(digits: int, either: list[int], tmp_path: Path) -> None:
+    """KITTI's folders with three images each: the boards, or a number, tell that they are cameras. What has more
+    moments is asked first; names of ten digits are times."""
+    for camera in range(4):
+        _images(tmp_path / f"image_{camera:02d}" / "data", *(f"{k:0{digits}d}" for k in range(3)))
+    assert [len(layout.cameras) for layout in layouts_of(sorted(tmp_path.rglob("*.png")))] == either
+    assert list(cameras_in([tmp_path], 4)) == [f"image_{k:02d}" for k in range(4)]
 
 
 def test_as_many_cameras_as_are_known(tmp_path: Path) -> None:

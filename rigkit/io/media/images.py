@@ -185,6 +185,14 @@ def folder_of_images(folder: Path) -> Path:
     return below[0]
 
 
+def require_folder(folder: Path) -> None:
+    """Raise InputError for what is not a folder, such as an image."""
+    if is_image(folder) and folder.is_file():
+        raise InputError(f"'{folder}' is an image; give the folder that holds it instead, '{folder.parent}'")
+    if not folder.is_dir():
+        raise InputError(f"'{folder}' is not a folder; give folders of images, or one session file")
+
+
 def no_images(folder: Path) -> str:
     """Return the message that a folder has no images, with the unsupported images or subfolders that it has instead."""
     words = f"folder '{folder}' has no images ({' '.join(IMAGE_ENDINGS)})"

@@ -12,6 +12,7 @@ from pathlib import Path
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.progress import Progress, silent
 from rigkit.io.boards.board_words import board_of_words
+from rigkit.io.corners.corner_cache import FoundCorners
 from rigkit.io.disk.reading import about, read_bytes, read_text, usable_path
 from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.manifests.rig_session import RigSession, is_rig_session, load_rig_session
@@ -25,7 +26,14 @@ from rigkit.workflows.calibration.calibrate import (
     session_inputs,
 )
 from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration, calibrate_rig_session, results_of_rig
-from rigkit.workflows.inputs.folder_session import ImagesByCamera, boards_seen, cameras_in, session_of_folders
+from rigkit.workflows.inputs.corners import Cache, keep_corners
+from rigkit.workflows.inputs.folder_session import (
+    FolderSession,
+    ImagesByCamera,
+    boards_seen,
+    cameras_in,
+    session_of_folders,
+)
 from rigkit.workflows.inputs.frames import (
     frames_folder,
     frames_of_videos,
@@ -121,27 +129,16 @@ def calibrate_folders(
     boards = _boards(given, folder_options, progress)
     if videos:
         _choose_frames(videos, boards, folder_options.timestamps, progress)
-    cameras: ImagesByCamera | None = None
-    if boards and folder_options.cameras is not None:
-        cameras = cameras_in(places, folder_options.cameras)
-    elif boards:
-        cameras = cameras_seen(places, [board_of_words(words) for words in boards], session, progress)
-    wanted = session_of_folders(
-        places,
-        boards,
-        session,
-        model=folder_options.model or "auto",
-        output=options.output,
-        known=options.known,
-        cameras=cameras,
-    )
+    wanted, cameras, corners = _session(places, boards, session, folder_options, options, progress)
     new = {path: text for path, text in wanted.files.items() if not _has_content(path, text)}
-    results = _results(list(cameras or ()), session, options)
+    results = _results(cameras, session, options)
     ensure_writable([*new, *results], force=options.force, inputs=[*(set(wanted.files) - set(new)), *declared])
     before = {path: read_bytes(path, "session") for path in new if path.exists()}
     write_together(dict(new), force=options.force)
     try:
         with _errors_about(folders, wanted.path):
+            if corners and options.cache is Cache.UPDATE and options.corners is None:
+                _keep_corners(wanted.path, corners)
             return calibrate_session_file(wanted.path, options, progress=progress)
     except BaseException:
         if before:
@@ -150,6 +147,51 @@ def calibrate_folders(
             with suppress(OSError):
                 path.unlink()
         raise
+
+
+def new_session(
+    folder: Path, folder_options: FolderOptions, path: Path, *, progress: Progress = silent
+) -> FolderSession:
+    """Return the session, to be written to `path`, with which `calibrate_folders` calibrates a folder of images.
+
+    Raises as `calibrate_folders` for boards and cameras.
+    """
+    boards = _boards([folder], folder_options, progress)
+    return _session([folder], boards, path, folder_options, CalibrateOptions(), progress)[0]
+
+
+def _session(
+    places: Sequence[Path],
+    boards: Sequence[str],
+    path: Path,
+    folder_options: FolderOptions,
+    options: CalibrateOptions,
+    progress: Progress,
+) -> tuple[FolderSession, list[str], Mapping[Path, FoundCorners]]:
+    """Return the session of folders, the names of its cameras, and the corners that were found to tell the cameras."""
+    cameras: ImagesByCamera | None = None
+    corners: Mapping[Path, FoundCorners] = {}
+    if boards and folder_options.cameras is not None:
+        cameras = cameras_in(places, folder_options.cameras)
+    elif boards:
+        cameras, corners = cameras_seen(places, [board_of_words(words) for words in boards], path, progress)
+    wanted = session_of_folders(
+        places,
+        boards,
+        path,
+        model=folder_options.model or "auto",
+        output=options.output,
+        known=options.known,
+        cameras=cameras,
+    )
+    return wanted, list(cameras or ()), corners
+
+
+def _keep_corners(path: Path, found: Mapping[Path, FoundCorners]) -> None:
+    """Write the corners of images to the caches of a session's cameras."""
+    listed = load_rig_session(path) if is_rig_session(path) else load_session(path)
+    for own in listed.cameras.values() if isinstance(listed, RigSession) else [listed]:
+        keep_corners(own, found)
 
 
 def _boards(places: Sequence[Path], declared: FolderOptions, progress: Progress) -> tuple[str, ...]:

@@ -171,13 +171,28 @@ def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Pr
         through = {} if camera is None else look(usable, camera, lens)
     if cache is Cache.UPDATE:
         kept.keep(first)
-        try:
-            kept.save()
-        except InputError as error:
-            _log.info(f"{error}; the corners are used, but not kept")
+        _save(kept)
     old = len(first) - len([name for name in fresh if name in first])
     source = f"found in {len(first) - old} images" + (f", kept in {session.corners_path.name} of {old}" if old else "")
     return SessionCorners(found=first | through, unreadable=unreadable, source=source)
+
+
+def keep_corners(session: Session, found: Mapping[Path, FoundCorners]) -> None:
+    """Write corners that `found_in` found in images of a session to its cache, where that has none of them."""
+    kept = CornerCache(session.corners_path, session.boards)
+    known = {path.resolve(): corners for path, corners in found.items()}
+    for name, path in named_images(session).items():
+        corners = known.get(path.resolve())
+        if corners is not None and kept.get(name, digest := image_hash(path)) is None:
+            kept.put(name, digest, corners)
+    _save(kept)
+
+
+def _save(kept: CornerCache) -> None:
+    try:
+        kept.save()
+    except InputError as error:
+        _log.info(f"{error}; the corners are used, but not kept")
 
 
 def _hash(path: Path) -> str:

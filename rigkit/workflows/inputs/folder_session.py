@@ -18,7 +18,14 @@ from rigkit.io.boards.board_words import WORDS_HELP, board_in_words, board_of_wo
 from rigkit.io.disk.toml_reader import relative_path, toml_text
 from rigkit.io.manifests.rig_session import NAME_PART
 from rigkit.io.manifests.session import SESSION_NAME, SESSION_SCHEMA
-from rigkit.io.media.images import folder_of_images, images_below, images_of_folder, no_images, warn_of_unread_formats
+from rigkit.io.media.images import (
+    folder_of_images,
+    images_below,
+    images_of_folder,
+    no_images,
+    require_folder,
+    warn_of_unread_formats,
+)
 from rigkit.io.media.video import is_video
 from rigkit.workflows.inputs.identify_board import Suggestion, suggestion
 from rigkit.workflows.inputs.layouts import CameraLayout, layouts_of
@@ -250,6 +257,7 @@ def _patterns(images: Sequence[Path], chosen: Collection[Path]) -> list[str]:
 
 def _all_below(folder: Path) -> list[tuple[Path, str]]:
     """Return all images of a folder and below it."""
+    require_folder(folder)
     places = dict.fromkeys(image.parent for image in images_below(folder))
     if not places:
         raise InputError(no_images(folder))
@@ -303,8 +311,7 @@ def _of_cameras(named: Mapping[str, Path]) -> bool:
 
 
 def _images(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        raise InputError(f"'{folder}' is not a folder; give folders of images, or one session file")
+    require_folder(folder)
     return images_of_folder(folder)
 
 

@@ -59,21 +59,23 @@ def cameras_by_name(folders: Sequence[Path], count: int | None = None) -> dict[s
 
 def cameras_seen(
     folders: Sequence[Path], boards: Sequence[Board], path: Path, progress: Progress
-) -> dict[str, list[tuple[Path, str]]]:
-    """Return the images of every camera as `cameras_in` does; where the structure of names allows several cameras, but
-    no known words say so, boards decide. Raises InputError as `cameras_in`; `path` is that of the session to come."""
+) -> tuple[dict[str, list[tuple[Path, str]]], dict[Path, FoundCorners]]:
+    """Return the images of every camera as `cameras_in` does, and the corners found to decide; where the structure of
+    names allows several cameras, but no known words say so, boards decide. Raises InputError as `cameras_in`; `path` is
+    that of the session to come."""
+    corners: dict[Path, FoundCorners] = {}
     try:
         found, doubt = cameras_in(folders), None
     except InputError as error:
         found, doubt = {}, error
     if len(folders) > 1 or len(found) > 1:
-        return found if doubt is None else cameras_in(folders)
+        return (found if doubt is None else cameras_in(folders)), corners
     images = images_below(folders[0])
     layouts = layouts_of(images)
     for layout in layouts:
-        if on_one_mount(layout, boards, path, progress):
+        if on_one_mount(layout, boards, path, corners, progress):
             _log.info(f"by names and boards the images are of {layout}; --cameras 1 takes them as one camera's")
-            return images_of_layout(layout)
+            return images_of_layout(layout), corners
     named = " or ".join(f"{layout} (--cameras {len(layout.cameras)})" for layout in layouts)
     if doubt is not None and not images:
         raise doubt
@@ -82,12 +84,14 @@ def cameras_seen(
         raise InputError(f"{doubt}; if all are of one camera: --cameras 1{shown}") from doubt
     if layouts:
         _log.info(f"the images may be of {named} by their names; by the boards they are one camera's")
-    return found
+    return found, corners
 
 
-def on_one_mount(layout: CameraLayout, boards: Sequence[Board], path: Path, progress: Progress) -> bool | None:
+def on_one_mount(
+    layout: CameraLayout, boards: Sequence[Board], path: Path, corners: dict[Path, FoundCorners], progress: Progress
+) -> bool | None:
     """Return whether the images of a layout are of cameras on one mount, by up to MAX_MOMENTS moments; None where
-    boards do not tell. `path` is that of the session to come."""
+    boards do not tell. `path` is that of the session to come; the corners of the images are added to `corners`."""
     at = np.unique(np.linspace(0, len(layout.shared) - 1, MAX_MOMENTS).round().astype(np.int64))
     moments = [layout.shared[k] for k in at]
     seen, single = list[FrameObservations](), list[Calibration]()
@@ -102,7 +106,8 @@ def on_one_mount(layout: CameraLayout, boards: Sequence[Board], path: Path, prog
             board_shape="flat",
             camera=name,
         )
-        found = _corners(session, progress)
+        _look(session, corners, progress)
+        found = {name: corners[image] for name, image in named_images(session).items() if image in corners}
         calibration = first_calibration(session, found)
         if calibration is None:
             return None
@@ -113,8 +118,8 @@ def on_one_mount(layout: CameraLayout, boards: Sequence[Board], path: Path, prog
     return _move_alike(RigViews(list(layout.cameras), seen, tuple(single), {}))
 
 
-def _corners(session: Session, progress: Progress) -> dict[str, FoundCorners]:
-    """Return the corners of the images that can be read."""
+def _look(session: Session, corners: dict[Path, FoundCorners], progress: Progress) -> None:
+    """Add the corners of those images of a session to `corners` that can be read and are not there."""
 
     def corners_of(image: Path) -> FoundCorners | None:
         try:
@@ -122,12 +127,11 @@ def _corners(session: Session, progress: Progress) -> dict[str, FoundCorners]:
         except InputError:
             return None
 
-    images, found = named_images(session), {}
-    for k, (name, corners) in enumerate(zip(images, in_threads(corners_of, images.values()), strict=True), start=1):
+    images = [image for image in session.images if image not in corners]
+    for k, (image, found) in enumerate(zip(images, in_threads(corners_of, images), strict=True), start=1):
         progress(f"first corners of {session.camera}", k, len(images))
-        if corners is not None:
-            found[name] = corners
-    return found
+        if found is not None:
+            corners[image] = found
 
 
 def _move_alike(views: RigViews) -> bool | None:

@@ -42,10 +42,10 @@ class CameraLayout:
 
 
 def layouts_of(images: Sequence[Path]) -> list[CameraLayout]:
-    """Return the ways in which `images` may be those of several cameras, of at most MAX_CAMERAS, and no more than they
-    have moments in common."""
+    """Return the ways in which `images` may be those of several cameras, of at most MAX_CAMERAS, fewest cameras first:
+    moments may be taken for cameras where boards only move sideways, and there are more of them."""
     layouts = (_layout(images, names) for names in _names(images))
-    return [layout for layout in layouts if layout is not None]
+    return sorted((one for one in layouts if one is not None), key=lambda one: len(one.cameras))
 
 
 def _names(images: Sequence[Path]) -> Iterator[list[str]]:
@@ -75,4 +75,4 @@ def _layout(images: Sequence[Path], names: Sequence[str]) -> CameraLayout | None
     moments = {camera: {frames[camera][str(i)]: i for i in own} for camera, own in columns.items()}
     shared = sorted(set.intersection(*map(set, moments.values())), key=natural_key)
     enough = len(cameras) * len(shared) >= MIN_SHARE * len(images)
-    return CameraLayout(moments, tuple(shared)) if len(shared) >= max(MIN_MOMENTS, len(cameras)) and enough else None
+    return CameraLayout(moments, tuple(shared)) if len(shared) >= MIN_MOMENTS and enough else None

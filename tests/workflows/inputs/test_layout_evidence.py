@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from helpers.stereo_pictures import FRAMES
 
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.core.progress import silent
+from rigkit.detection.detect import detect_boards
 from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.manifests.rig_session import frames_of_images, load_rig_session
-from rigkit.io.media.images import read_image
+from rigkit.io.media.images import Image, read_image
 from rigkit.workflows.calibration.calibrate_any import calibrate_sources
 from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration
-from rigkit.workflows.inputs.corners import named_images
+from rigkit.workflows.inputs.corners import Cache, named_images
 from rigkit.workflows.inputs.folder_session import session_of_folders
 from rigkit.workflows.inputs.layout_evidence import cameras_seen
 from rigkit.workflows.options.cameras import CalibrateOptions, FolderOptions
@@ -47,7 +52,7 @@ def arranged(pictures: Path, folder: Path, form: str, sides: tuple[str, str]) ->
 )
 def test_boards_that_move_alike_make_a_rig(pictures: Path, tmp_path: Path, form: str, sides: tuple[str, str]) -> None:
     folder = arranged(pictures, tmp_path / "photos", form, sides)
-    cameras = cameras_seen([folder], [BOARD], folder / "session.toml", silent)
+    cameras, _ = cameras_seen([folder], [BOARD], folder / "session.toml", silent)
     for path, text in session_of_folders([folder], ["9x6x30"], folder / "session.toml", cameras=cameras).files.items():
         path.write_text(text)
     session = load_rig_session(folder / "session.toml")
@@ -58,11 +63,22 @@ def test_boards_that_move_alike_make_a_rig(pictures: Path, tmp_path: Path, form:
     assert one == other and len(set(one)) == FRAMES
 
 
-def test_the_command_calibrates_a_folder_for_each_moment(pictures: Path, tmp_path: Path) -> None:
+def test_the_command_calibrates_a_folder_for_each_moment(
+    pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The corners that tell the cameras are kept: no image is searched twice without a lens."""
+    searched = []
+
+    def counted(image: Image, boards: Sequence[Board], **known: Any) -> tuple[BoardDetection, ...]:
+        searched.append(known["camera"] is None)
+        return detect_boards(image, boards, **known)
+
+    monkeypatch.setattr("rigkit.workflows.inputs.corners.detect_boards", counted)
     folder = arranged(pictures, tmp_path / "photos", "frame_{k:04d}/{side}.jpg", ("1", "2"))
     options = FolderOptions(boards=("9x6x30",), model="brown")
-    done = calibrate_sources([folder], options, CalibrateOptions())
+    done = calibrate_sources([folder], options, CalibrateOptions(cache=Cache.UPDATE))
     assert isinstance(done, RigSessionCalibration)
+    assert sum(searched) == 2 * FRAMES
     assert done.rig.baseline_mm("1", "2")[0] == pytest.approx(90.0, abs=0.5)
     with pytest.raises(InputError, match="not of 3 cameras"):
         calibrate_sources([folder], replace(options, cameras=3), CalibrateOptions(force=True))
@@ -77,7 +93,7 @@ def test_boards_of_one_camera_do_not(pictures: Path, tmp_path: Path, form: str) 
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(path, target)
     if form == "{side}_{k}.jpg":
-        assert list(cameras_seen([folder], [BOARD], folder / "session.toml", silent)) == [""]
+        assert list(cameras_seen([folder], [BOARD], folder / "session.toml", silent)[0]) == [""]
         return
     with pytest.raises(InputError, match=r"--cameras 1; .* 2 cameras .*\(--cameras 2\), but boards do not move alike"):
         cameras_seen([folder], [BOARD], folder / "session.toml", silent)
@@ -89,4 +105,4 @@ def test_an_image_and_its_copy_are_of_one_camera(pictures: Path, tmp_path: Path,
         shutil.copy(path, tmp_path / f"{k}a.jpg")
         image = read_image(path)
         cv2.imwrite(str(tmp_path / f"{k}b.jpg"), np.ascontiguousarray(image[::-1, ::-1]) if turned else image)
-    assert list(cameras_seen([tmp_path], [BOARD], tmp_path / "session.toml", silent)) == [""]
+    assert list(cameras_seen([tmp_path], [BOARD], tmp_path / "session.toml", silent)[0]) == [""]
