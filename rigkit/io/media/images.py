@@ -205,8 +205,7 @@ def no_images(folder: Path) -> str:
     if not inside:
         return f"{words}; give another"
     first, others = inside[0].parent, len({path.parent for path in inside}) - 1
-    every = f'images = "{folder}/**/*{inside[0].suffix}"'
-    return f"{words}, but '{first}' and {others} more below it have; give one folder a camera, or a session: {every}"
+    return f"the images of '{folder}' are in '{first}' and {others} more below it; give one folder a camera"
 
 
 def warn_of_unread_formats(folder: Path) -> None:

@@ -219,8 +219,7 @@ def test_a_folder_without_images_says_what_it_holds_instead(tmp_path: Path) -> N
         if day == "monday":
             assert folder_of_images(tmp_path) == tmp_path / "monday"
     words = no_images(tmp_path)
-    assert f"but '{tmp_path / 'monday'}' and 1 more below it have" in words
-    assert f'images = "{tmp_path}/**/*.PNG"' in words
+    assert words.endswith(f"are in '{tmp_path / 'monday'}' and 1 more below it; give one folder a camera")
     (tmp_path / "a.jp2").touch()
     assert "formats that are not read, 'a.jp2' the first" in no_images(tmp_path)
     (tmp_path / "tuesday" / "a.PNG").unlink()
