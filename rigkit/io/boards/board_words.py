@@ -26,7 +26,7 @@ WORDS_HELP = "9x6x25 (inner corners along and across, mm a square), aprilgrid:6x
 
 
 def board_in_words(words: str) -> Board | None:
-    """Return the board described by `words`, named after them; None if they are a file name.
+    """Return the board described by `words`, named after type, size and first mark; None if they are a file name.
 
     The form is TYPE:COLUMNSxROWSxMM,KEY=VALUE,... with the types and keys of board files. Without TYPE it is a
     chessboard, which may also be written "9x6, 30 mm".
@@ -47,9 +47,9 @@ def board_in_words(words: str) -> Board | None:
     for pair in filter(None, match["keys"].split(",")):
         name, _, value = pair.partition("=")
         values[name] = _value(words, name, value, known.get(name, str))
-    name = "-".join(
-        filter(None, (match["type"] or "board", f"{match['columns']}x{match['rows']}x{float(match['mm']):g}"))
-    )
+    first = values.get("first_tag") or values.get("first_marker")
+    size = f"{match['columns']}x{match['rows']}x{float(match['mm']):g}"
+    name = "-".join([match["type"] or "board", size, *([f"first{first}"] if first else [])])
     return measured_board(TomlTable(values, DECLARED_BOARD, Path(f"board '{words}'")), name)
 
 

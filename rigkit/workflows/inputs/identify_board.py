@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import CheckFailed, DegenerateError, InputError
+from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.printing import brief, counted
 from rigkit.core.progress import Progress, silent
@@ -254,9 +255,16 @@ def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion
         return Suggestion(doubt=_doubtful(pictures))
     if not guess.determined:
         return Suggestion(part=_partial_board_words(guess))
-    # Other chessboards may be background.
-    boards = [guess.board, *(board for board in guess.beside if board.identified)]
+    # Other chessboards may be background. A tag is on one board of a rig: a board with the same is of other images.
+    boards = [guess.board]
+    boards += [board for board in guess.beside if board.identified and not any(_share_tags(board, b) for b in boards)]
     return Suggestion(" --board ".join(map(words_of_board, boards)))
+
+
+def _share_tags(one: Board, other: Board) -> bool:
+    """Return whether two AprilGrids have tags of the same numbers."""
+    numbers = [set(p.numbers(*b.size).flat) for b in (one, other) if isinstance(p := b.pattern, AprilGrid)]
+    return len(numbers) == 2 and not numbers[0].isdisjoint(numbers[1])
 
 
 def _partial_board_words(guess: BoardGuess) -> str:

@@ -15,7 +15,10 @@ from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.unknown import BoardGuess
+from rigkit.io.boards.board_words import with_length
+from rigkit.io.manifests.session import load_session
 from rigkit.workflows.inputs import identify_board
+from rigkit.workflows.inputs.folder_session import session_of_folders
 
 BLUR_PX, NOISE_LEVELS = 4.0, 10.0
 """Together too much for a board of unknown size, in an image of 320 px."""
@@ -168,3 +171,21 @@ def test_every_second_image_shows_the_board(monkeypatch: pytest.MonkeyPatch, tmp
     )
     assert identify_board.suggestion(paths).words == "9x6xMM"
     assert identify_board.suggestion(paths[::2]).words is None
+
+
+def test_boards_of_one_session_have_no_tag_in_common(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A second grid of tags is on the rig, or in pictures of something else: then it has tags of the first."""
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((40, 40), np.uint8))
+    first, longer, second = (
+        Board("board", *size, 1.0, 1.0, pattern=AprilGrid(0.3, first_tag=tag))
+        for size, tag in (((12, 12), 0), ((22, 12), 0), ((12, 12), 36))
+    )
+    seen = BoardGuess(board=first, images=(0,), beside=(longer, second))
+    monkeypatch.setattr(identify_board, "guess_board", lambda *_: seen)
+    words = identify_board.suggestion([tmp_path / "0.png"]).words
+    assert words == "aprilgrid:6x6xMM,spacing=0.3 --board aprilgrid:6x6xMM,spacing=0.3,first_tag=36"
+    declared = with_length(words, 88.0).split(" --board ")
+    made = session_of_folders([tmp_path], declared, tmp_path / "session.toml")
+    for path, text in made.files.items():
+        path.write_text(text)
+    assert [board.pattern for board in load_session(made.path).boards] == [first.pattern, second.pattern]
