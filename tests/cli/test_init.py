@@ -7,6 +7,8 @@ import shutil
 from itertools import combinations
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from helpers.data import REPOSITORY
 
@@ -18,6 +20,7 @@ from rigkit.io.manifests.manifest import load_dataset
 from rigkit.io.manifests.manifest_writer import ImageBoards, group_pairs
 from rigkit.io.manifests.rig_session import load_rig_session
 from rigkit.io.manifests.session import load_session
+from rigkit.io.media.images import read_image
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "images"
 CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
@@ -130,6 +133,16 @@ def test_a_baseline_of_no_pair(tmp_path: Path, capsys: pytest.CaptureFixture[str
     options = ["--square-mm", "50", "--baseline-mm", "120+-1"]
     assert main(["init", str(tmp_path), "--calibration", "c.json", "--pose-type", "general", *options]) == 2
     assert "'120+-1' names no pair: write PAIR=MM+-SIGMA, such as first=120+-1" in capsys.readouterr().err
+
+
+def test_a_calibration_of_another_image_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for view in (1, 2):
+        image = read_image(IMAGES / "regular-general" / f"view{view}.jpg")
+        cv2.imwrite(str(tmp_path / f"view{view}.png"), np.ascontiguousarray(image[8:]))
+    options = ["--square-mm", "50", "--calibration", str(CALIBRATION), "--pose-type", "general"]
+    assert main(["init", str(tmp_path), *options]) == 2
+    assert f"view1.png' is 1624x1232 px, but '{CALIBRATION}' is of a camera of 1624x1240" in capsys.readouterr().err
+    assert not (tmp_path / "dataset.toml").exists()
 
 
 def test_several_cameras_and_pose_types(

@@ -185,6 +185,13 @@ def folder_of_images(folder: Path) -> Path:
     return below[0]
 
 
+def further_images(folder: Path) -> Path | None:
+    """Return the first folder with images below a folder that has images itself; None without one."""
+    if not folder.is_dir() or not images_of_folder(folder):
+        return None
+    return next((image.parent for image in images_below(folder) if image.parent != folder), None)
+
+
 def require_folder(folder: Path) -> None:
     """Raise InputError for what is not a folder, such as an image."""
     if is_image(folder) and folder.is_file():

@@ -13,6 +13,7 @@ from rigkit.core.identifiers import MAX_IDENTIFIER
 from rigkit.core.printing import counted
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
+from rigkit.io.calibrations.calibration_file import load_camera
 from rigkit.io.disk.writing import write_atomic
 from rigkit.io.manifests.manifest import load_dataset
 from rigkit.io.manifests.manifest_writer import (
@@ -23,7 +24,7 @@ from rigkit.io.manifests.manifest_writer import (
     group_pairs,
     manifest_text,
 )
-from rigkit.io.media.images import read_image, to_grey
+from rigkit.io.media.images import read_image, require_size, to_grey
 from rigkit.workflows.inputs.identify_board import suggestion
 
 
@@ -65,8 +66,14 @@ def find_pairs(
 def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> InputError | None:
     """Write the manifest; return the error of loading it if it is incomplete, else None.
 
-    Raises InputError if the file exists, unless `force`, or cannot be written.
+    Raises InputError if the file exists, unless `force`, or cannot be written, and for images of another size than the
+    calibration of their camera.
     """
+    for pair in new.pairs:
+        for image, name in zip((pair.first, pair.second), new.cameras[pair.name], strict=True):
+            calibration = path.parent / new.calibrations[name]
+            if calibration.is_file():
+                require_size(image.size_px, f"image '{image.image}'", load_camera(calibration).size_px, calibration)
     write_atomic(path, manifest_text(new, path.parent.resolve()), force=force)
     try:
         load_dataset(path)

@@ -20,6 +20,7 @@ from rigkit.io.manifests.rig_session import NAME_PART
 from rigkit.io.manifests.session import SESSION_NAME, SESSION_SCHEMA
 from rigkit.io.media.images import (
     folder_of_images,
+    further_images,
     images_below,
     images_of_folder,
     no_images,
@@ -93,9 +94,9 @@ def session_of_folders(
     files: dict[Path, str] = {}
     names = [_board_file(words, place, files) for words in boards]
     named = "" if output is None else f" -o {output.name}"
-    shown = " ".join([*map(str, folders), *(f"--board {words}" for words in boards)])
+    shown = " ".join(["rigkit calibrate", *map(str, folders), *(f"--board {words}" for words in boards)])
     lines = [
-        "# " + " ".join(f"Written by rigkit calibrate {shown}".split()),
+        "# " + " ".join(f"Written by {shown}".split()),
         f"# Calibrate again with: rigkit calibrate {path.name}{named} --force",
         f'schema = "{SESSION_SCHEMA}"',
         "",
@@ -122,8 +123,8 @@ def _cameras_in_words(cameras: ImagesByCamera, place: Path, known: Known) -> lis
         "",
     ]
     if known.rig is not None:
-        rig = toml_text(relative_path(known.rig, place))
-        lines += ["# Its cameras stay as they are, lens and mount.", f"rig = {rig}", ""]
+        rig = f"rig = {toml_text(relative_path(known.rig, place))}"
+        lines += ["# Its cameras stay as they are, lens and mount.", rig, ""]
     lenses = known.of_cameras(list(cameras))
     for name, patterns in cameras.items():
         lines += ["[[cameras]]", f"id = {toml_text(name)}", f"images = {_patterns_toml(patterns, place)}"]
@@ -168,12 +169,15 @@ def boards_seen(places: Sequence[Path], side_mm: float, progress: Progress = sil
     """
     shown = _board_suggestion(places, progress)
     if shown.words is None:
-        if shown.fault is not None:
-            raise InputError(f"calibrate: {shown.fault}")
-        if shown.part is not None:
-            raise InputError(f"calibrate: the images show {shown.part}, and give it as --board {WORDS_HELP}")
+        part = shown.part and f"the images show {shown.part}, and give it as --board {WORDS_HELP}"
+        if shown.fault or part:
+            raise InputError(f"calibrate: {shown.fault or part}")
         doubt = f" ({shown.doubt})" if shown.doubt is not None else ""
-        raise InputError(f"calibrate: no board is seen in the images{doubt}; give it, such as --board {WORDS_HELP}")
+        below = next(filter(None, map(further_images, places)), None)
+        other = f", but '{below}' below has others: give it instead if they show one" if below else ""
+        raise InputError(
+            f"calibrate: no board is seen in the images{doubt}{other}; if one is, give it, such as --board {WORDS_HELP}"
+        )
     return tuple(with_length(words, side_mm) for words in shown.words.split(" --board "))
 
 
@@ -192,11 +196,9 @@ def _missing_board_message(folders: Sequence[Path]) -> str:
     shown = _board_suggestion(folders)
     if shown.fault is not None:
         return f"calibrate: {shown.fault}"
-    if shown.words is None:
-        such = f"give the board, such as --board {WORDS_HELP}, or --board board.toml"
-    else:
-        board = f"--board {shown.words}"
-        such = f"they show {board}: measure the squares, and say that with the mm of one for MM, or as --square-mm"
+    such = f"give the board, such as --board {WORDS_HELP}, or --board board.toml"
+    if shown.words is not None:
+        such = f"they show --board {shown.words}: measure a square, and give that with its mm for MM, or --square-mm"
     return f"calibrate: images cannot tell how large squares are; {such}"
 
 

@@ -99,7 +99,12 @@ def test_a_grid_too_blurred_to_be_believed_is_named(tmp_path: Path, capsys: pyte
     assert main(["board", "identify", str(tmp_path)]) == 1
     assert "in '0.png' a 8x6 grid is seen, corners uncertain by" in capsys.readouterr().err
     assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
-    assert "no board is seen in the images (in '0.png' a 8x6 grid is seen" in capsys.readouterr().err
+    words = capsys.readouterr().err
+    assert "no board is seen in the images (in '0.png' a 8x6 grid is seen" in words and "below" not in words
+    (tmp_path / "calib").mkdir()
+    cv2.imwrite(str(tmp_path / "calib" / "1.png"), np.asarray(scene.render(supersample=2)))
+    assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
+    assert f"but '{tmp_path / 'calib'}' below has others: give it instead" in capsys.readouterr().err
 
 
 def test_images_that_do_not_decide_between_two_sizes(
