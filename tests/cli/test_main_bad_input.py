@@ -242,13 +242,18 @@ def test_two_boards_are_reconstructed_and_the_missing_third_is_named(
     lost = min(detect_boards(image), key=lambda d: d.pixels[:, 0].mean())
     hull = cv2.convexHull(lost.pixels.astype(np.float32)).astype(np.int32)
     cv2.imwrite(str(folder / "same2.png"), cv2.fillConvexPoly(image.copy(), hull, 90))
-    write_manifest(folder, pair_toml(scenes["same"], "same", ("regular", "regular")))
-    code = main(["reconstruct", str(folder), "-o", str(folder / "out"), "-j", "1"])
+    pairs = [pair_toml(scenes["same"], "same", (camera, camera)) for camera in ("regular", "fisheye")]
+    (folder / "fisheye.json").write_text("Dear rig,")
+    write_manifest(folder, pairs[0], pairs[1].replace('id = "same"', 'id = "of a letter"'))
+    code = main(["reconstruct", str(folder), "-o", str(folder / "out"), "-j", "1", "--json"])
     printed = capsys.readouterr()
-    assert code == 0
+    assert code == 2
     assert len(list((folder / "out").rglob("*.png"))) == 3
+    reported = json.loads(printed.out)
+    (pair,) = reported["pairs"]
     corners = sum(board.corner_count for board in BOARDS) - len(lost.pixels)
-    assert f"{corners} points, 2 boards" in printed.out
+    assert (pair["pair"], pair["points"], len(pair["boards"])) == ("same", corners, 2)
+    assert list(reported["failed"]) == ["of a letter"] and "fisheye.json" in reported["failed"]["of a letter"]
     assert "seen in image 1 only" in printed.err
 
 

@@ -195,13 +195,16 @@ def test_a_worker_of_the_callers_works_alone(monkeypatch: pytest.MonkeyPatch, jo
     assert list(over_items(lambda k: 2 * k, [1, 2], jobs=2)) == [(0, 2), (1, 4)]
 
 
-def test_a_system_without_these_signals_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Windows has no SIGHUP and no signal masks."""
+@pytest.mark.parametrize("works", [[], [1, 2]], ids=["no work", "work"])
+def test_a_system_without_these_signals_works(
+    works: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows has no SIGHUP and no signal masks. The first work starts a process, which imports everything anew."""
     monkeypatch.delattr(signal, "SIGHUP")
     monkeypatch.delattr(signal, "pthread_sigmask")
     assert main(["board", "5x4", "--square-mm", "30", "-o", str(tmp_path / "board")]) == 0
     with worker_pool(1) as pool:
-        assert list(pool.map(_twice, [1, 2])) == [2, 4]
+        assert list(pool.map(_twice, works)) == [2 * k for k in works]
 
 
 def test_the_version_says_what_is_installed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,7 @@ from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredAngle
+from rigkit.identification.identify import identify_pair
 from rigkit.reconstruction.pairing import MatchedPair, match_pair
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 
@@ -60,6 +61,16 @@ def test_where_angles_fit_several_names_the_fewest_change_and_it_is_said(seed: i
         assert names_are_right(pair, made)
         (words,) = [words for words in pair.notes if "measured angles" in words]
         assert "2 orders of the names fit" in words
+
+
+@pytest.mark.parametrize(("third", "words"), [(90.0, "2 orders of the names fit"), (100.0, "by the measured angles;")])
+def test_names_that_fit_the_measured_angles(third: float, words: str) -> None:
+    angles = (75.0, 90.0, third)
+    made = scene(np.random.default_rng(2), angles)
+    first, second = ([replace(d, board_id=None) for d in found] for found in made.detections())
+    identity = identify_pair(first, second, BOARDS, CAMERA, CAMERA, angles=measured(angles))
+    assert [d.board_id for d in identity.detections1] == [d.board_id for d in made.detections()[0]]
+    assert words in identity.notes[-1]
 
 
 def test_boards_of_almost_the_same_squares_look_alike_too() -> None:

@@ -95,6 +95,8 @@ def test_a_bad_camera_and_a_lost_image_end_their_own_pairs_only(
     assert [pair["pair"] for pair in reported["pairs"]] == ["second"]
     assert "letter.txt" in reported["failed"]["first"] and "nowhere" in reported["failed"]["third"]
     assert (tmp_path / "out" / "second" / "3SDIR.ply").is_file()
+    assert main([word for word in arguments if word != "--json"] + ["--force"]) == 2
+    assert "3SDIR.ply: 144 points, 3 boards, baseline" in capsys.readouterr().out
 
 
 def test_a_link_in_the_folder_of_results_is_not_followed(tmp_path: Path) -> None:

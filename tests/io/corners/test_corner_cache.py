@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from rigkit.io.corners.corner_cache import source_hash
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.io.corners.corner_cache import CornerCache, FoundCorners, source_hash
 from rigkit.io.disk.toml_reader import toml_text
 from rigkit.kernels import building
 
@@ -30,3 +32,20 @@ def test_lock_files_of_editors_do_not_change_the_source_hash(tmp_path: Path, mon
 def test_a_table_goes_into_a_line_of_toml() -> None:
     printed = {"a": 1, "words": ["x", "y"]}
     assert tomllib.loads(f"one = {toml_text(printed)}") == {"one": printed}
+
+
+def test_a_file_that_is_no_cache_is_left_as_it_is(tmp_path: Path) -> None:
+    """A damaged cache is written anew."""
+    path = tmp_path / "corners.json"
+    for content, ours in (('{"mine": 1}', False), ('{"schema": "rigkit.corners/1", "ima', True)):
+        path.write_text(content)
+        cache = CornerCache(path, [Board("a", 9, 6, 30.0, 30.0)])
+        assert cache.images == []
+        cache.put("image.png", "0123", FoundCorners((640, 480), ()))
+        if ours:
+            cache.save()
+            assert CornerCache(path, [Board("a", 9, 6, 30.0, 30.0)]).images == ["image.png"]
+        else:
+            with pytest.raises(InputError, match="left as it is"):
+                cache.save()
+            assert path.read_text() == content

@@ -45,10 +45,12 @@ def test_interlaced_images_are_called_that(tmp_path: Path, rng: np.random.Genera
     views, _, _ = random_views(CAMERA, 8, rng, reach_deg=25.0)
     result = calibrate(views, SIZE, model="brown", board="flat")
     images = {view.image: tmp_path / view.image for view in views}
+    made = {s: np.clip(picture(s, rng), 0.0, 255.0).astype(np.uint8) for s in (0.0, 0.8, 1.0, 2.0)}
+    files = {s: cv2.imencode(".png", image)[1].tobytes() for s, image in made.items()}
 
     def printed(*shifts_px: float) -> str:
         for path, shift_px in zip(images.values(), shifts_px, strict=True):
-            cv2.imwrite(str(path), np.clip(picture(shift_px, rng), 0.0, 255.0).astype(np.uint8))
+            path.write_bytes(files[shift_px])
         return str(interlaced(result, images))
 
     assert "every second line is of another moment" in printed(0.0, *[0.8] * 7) and "(3 of 4 images" in printed(

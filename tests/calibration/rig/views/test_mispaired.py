@@ -11,8 +11,11 @@ import pytest
 from helpers.calibration_scenes import BOARD, lens
 from helpers.rig_scenes import Views
 
+from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.views.mispaired import mixup_of_all_frames
+from rigkit.calibration.rig.views.observations import RigViews, frame_observations
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
@@ -139,10 +142,23 @@ def test_one_camera_mirrored(board: Board, rng: np.random.Generator) -> None:
     assert "the images of 'left' or those of 'right' are mirrored:" in cause(views)
 
 
+HALF_TURNED = "rotated by 180 degrees in frames '[12]', '[34]', '[56]' and 2 more"
+
+
+def half_turned(views: Views) -> Views:
+    return views | {"right": [(f, turned(view) if int(f) % 2 else view) for f, view in views["right"]]}
+
+
 def test_half_of_one_camera_turned(rng: np.random.Generator) -> None:
-    views = pair(rng)
-    views["right"] = [(f, turned(view) if int(f) % 2 else view) for f, view in views["right"]]
-    assert re.search("rotated by 180 degrees in frames '[12]', '[34]', '[56]' and 2 more", cause(views))
+    assert re.search(HALF_TURNED, cause(half_turned(pair(rng))))
+
+
+def test_half_of_one_camera_turned_before_the_rig_is_solved(rng: np.random.Generator) -> None:
+    views = half_turned(pair(rng))
+    alone = [calibrate([v for _, v in own], LENS.size_px, model="brown", degree=4, folds=0) for own in views.values()]
+    seen = [frame_observations(own, one) for own, one in zip(views.values(), alone, strict=True)]
+    found = mixup_of_all_frames(RigViews(tuple(views), seen, tuple(alone), {}))
+    assert found is not None and re.search(HALF_TURNED, found.message)
 
 
 def test_one_picture_under_two_names(rng: np.random.Generator) -> None:
