@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.schemas import faults
 from helpers.stereo_pictures import CAMERA, FRAMES, RIGHT_FROM_LEFT, of_one_camera
 
 from rigkit.cameras.base import Camera
@@ -106,15 +107,27 @@ def test_from_pictures_to_a_page_and_two_formats_in_one_command(
     assert {path.name for path in folder.iterdir()} == {path.name for path in before} | {"corners.json"}
 
 
-def test_results_in_one_folder_have_a_session_each(pictures: Path, tmp_path: Path) -> None:
+def test_results_in_one_folder_have_a_session_each(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # A file that is no cache of corners stays.
+    foreign = tmp_path / "far-session-corners.json"
+    foreign.write_text('{"mine": 1}')
     for name, model in (("near", "brown"), ("far", "pinhole")):
         folder = of_one_camera(pictures, tmp_path / f"{name}-photos", 4)
         output = tmp_path / f"{name}.json"
-        command = ["calibrate", str(folder), "--board", "9x6x30", "--model", model, "-o", str(output)]
+        command = ["calibrate", str(folder), "--board", "9x6x30", "--model", model, "-o", str(output), "--json"]
         assert main(command) == 0
+        printed = capsys.readouterr()
+        assert ("left as it is; rename it; the corners are used, but not kept" in printed.err) == (name == "far")
+        answer = json.loads(printed.out)
+        assert answer["model"] == model and faults(answer["page"]) == []
+        assert set(answer["sigmas"]) == set(answer["parameters"])
+        assert {"parameters", "boards", "images"} <= {table["key"] for table in answer["page"]["tables"]}
         session = load_session(tmp_path / f"{name}-session.toml")
         assert session.model == model and {image.parent for image in session.images} == {folder}
         assert f"rigkit calibrate {name}-session.toml -o {name}.json --force" in session.path.read_text()
+    assert foreign.read_text() == '{"mine": 1}'
 
 
 def test_a_session_of_a_person_is_not_replaced(

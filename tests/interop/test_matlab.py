@@ -201,6 +201,12 @@ def test_objects_are_refused_with_what_to_do(tmp_path: Path) -> None:
         import_camera(path)
 
 
+def test_a_name_that_is_none_is_refused(tmp_path: Path) -> None:
+    """A byte of a name was damaged: nothing that follows it is to be trusted."""
+    with pytest.raises(InputError, match="damaged"):
+        import_camera(_saved(tmp_path / "damaged.mat", {"f-c": np.ones(2), **BOUGUET}))
+
+
 def test_damaged_bytes_are_refused_in_one_line(tmp_path: Path, rng: np.random.Generator) -> None:
     """SciPy's reader ends the process on some of these."""
     whole = [_saved(tmp_path / f"{k}.mat", c).read_bytes() for k, c in enumerate((INTRINSICS, BOUGUET))]
