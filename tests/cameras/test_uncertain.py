@@ -7,6 +7,7 @@ import pytest
 
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cameras.uncertain import UncertainRig
+from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 
@@ -21,11 +22,13 @@ MOVE = 1e-6
 
 
 @pytest.mark.parametrize(("first", "second"), [(0, 1), (1, 0), (1, 2), (2, 1), (2, 0)])
-@pytest.mark.parametrize("number", range(sum(SIZES)))
-def test_a_pair_moves_as_the_rig_does(first: int, second: int, number: int) -> None:
+def test_a_pair_moves_as_the_rig_does(first: int, second: int) -> None:
     """The rig is sure but for one number: its pair is moved along one axis, to where the moved rig has it."""
-    step = np.zeros(sum(SIZES))
-    step[number] = MOVE
+    for step in MOVE * np.eye(sum(SIZES)):
+        assert_a_pair_moves_as_the_rig_does(first, second, step)
+
+
+def assert_a_pair_moves_as_the_rig_does(first: int, second: int, step: FloatArray) -> None:
     rig = UncertainRig(cameras=CAMERAS, cam_from_rig=POSES, covariance=np.outer(step, step))
     own = np.split(step, np.cumsum(SIZES)[:-1])
     cameras = [camera.with_parameters(camera.parameters + by) for camera, by in zip(CAMERAS, own[:3], strict=True)]

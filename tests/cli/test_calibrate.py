@@ -43,10 +43,17 @@ def write_half(image: Path, half: Path) -> None:
     cv2.imwrite(str(half), small, [cv2.IMWRITE_JPEG_QUALITY, 97])
 
 
-@pytest.fixture
-def session(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def halves(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("halves")
     for k, path in enumerate(sorted(IMAGES.glob("*.jpg"))[:5]):
-        write_half(path, tmp_path / f"{k:02d}.jpg")
+        write_half(path, folder / f"{k:02d}.jpg")
+    return folder
+
+
+@pytest.fixture
+def session(halves: Path, tmp_path: Path) -> Path:
+    shutil.copytree(halves, tmp_path, dirs_exist_ok=True)
     (tmp_path / "board.toml").write_text(BOARD)
     path = tmp_path / "session.toml"
     path.write_text(SESSION)

@@ -19,6 +19,7 @@ from rigkit.calibration.rig.joint import JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.lags import Timing, cost_of_own_times, times_of
 from rigkit.calibration.rig.solving.shutters import readout_steps, with_longer_readouts
+from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
@@ -33,11 +34,18 @@ LEFT = 0.3
 from one frame to the next boards that turn by a radian go on by more than a polynomial tells."""
 
 
-def pose(time: float, seed: int) -> Rigid3:
-    """Return where a board in hand is, from one frame's time to the next about 60 mm and 15 degrees further."""
-    turns, shifts = np.sin(RATES * time + np.random.default_rng(seed).uniform(0.0, 6.0, (2, 3)))
+def poses(times: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Return rotations (N, 3, 3) and translations (N, 3) of a board in hand at `times` (N,): from one frame's time to
+    the next about 60 mm and 15 degrees further."""
+    phases = np.random.default_rng(seed).uniform(0.0, 6.0, (2, 3))
+    turns, shifts = np.moveaxis(np.sin(RATES * times[:, None, None] + phases), 1, 0)
     turn = exp_so3(turns * [0.4, 0.4, 0.8])
-    return Rigid3(turn, shifts * [70.0, 50.0, 120.0] + [0.0, 0.0, 600.0] - turn @ BOARD.points().mean(axis=0))
+    return turn, shifts * [70.0, 50.0, 120.0] + [0.0, 0.0, 600.0] - turn @ BOARD.points().mean(axis=0)
+
+
+def pose(time: float, seed: int) -> Rigid3:
+    turn, shift = poses(np.array([time]), seed)
+    return Rigid3(turn[0], shift[0])
 
 
 def rig_of(
@@ -61,8 +69,9 @@ def rig_of(
             pixels, _ = lens("reg").project((mount @ pose(time(k) + late, seed)).apply(BOARD.points()))
             for _ in range(3 if readout else 0):
                 read = time(k) + late + readout * (pixels[:, 1] - 0.5 * (SIZE[1] - 1.0)) / SIZE[1]
-                corners = zip(read.tolist(), BOARD.points(), strict=True)
-                pixels, _ = lens("reg").project(np.array([(mount @ pose(t, seed)).apply(x) for t, x in corners]))
+                turn, shift = poses(read, seed)
+                corners = np.einsum("nij,nj->ni", turn, BOARD.points()) + shift
+                pixels, _ = lens("reg").project(mount.apply(corners))
             seen = lens("reg").on_image(pixels)
             noisy = np.clip(pixels[seen] + noise_px * rng.normal(size=(int(seen.sum()), 2)), 0.0, np.array(SIZE) - 1.0)
             view = BoardView(f"{side}{k}", BOARD, BOARD.grid()[seen], noisy, np.full(len(noisy), noise_px))
