@@ -212,7 +212,7 @@ def _tilted_view(
 def _match(first: _Features, second: _Features, unique: bool) -> tuple[IntArray, IntArray, FloatArray]:
     """Return indices (M,) and (M,) of mutual nearest neighbours that pass the ratio test, and their distances (M,)."""
     forward, distance, rival = _nearest(first, second)
-    backward, _, _ = _nearest(second, first)
+    backward, _, _ = _nearest(second, first, rivals=1)
     if not forward.size or not backward.size:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0)
     returned = first.pixels[backward[forward]]
@@ -226,8 +226,11 @@ def _match(first: _Features, second: _Features, unique: bool) -> tuple[IntArray,
     return i, forward[i], distance[i]
 
 
-def _nearest(first: _Features, second: _Features, block: int = 1024) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the nearest feature of `second` for each of `first`, its distance, and that of the nearest other point."""
+def _nearest(
+    first: _Features, second: _Features, *, rivals: int = RIVALS, block: int = 1024
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return the nearest feature of `second` for each of `first`, its distance, and that of the nearest other point
+    among the `rivals` nearest features."""
     n, m = len(first.pixels), len(second.pixels)
     if m <= RIVALS or n == 0:
         return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0)
@@ -237,9 +240,9 @@ def _nearest(first: _Features, second: _Features, block: int = 1024) -> tuple[In
         rows = slice(start, min(start + block, n))
         similarity = first.descriptors[rows] @ second.descriptors.T
         each = np.arange(len(similarity))
-        top, values = np.empty((len(each), RIVALS), np.int64), np.empty((len(each), RIVALS), np.float32)
+        top, values = np.empty((len(each), rivals), np.int64), np.empty((len(each), rivals), np.float32)
         # Repeated argmax: np.partition takes twenty times as long.
-        for k in range(RIVALS):
+        for k in range(rivals):
             top[:, k] = similarity.argmax(axis=1)
             values[:, k] = similarity[each, top[:, k]]
             similarity[each, top[:, k]] = -np.inf
