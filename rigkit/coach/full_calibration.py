@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
-from rigkit.calibration.certainty.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import lens_modes, uncertain_camera
 from rigkit.calibration.choosing.begun import BegunCalibration, begin
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.result import Calibration
@@ -64,7 +64,9 @@ def full_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> Fu
     try:
         begun = begin("", named, request)
         (found,) = calibrate_together([("", named, request)], known=[begun])
-        return FullCalibration(found, Knowledge.beyond_model(found), uncertain_camera(found), begun)
+        modes = lens_modes(found)
+        known = Knowledge.of(found).with_model_inadequacy(modes)
+        return FullCalibration(found, known, uncertain_camera(found, modes=modes), begun)
     except (InputError, DegenerateError):
         return None
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.certainty.displaced import LensModes, lens_modes, with_modes
+from rigkit.calibration.certainty.displaced import LensModes, with_modes
 from rigkit.calibration.certainty.uncertainty import projection_design
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.camera_prior import camera_prior
@@ -140,11 +140,6 @@ class Knowledge:
             )
             known = known.with_views(held, shape.board_id)
         return known
-
-    @classmethod
-    def beyond_model(cls, calibration: Calibration) -> Knowledge:
-        """Return the same with the inadequacy of the model, estimated from alternative models."""
-        return cls.of(calibration).with_model_inadequacy(lens_modes(calibration))
 
     def of_views(self, held: BoardPoses, board_id: str = "") -> FloatArray:
         """Return the information of each view of the board `board_id` in C poses, (C, T, T)."""

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from helpers.coach_scenes import BOARD, REACH, SIZE, both, shared_boards
 
-from rigkit.calibration.certainty.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import lens_modes, uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
@@ -78,7 +78,8 @@ class Later(Executor):
         else:
             own = self.rig.single[NAMES.index(OTHER if args[0][0].image.startswith(OTHER) else NAMES[0])]
             known = f"begun {len(args[0])}"
-            found = FullCalibration(own, Knowledge.beyond_model(own), uncertain_camera(own), known)  # type: ignore[arg-type]
+            knowledge = Knowledge.of(own).with_model_inadequacy(lens_modes(own))
+            found = FullCalibration(own, knowledge, uncertain_camera(own), known)  # type: ignore[arg-type]
             self.lenses.append(partial(future.set_result, found))
             if len(self.lenses) > self.slow:
                 self.lenses.pop()()

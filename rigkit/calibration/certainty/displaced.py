@@ -171,18 +171,20 @@ class LensModes:
     turns: FloatArray | None = None
 
 
-def uncertain_camera(calibration: Calibration, *, quoted: bool = True, near: bool = False) -> UncertainCamera:
+def uncertain_camera(
+    calibration: Calibration, *, quoted: bool = True, near: bool = False, modes: LensModes | None = None
+) -> UncertainCamera:
     """Return a calibrated camera and its covariance, with its model inadequacy as further parameters where that is
     significant; with a model that fits and boards all over the image it is not, and the camera is the calibration's.
 
     The covariance is widened if `quoted`, else that of Student's t, for callers that use the calibration's degrees of
     freedom. The camera is for far points; with `near` for points in mm, a `NearCamera` where the pupil moves, as the
-    errors of lens and pupil are correlated.
+    errors of lens and pupil are correlated. `modes` are those of `lens_modes`, where they are known already.
     """
     pupil = calibration.pupil if near else None
     known = calibration.covariance if pupil is None else calibration.near_covariance[:-6, :-6]
     known = known * (calibration.widening**2 if quoted else 1.0)
-    modes = lens_modes(calibration, near=near)
+    modes = lens_modes(calibration, near=near) if modes is None else modes
     (camera,), covariance = with_modes((calibration.camera,), known, (modes,))
     return UncertainCamera(camera if pupil is None else NearCamera.of(camera, pupil.terms), covariance)
 

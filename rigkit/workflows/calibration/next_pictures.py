@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.calibration.certainty.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import lens_modes, uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.base import Camera
@@ -42,9 +42,10 @@ def next_views(
     The error before them is that of the calibration's covariance. Raises as `plan_views` and `goal_of`.
     """
     reach = reach or Reach()
-    known = Knowledge.beyond_model(calibration)
+    modes = lens_modes(calibration)
+    known = Knowledge.of(calibration).with_model_inadequacy(modes)
     last = calibration.views[-1].cam_from_board
-    goal, stated = goal_of(known.camera, reach, length), uncertain_camera(calibration).covariance
+    goal, stated = goal_of(known.camera, reach, length), uncertain_camera(calibration, modes=modes).covariance
     return plan_views(known, boards, goal, count, reach=reach, last=last).stated(float(goal.error(stated)))
 
 

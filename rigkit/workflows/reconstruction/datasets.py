@@ -84,7 +84,7 @@ def write_for(dataset: Dataset, options: DatasetOptions, files: Mapping[str, str
         write_results(options.output, files, force=options.force, inputs=dataset.inputs)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class LoadedCamera:
     """A camera with its calibration; None for another tool's file, which holds the camera only."""
 
@@ -96,7 +96,7 @@ class LoadedCamera:
         """The camera for points in mm: a `NearCamera` if its entrance pupil moves."""
         return self.camera if self.calibration is None else self.calibration.near
 
-    @property
+    @functools.cached_property
     def known(self) -> UncertainCamera | None:
         """The camera for points in mm with its covariance; None if the calibration is unknown."""
         return None if self.calibration is None else uncertain_camera(self.calibration, near=True)
