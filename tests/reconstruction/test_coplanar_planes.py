@@ -93,17 +93,17 @@ def test_exact_corners_give_the_exact_scene(rng: np.random.Generator) -> None:
 def test_the_level_holds_as_it_was_declared(rng: np.random.Generator) -> None:
     """Exactly, as a prior between exact and free, and in the frames of tilted cameras as in level ones."""
     scene = scene_of(regular_camera(), rng, PoseType.PLANAR)
-    pair, poses = noisy_pair(scene, BOARDS, rng, SIGMA_PX), {}
-    for level in (0.0, 1e-4, 1.0):
-        geometry = pair_geometry(pair, pose_type=PoseType.PLANAR, level_sigma_rad=level)
-        poses[level] = coplanar_planes(geometry).cam2_from_cam1
+    pair = noisy_pair(scene, BOARDS, rng, SIGMA_PX)
+    geometries = {
+        level: pair_geometry(pair, pose_type=PoseType.PLANAR, level_sigma_rad=level) for level in (0.0, 1e-4, 1.0)
+    }
+    planes = {level: coplanar_planes(geometry) for level, geometry in geometries.items()}
+    poses = {level: own.cam2_from_cam1 for level, own in planes.items()}
     free = coplanar_planes(pair_geometry(pair, pose_type=PoseType.GENERAL)).cam2_from_cam1
     off = {level: abs(pose.rotation[1, 0]) for level, pose in poses.items()}
     assert off[0.0] < 1e-12 < off[1e-4] < off[1.0]
     assert np.allclose(poses[1.0].rotation, free.rotation, atol=1e-7)
-    geometry = pair_geometry(pair, pose_type=PoseType.PLANAR, level_sigma_rad=1e-4)
-    turned = coplanar_planes(_tilted(geometry))
-    straight = coplanar_planes(geometry)
+    turned, straight = coplanar_planes(_tilted(geometries[1e-4])), planes[1e-4]
     assert turned.baseline_mm()[0] == pytest.approx(straight.baseline_mm()[0], abs=0.2 * straight.baseline_mm()[1])
     for a, b in PAIRS:
         (angle, sigma), (same, _) = straight.angle_deg(a, b), turned.angle_deg(a, b)
