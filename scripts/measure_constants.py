@@ -1,24 +1,28 @@
 """Measure how far each constant of rigkit's detection can be changed before boards are lost or false ones found.
 
-    python scripts/measure_constants.py [MODULE ...] [--boards BOARD=DIR ...] [--without DIR ...] [--seeds 2]
+    python scripts/measure_constants.py [MODULE ...] [--data DIR] [--jobs 2] > MARGINS
+    python scripts/measure_constants.py --page MARGINS ...
 
-Each number among the constants of `rigkit.detection` (or of the MODULEs given, such as rigkit.detection.checks.border),
-and each number in a tuple, is multiplied and divided by FACTORS, one at a time, in all modules that import it. Rendered
-boards of every kind, in focus, blurred, noisy, faint and through a fisheye, and rendered pictures without boards are
-searched; some of the boards also for a board that nobody described; and the real images given (BOARD as in `rigkit
-detect --board`). A constant is tried only on the images in which a function that reads it is called.
+Each number among the constants of `rigkit.detection` (or of the MODULEs given, such as checks.border), and each number
+in a tuple, is multiplied and divided by FACTORS, one at a time, in all modules that import it. The images are those of
+`detection_bench.constant_looks`, rendered and real, with boards and without. A constant is tried only on the images in
+which a line that reads it runs: on at most MOST with and MOST without boards, the quick ones if those are MANY.
 
 Prints for each constant, on both sides, the first factor that has an effect, and the effect: corners lost (more than
 MAX_LOST_SHARE of them), false boards found, corners moved (more than MAX_MOVED of their sigmas, rms), or sigmas changed
 (more than MAX_SIGMA_CHANGE, rms of the logarithm). "-" if there is none at the largest factor; "same" if not even a
 digit of any result changes then: in these images the constant decides nothing. "not read" are constants that no
-function reads when called, such as defaults of arguments.
+function reads when called, such as defaults of arguments. The whole takes about half an hour of one core.
+`--page` enters what was printed in docs/pages/detection-constants.md, in place of older rows.
 """
 
 from __future__ import annotations
 
 import argparse
+import datetime
+import dis
 import importlib
+import multiprocessing
 import os
 import pkgutil
 import re
@@ -26,7 +30,6 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import CodeType, FrameType, ModuleType
 from typing import Any
@@ -35,82 +38,20 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from detection_bench.blanks import BLANKS, blank
-from detection_bench.scenes import LENSES, one_board
-from detectors.degradations import degraded
+from detection_bench.constant_looks import DATA, Found, Look, every_look
+from detection_bench.constants_page import PAGE, page
 
 import rigkit.detection
 from rigkit.core.arrays import FloatArray
-from rigkit.core.boards import Board
 from rigkit.core.errors import RigkitError
-from rigkit.core.patterns.aprilgrid import AprilGrid
-from rigkit.core.patterns.charuco import Charuco
-from rigkit.core.patterns.circles import Circles
-from rigkit.detection.detect import detect_boards
-from rigkit.detection.saddles.response import GreyImage, grey_image
-from rigkit.detection.unknown import guess_board
-from rigkit.io.boards.board_words import board_of_words, words_of_board
-from rigkit.io.media.images import images_of_folder, read_image
 
 FACTORS = (1.25, 2.0, 4.0)
 MAX_LOST_SHARE, MAX_MOVED, MAX_SIGMA_CHANGE = 0.01, 0.3, 0.1
-BOARDS = (
-    Board("chessboard", 8, 6, 60.0, 60.0),
-    Board("charuco", 8, 6, 60.0, 60.0, pattern=Charuco("DICT_5X5_100", 45.0)),
-    Board("aprilgrid", 8, 6, 60.0, 60.0, pattern=AprilGrid(0.3)),
-    Board("circles", 9, 7, 60.0, 60.0, pattern=Circles()),
-)
-CONDITIONS = (("as it is", 0.0), ("blur", 2.5), ("noise", 15.0), ("faint", 0.15))
-"""Degradations of rendered boards; see `detectors/degradations.py`."""
-COUNTED_PATTERNS = ("codes", "mosaic", "code", "dots", "staggered")
-"""Rendered pictures that contain pieces of real chessboards or grids of circles."""
-IMAGES_OF_UNKNOWN = 3
-"""Images of a board that nobody described which are searched together."""
+MANY, AT_ONCE, MOST, GOLDEN = 12, 8, 12, 0.618034
+NO_EFFECT = ("same", "-")
 
-Corners = dict[tuple[str, int, int], tuple[float, float, float]]
-"""Board, column and row of corners, and their u, v and sigma."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Look:
-    """Images, the boards that are looked for (none: the board is to be found out), and whether they are shown."""
-
-    images: tuple[GreyImage, ...]
-    boards: tuple[Board, ...]
-    shown: bool
-
-    def found(self) -> Found:
-        """Return the corners of the boards that are shown, and the number of false boards."""
-        if not self.boards:
-            guess = guess_board(self.images)
-            if guess is None or not self.shown:
-                return Found({}, int(guess is not None))
-            # Any other board, or another state of knowledge, is a loss.
-            words = f"{words_of_board(guess.board)} {guess.determined}"
-            return Found({(words, k, 0): (0.0, 0.0, 1.0) for k in range(guess.board.corner_count)}, 0)
-        seen = [one for image in self.images for one in detect_boards(image, self.boards)]
-        if not self.shown:
-            return Found({}, len(seen))
-        names = {board.board_id for board in self.boards}
-        return Found(
-            {
-                (str(one.board_id), column, row): (u, v, sigma)
-                for one in seen
-                if one.board_id in names
-                for (column, row), (u, v), sigma in zip(
-                    one.grid.tolist(), one.pixels.tolist(), one.sigma_px.tolist(), strict=True
-                )
-            },
-            0,
-        )
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Found:
-    """What a look finds."""
-
-    corners: Corners
-    false: int
+Line = tuple[str, int]
+"""A file and a line."""
 
 
 def constants_of(module: ModuleType) -> list[str]:
@@ -176,38 +117,63 @@ def forget() -> None:
                     value.cache_clear()
 
 
-def readers_of(module: ModuleType, constant: str) -> set[CodeType]:
-    """Return the functions that read a constant when they are called."""
+def readers_of(module: ModuleType, constant: str) -> set[Line]:
+    """Return the lines in which functions read a constant when they are called."""
     name = constant.partition("[")[0]
-    out: set[CodeType] = set()
-    for user in users_of(module, name):
-        file, parts = str(user.__file__), [compile(Path(str(user.__file__)).read_text(), str(user.__file__), "exec")]
+    return {line for user in users_of(module, name) for line in _reads(user).get(name, ())}
+
+
+READS: dict[str, dict[str, set[Line]]] = {}
+
+
+def _reads(module: ModuleType) -> dict[str, set[Line]]:
+    """Return the lines in which the functions of a module read each global name."""
+    file = str(module.__file__)
+    if file not in READS:
+        out: dict[str, set[Line]] = {}
+        parts = [compile(Path(file).read_text(encoding="utf-8"), file, "exec")]
         while parts:
             part = parts.pop()
-            inner = [code for code in part.co_consts if isinstance(code, CodeType)]
+            parts += [code for code in part.co_consts if isinstance(code, CodeType)]
             # Bodies of modules and classes run once, at the import.
-            if name in part.co_names and part.co_flags & 1 and part.co_filename == file:
-                out.add(part)
-            parts += inner
-    return out
+            if part.co_flags & 1:
+                for step in dis.get_instructions(part):
+                    if step.opname == "LOAD_GLOBAL" and step.positions and step.positions.lineno:
+                        out.setdefault(str(step.argval), set()).add((file, step.positions.lineno))
+        READS[file] = out
+    return READS[file]
 
 
-def called_by(look: Look) -> tuple[Found, set[tuple[str, int]]]:
-    """Return what a look finds, and the functions of rigkit.detection that it calls (file and line)."""
-    calls: set[tuple[str, int]] = set()
+def lines_of(look: Look, lines: set[Line]) -> tuple[Found, set[Line]]:
+    """Return what a look finds, and which of some lines run."""
+    by_file: dict[str, set[int]] = {}
+    for file, line in lines:
+        by_file.setdefault(file, set()).add(line)
+    run: set[Line] = set()
 
-    def note(frame: FrameType, event: str, _: object) -> None:
-        if event == "call" and "detection" in frame.f_code.co_filename:
-            calls.add((frame.f_code.co_filename, frame.f_code.co_firstlineno))
+    def enter(frame: FrameType, event: str, _: object) -> Any:
+        code = frame.f_code
+        left = by_file.get(code.co_filename)
+        if not left:
+            return None
+        left = left & {line for _, _, line in code.co_lines() if line}
+
+        def step(frame: FrameType, event: str, _: object) -> Any:
+            if event == "line" and frame.f_lineno in left:
+                run.add((code.co_filename, frame.f_lineno))
+                by_file[code.co_filename].discard(frame.f_lineno)
+            return step
+
+        return step if left else None
 
     forget()
-    threading.setprofile(note)
-    sys.setprofile(note)
+    threading.settrace(enter)
+    sys.settrace(enter)
     try:
-        return look.found(), calls
+        return look.found(), run
     finally:
-        sys.setprofile(None)
-        threading.setprofile(None)
+        sys.settrace(None)
+        threading.settrace(None)
 
 
 def effect(usual: Sequence[Found], now: Sequence[Found], corners: int) -> str:
@@ -249,95 +215,130 @@ def margin(
     factors: Sequence[float],
     corners: int,
 ) -> str:
-    """Return the first factor that has an effect on `looks`, and the effect. The last one is tried first: if that has
-    none, the others are not tried."""
-    last = _with(module, constant, looks, usual, factors[-1], corners)
-    if last in ("same", "-"):
+    """Return the first factor that has an effect on `looks`, and the effect.
+
+    The last one is tried first, on the first AT_ONCE looks, and on further ones until it has an effect. Smaller ones
+    are tried on the looks that it changed.
+    """
+    order = list(range(len(looks)))
+    last, order = _with(module, constant, looks, usual, order, factors[-1], corners)
+    if last in NO_EFFECT:
         return last
     for factor in factors[:-1]:
-        words = _with(module, constant, looks, usual, factor, corners)
-        if words not in ("same", "-"):
-            return f"{factor:.2g}: {words}"
-    return f"{factors[-1]:.2g}: {last}"
+        words, _ = _with(module, constant, looks, usual, order, factor, corners)
+        if words not in NO_EFFECT:
+            return f"{factor:.3g}: {words}"
+    return f"{factors[-1]:.3g}: {last}"
 
 
 def _with(
-    module: ModuleType, constant: str, looks: Sequence[Look], usual: Sequence[Found], factor: float, corners: int
-) -> str:
+    module: ModuleType,
+    constant: str,
+    looks: Sequence[Look],
+    usual: Sequence[Found],
+    order: Sequence[int],
+    factor: float,
+    corners: int,
+) -> tuple[str, list[int]]:
+    """Return the effect on the first AT_ONCE looks in `order`, or on more until there is one, and which changed."""
+    now: dict[int, Found] = {}
+    words = "same"
     with changed(module, constant, factor) as differs:
-        if not differs:
-            return "same"
-        try:
-            return effect(usual, [look.found() for look in looks], corners)
-        except (RigkitError, ArithmeticError, ValueError, IndexError, AssertionError, np.linalg.LinAlgError) as error:
-            return type(error).__name__
-
-
-def rendered(seeds: int) -> Iterator[Look]:
-    """Yield rendered boards of every kind, told and untold, and pictures without boards."""
-    for seed in range(seeds):
-        for board in BOARDS:
-            images: list[GreyImage] = []
-            for k, lens in enumerate(LENSES):
-                rng = np.random.default_rng(seed)
-                image = one_board(rng, lens=lens, board=board).render(noise_levels=2.0, rng=rng).astype(np.uint8)
-                for what, amount in CONDITIONS[k::2]:
-                    worse = degraded(what, amount, image, rng)[0] if amount else image
-                    images.append(grey_image(worse))
-                    yield Look((images[-1],), (board,), True)
-            yield Look(tuple(images[:IMAGES_OF_UNKNOWN]), (), True)
-        for name in BLANKS:
-            if name not in COUNTED_PATTERNS:
-                empty = (grey_image(blank(name, np.random.default_rng(seed))),)
-                yield from (Look(empty, boards, False) for boards in (BOARDS, ()))
-
-
-def real(folders: Sequence[Path], boards: tuple[Board, ...], *, shown: bool) -> list[Look]:
-    paths = [path for folder in folders for path in images_of_folder(folder)]
-    return [Look((grey_image(read_image(path)),), boards, shown) for path in paths]
+        while differs and len(now) < len(order) and words in NO_EFFECT:
+            for k in order[len(now) : len(now) + AT_ONCE]:
+                try:
+                    now[k] = looks[k].found()
+                except (
+                    RigkitError,
+                    ArithmeticError,
+                    ValueError,
+                    IndexError,
+                    AssertionError,
+                    np.linalg.LinAlgError,
+                ) as e:
+                    return type(e).__name__, [*now, k]
+            words = effect([usual[k] for k in now], list(now.values()), corners)
+    return words, [k for k, one in now.items() if one != usual[k]]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("modules", nargs="*")
-    parser.add_argument("--boards", nargs="*", default=[], metavar="BOARD=DIR")
-    parser.add_argument("--without", type=Path, nargs="*", default=[], help="folders of images without boards")
-    parser.add_argument("--seeds", type=int, default=2, help="rendered pictures of each kind")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of real captures")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--page", type=Path, nargs="+", metavar="MARGINS", help="enter rows in the page")
     args = parser.parse_args()
-    looks = list(rendered(args.seeds))
-    for words in args.boards:
-        board, folder = words.rsplit("=", 1)
-        looks += real([Path(folder)], (board_of_words(board),), shown=True)
-    looks += real(args.without, BOARDS, shown=False)
-    measure(looks, args.modules)
+    if args.page:
+        files = [file for file in (PAGE, *args.page) if file.exists()]
+        printed = "".join(file.read_text(encoding="utf-8") for file in files)
+        date = str(datetime.datetime.now(datetime.UTC).date())
+        PAGE.write_text(page(printed, every_constant(), date), encoding="utf-8")
+        return
+    measure(list(every_look(args.data)), args.modules, args.jobs)
 
 
-def measure(looks: Sequence[Look], modules: Sequence[str]) -> None:
-    """Print the table of the constants of some modules, or of all."""
+def every_module() -> list[str]:
+    """Import all modules of rigkit.detection and return their names."""
     package = rigkit.detection
     every = [info.name for info in pkgutil.walk_packages(package.__path__, f"{package.__name__}.") if not info.ispkg]
     for path in every:
         importlib.import_module(path)
-    usual, calls = zip(*map(called_by, looks), strict=True)
-    corners, false = sum(len(one.corners) for one in usual), sum(one.false for one in usual)
-    print(f"{sum(len(look.images) for look in looks)} images: {corners} corners of boards, {false} false boards\n")
-    print("| constant | value | looks | smaller by | larger by |\n| :-- | --: | --: | :-- | :-- |")
-    for path in modules or every:
-        module = sys.modules[path]
-        for name in constants_of(module):
-            readers = {(code.co_filename, code.co_firstlineno) for code in readers_of(module, name)}
-            of = [k for k, called in enumerate(calls) if called & readers]
-            sides = ["not called" if readers else "not read"] * 2
-            if of:
-                sides = [
-                    margin(module, name, [looks[k] for k in of], [usual[k] for k in of], factors, corners)
-                    for factors in ([1.0 / factor for factor in FACTORS], FACTORS)
-                ]
-            print(
-                f"| {path.removeprefix('rigkit.detection.')}.{name} | {value_of(module, name):g} | {len(of)} "
-                f"| {' | '.join(sides)} |",
-                flush=True,
-            )
+    return every
+
+
+def every_constant() -> list[tuple[str, str]]:
+    """Return module, without rigkit.detection, and name of each constant."""
+    return [
+        (path.removeprefix("rigkit.detection."), name)
+        for path in every_module()
+        for name in constants_of(sys.modules[path])
+    ]
+
+
+def measure(looks: Sequence[Look], modules: Sequence[str], jobs: int = 1) -> None:
+    """Print the rows of some modules, or of all."""
+    every = every_module()
+    of = [f"rigkit.detection.{name}" for name in modules] or every
+    constants = [(sys.modules[path], name) for path in of for name in constants_of(sys.modules[path])]
+    lines = {line for module, name in constants for line in readers_of(module, name)}
+    measured = [(look, *lines_of(look, lines)) for look in looks]
+    for kind in ("REAL", "RENDERED"):
+        own = [usual for look, usual, _ in measured if look.name.startswith(kind)]
+        found, false = sum(len(one.corners) for one in own), sum(one.false for one in own)
+        print(f"{kind}: {len(own)} images, {found} corners, {false} false boards", flush=True)
+    MEASURED.extend(measured)
+    # Forked processes have what was measured.
+    with multiprocessing.get_context("fork").Pool(jobs) as pool:
+        for row in pool.imap(_row, [(module.__name__, name) for module, name in constants]):
+            print(row, flush=True)
+
+
+MEASURED: list[tuple[Look, Found, set[Line]]] = []
+"""The looks, what they find, and the lines that they run."""
+
+
+def _row(constant: tuple[str, str]) -> str:
+    """Return the row of a constant (module and name)."""
+    path, name = constant
+    module = sys.modules[path]
+    readers = readers_of(module, name)
+    used = [(look, usual) for look, usual, run in MEASURED if run & readers]
+    quick = [(look, usual) for look, usual in used if look.quick]
+    if sum(look.shown for look, _ in quick) >= MANY:
+        used = quick
+    # In an order in which the first are of all kinds.
+    used = [used[k] for k in np.argsort(np.arange(len(used)) * GOLDEN % 1.0)]
+    used = [pair for shown in (True, False) for pair in [pair for pair in used if pair[0].shown == shown][:MOST]]
+    sides = ["not called" if readers else "not read"] * 2
+    if used:
+        looks, found = [look for look, _ in used], [usual for _, usual in used]
+        corners = sum(len(usual.corners) for usual in found)
+        sides = [
+            margin(module, name, looks, found, factors, corners)
+            for factors in ([1.0 / factor for factor in FACTORS], FACTORS)
+        ]
+    shown = f"{path.removeprefix('rigkit.detection.')}.{name}"
+    return f"| {shown} | {value_of(module, name):g} | {len(used)} | {' | '.join(sides)} |"
 
 
 if __name__ == "__main__":

@@ -6,10 +6,11 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-import measure_constants
 import numpy as np
 import pytest
-from measure_constants import Found, Look, changed, constants_of, effect, margin, readers_of, value_of
+from detection_bench.constant_looks import BOARDS, Found, Look, rendered, special
+from detection_bench.constants_page import PAGE, page, rows_of
+from measure_constants import changed, constants_of, effect, every_constant, lines_of, margin, readers_of, value_of
 
 from rigkit.detection import doubtful
 from rigkit.detection.checks import discontinuity, evidence, validate
@@ -59,9 +60,10 @@ def test_what_functions_keep_is_computed_again_with_another_constant() -> None:
     assert discontinuity._rules().jump == before
 
 
-def test_the_functions_that_read_a_constant_are_found_through_imports_too() -> None:
-    names = {code.co_name for code in readers_of(edge_fit, "MAX_MOVE_PX")}
-    assert "fit_whole_board" in names and "fit_edges" not in names
+def test_the_lines_that_read_a_constant_are_found_through_imports_too() -> None:
+    for file, line in readers_of(edge_fit, "MAX_MOVE_PX"):
+        assert "MAX_MOVE_PX" in Path(file).read_text(encoding="utf-8").splitlines()[line - 1]
+    assert {Path(file).name for file, _ in readers_of(edge_fit, "MAX_MOVE_PX")} >= {"edge_fit.py", "whole_board.py"}
 
 
 def found(corners: int, false: int = 0, *, off: float = 0.0, sigma: float = 1.0) -> Found:
@@ -88,14 +90,26 @@ class _ByOffset(Look):
         return found(1000 - (20 if by > 3.0 else 5 if by > 1.5 else 0), 1 if by < 0.3 else 0)
 
 
+class _Counted(Look):
+    """A look that nothing changes."""
+
+    times = 0
+
+    def found(self) -> Found:
+        _Counted.times += 1
+        return found(1000)
+
+
 BEFORE = evidence.OFFSET
 
 
-def test_the_margin_is_the_first_factor_that_has_an_effect() -> None:
-    looks = [_ByOffset((), (), True)]
+def look(kind: type[Look]) -> Look:
+    return kind("RENDERED nothing", (), (), True, True)
 
+
+def test_the_margin_is_the_first_factor_that_has_an_effect() -> None:
     def of(*factors: float) -> str:
-        return margin(evidence, "OFFSET", looks, [found(1000)], factors, 1000)
+        return margin(evidence, "OFFSET", [look(_ByOffset)], [found(1000)], factors, 1000)
 
     assert of(1.25, 2.0, 4.0) == "4: 20 corners lost"
     assert of(0.8, 0.5, 0.25) == "0.25: 1 false boards"
@@ -103,16 +117,113 @@ def test_the_margin_is_the_first_factor_that_has_an_effect() -> None:
     assert of(1.25, 2.0) == "-"
 
 
+def test_images_that_the_largest_factor_does_not_change_are_not_searched_with_smaller_ones() -> None:
+    looks = [look(_Counted), look(_ByOffset)]
+    before = _Counted.times
+    assert margin(evidence, "OFFSET", looks, [found(1000)] * 2, (1.25, 2.0, 4.0), 1000) == "4: 20 corners lost"
+    assert _Counted.times == before + 1
+
+
 def test_the_rendered_images_show_boards_of_every_kind_and_none() -> None:
-    looks = list(measure_constants.rendered(1))
-    told = {look.boards[0].board_id for look in looks if look.shown and look.boards}
-    assert told == {b.board_id for b in measure_constants.BOARDS}
-    assert {(bool(look.boards), look.shown) for look in looks} == {(a, b) for a in (True, False) for b in (True, False)}
+    looks = [*rendered(), *special()]
+    told = {one.boards[0].board_id for one in looks if one.shown and one.boards}
+    assert told >= {board.board_id for board in BOARDS}
+    assert {(bool(one.boards), one.shown) for one in looks} == {(a, b) for a in (True, False) for b in (True, False)}
 
 
-def test_the_functions_that_a_look_calls_are_noted() -> None:
-    looks = [look for look in measure_constants.rendered(1) if look.shown and look.boards]
-    result, calls = measure_constants.called_by(looks[0])
+def test_the_lines_that_run_are_noted() -> None:
+    look = next(rendered())
+    readers = readers_of(edge_fit, "MAX_MOVE_PX")
+    result, run = lines_of(look, readers)
     assert len(result.corners) > 20
-    (reader,) = (code for code in readers_of(edge_fit, "MAX_MOVE_PX") if code.co_name == "edge_rules")
-    assert (reader.co_filename, reader.co_firstlineno) in calls
+    assert "edge_fit.py" in {Path(file).name for file, _ in run} and run <= readers
+
+
+ROWS = "| a.b.WIDTH | 3 | 7 | 0.8: 5 corners lost | same |\n| a.b.PARTS[1] | 0.5 | 2 | - | not read |\n"
+
+
+def test_rows_of_a_page_are_replaced_by_newer_ones_and_those_of_removed_constants_left_out() -> None:
+    first = page(ROWS, [("a.b", "WIDTH"), ("a.b", "PARTS[1]"), ("a.b", "NEW")], "2000-01-01")
+    assert "| a.b.WIDTH | 3 | 7 | 1.25: 5 corners lost | same |" in first and "2 numbers, 0 have" in first
+    second = page(f"{first}| a.b.WIDTH | 4 | 7 | same | 2: 1 false boards |\n", [("a.b", "WIDTH")], "2000-01-01")
+    assert set(rows_of(second)) == {("a.b", "WIDTH")} and rows_of(second)["a.b", "WIDTH"][2] == "4"
+
+
+NOT_MEASURED: tuple[str, ...] = (
+    "circles.blobs",
+    "circles.certainty",
+    "circles.evidence",
+    "circles.find",
+    "circles.fit",
+    "circles.lattices",
+    "circles.local_map",
+    "circles.place",
+    "circles.through_lens",
+    "doubtful",
+    "duplicate_marks",
+    "fields",
+    "guided.board_guide",
+    "guided.corner_fit",
+    "guided.guided",
+    "guided.lopsided_blur",
+    "guided.rejoin",
+    "guided.relit",
+    "lattice.grow",
+    "lattice.lattice",
+    "lattice.links",
+    "lattice.local_fit",
+    "lattice.split",
+    "lattices",
+    "saddles.bad_pixels",
+    "saddles.local_contrast",
+    "saddles.mosaic",
+    "saddles.response",
+    "saddles.ring",
+    "saddles.saddle",
+    "subpixel.blur_shape",
+    "subpixel.board_window",
+    "subpixel.consistent",
+    "subpixel.correlation",
+    "subpixel.edge_curvature",
+    "subpixel.edge_fit",
+    "subpixel.edge_model",
+    "subpixel.outer_squares",
+    "subpixel.resampled",
+    "subpixel.scatter",
+    "subpixel.shadows",
+    "subpixel.subpixel",
+    "subpixel.uncertain_corners",
+    "subpixel.uniform_blur",
+    "subpixel.whole_board",
+    "tags.codes",
+    "tags.corners",
+    "tags.in_squares",
+    "tags.markers",
+    "tags.module_size",
+    "tags.placing",
+    "tags.quads",
+    "tags.surface",
+    "tags.unknown_charuco",
+    "tags.unknown_tags",
+    "tags.whole",
+    "tags.without_markers",
+    "targets.aprilgrid",
+    "targets.charuco",
+    "targets.chessboard",
+    "unknown",
+    "whole_charuco",
+    "whole_grids",
+)
+"""Modules of which no margins are measured yet."""
+
+
+def test_every_constant_of_detection_is_in_the_page_of_margins() -> None:
+    rows = rows_of(PAGE.read_text(encoding="utf-8"))
+    missing = [
+        f"{path}.{name}" for path, name in every_constant() if (path, name) not in rows and path not in NOT_MEASURED
+    ]
+    modules = " ".join(sorted({one.rsplit(".", 1)[0] for one in missing}))
+    assert not missing, (
+        f"no margin is measured for {', '.join(missing)}: scripts/measure_constants.py {modules} > MARGINS, "
+        "then scripts/measure_constants.py --page MARGINS"
+    )
