@@ -129,12 +129,8 @@ def calibration_from(
                 raise
             raise InputError(f"{shown} ({error})") from error
     images = named_images(session)
-    also = [
-        *suggest_rigid_boards(views, result),
-        *interlaced(result, images),
-        *black_borders(result, images),
-        *wrong_print(views, images),
-    ]
+    prints = wrong_print(views, images)
+    also = [*suggest_rigid_boards(views, result), *interlaced(result, images), *black_borders(result, images), *prints]
     verdicts = diagnose_session(result, dropped, also)
     if verdicts[0].severity is Severity.BAD:
         shown = why_misplaced(session.images, session.boards)
@@ -142,5 +138,6 @@ def calibration_from(
             # The few views of the declared board are misread.
             raise InputError(f"{session.path}: {shown}")
         if shown is not None:
-            verdicts = (verdicts[0], Finding.bad(shown), *verdicts[1:])
+            # It names the print, too.
+            verdicts = (verdicts[0], Finding.bad(shown), *(one for one in verdicts[1:] if one not in prints))
     return replace(result, dropped=(*dropped, *result.dropped), verdicts=verdicts)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from detection_bench.scenes import one_board
 
+from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.patterns.aprilgrid import AprilGrid
@@ -52,3 +53,17 @@ def test_prints_unlike_the_declared_ones_are_told(
     found = wrong_print(views, images)
     assert [finding.message for finding in found] == ([] if told is None else [told])
     assert wrong_print(views, {}) == []
+
+
+def test_a_border_is_told_once(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
+    """Where a calibration is bad, the whole board is compared with the declared one."""
+    board = Board("b", 8, 6, 60.0, 60.0, pattern=AprilGrid(0.3))
+    for k in range(3):
+        scene = one_board(rng, board=board, max_tilt_deg=10.0)
+        picture = scene.render(optics=Optics(0.7, supersample=2), noise_levels=2.0, rng=rng)
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.asarray(picture))
+    words = "aprilgrid:4x3x60,spacing=0.3,border=1"
+    main(["calibrate", str(tmp_path), "--board", words, "--model", "pinhole", "-o", str(tmp_path / "camera.json")])
+    printed = "".join(capsys.readouterr())
+    assert "border is 1 in the board file, 2 in the images" in printed
+    assert "have a border of" not in printed
