@@ -75,11 +75,12 @@ def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bo
     """Return the `fit` of a board's N corners, whose cells have `sides` (N, 2, 2), with sigmas multiplied by
     `edges.uneven_factors`, and the board's `edges.sigma_factors`, by which they are not.
 
-    That of a `marked` board, with markers in its squares, is 1: all its residuals count as noise.
+    That of a `marked` board, with markers in its squares, is at least 1: all its residuals count as noise, and those
+    due to markers may have any sign.
     """
     noise = _noise_of(fit, fit.valid & (fit.contrast > 0.0), sides, np.zeros(len(sides), np.int64))
     rules = factor_rules(radius_px)
-    typical = np.ones(1) if marked else edges.sigma_factors(noise, 1, rules)
+    typical = np.maximum(edges.sigma_factors(noise, 1, rules), 1.0 if marked else 0.0)
     return fit.less_sure(edges.uneven_factors(noise, typical, rules)), float(typical[0])
 
 

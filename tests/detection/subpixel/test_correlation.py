@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.subpixel import edge_fit, subpixel
-from rigkit.detection.subpixel.correlation import board_factors
+from rigkit.detection.subpixel.correlation import board_factors, with_uneven
 from rigkit.detection.subpixel.edge_fit import EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import Geometry
 from rigkit.synthetic.render import Optics
@@ -111,6 +111,14 @@ def test_each_board_has_its_own(rng: np.random.Generator) -> None:
     assert factors[1] == pytest.approx(factor(shared, sides), rel=1e-9)
     assert factors[1] > 1.9
     assert factors[2] == 1.0
+
+
+@pytest.mark.parametrize("make", [smoothed(1.0), sharpened], ids=["smoothed", "sharpened"])
+def test_correlated_noise_only_raises_sigmas_of_marked_boards(make: Noise, rng: np.random.Generator) -> None:
+    fit, _, sides = fitted(make, rng, count=40)
+    _, typical = with_uneven(fit, sides, RADIUS_PX, marked=True)
+    assert typical == max(factor(fit, sides), 1.0)
+    assert typical > 1.9 or make is sharpened
 
 
 def demosaiced(levels: np.ndarray) -> np.ndarray:
