@@ -76,7 +76,8 @@ def run(args: argparse.Namespace) -> int:
 def _session(args: argparse.Namespace) -> int:
     from rigkit.cli.console import progress_on_stderr
     from rigkit.io.disk.writing import ensure_writable, write_together
-    from rigkit.workflows.calibration.calibrate_any import FolderOptions, new_session
+    from rigkit.workflows.calibration.calibrate_any import new_session
+    from rigkit.workflows.options.cameras import FolderOptions
 
     of_manifests = ("calibration", "pose_type", "baseline_mm", "angle_deg")
     if any(getattr(args, name) for name in of_manifests):

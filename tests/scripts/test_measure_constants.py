@@ -205,7 +205,7 @@ NOT_MEASURED: tuple[str, ...] = (
     "tags.surface",
     "tags.unknown_charuco",
     "tags.unknown_tags",
-    "tags.whole",
+    "tags.whole_tags",
     "tags.without_markers",
     "targets.aprilgrid",
     "targets.charuco",

@@ -26,7 +26,7 @@ from rigkit.workflows.calibration.calibrate import (
     session_inputs,
 )
 from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration, calibrate_rig_session, results_of_rig
-from rigkit.workflows.inputs.corners import Cache, keep_corners
+from rigkit.workflows.inputs.corners import keep_corners
 from rigkit.workflows.inputs.folder_session import (
     FolderSession,
     ImagesByCamera,
@@ -41,7 +41,7 @@ from rigkit.workflows.inputs.frames import (
     with_frames,
 )
 from rigkit.workflows.inputs.layout_evidence import cameras_by_name, cameras_seen
-from rigkit.workflows.options.cameras import CalibrateOptions, FolderOptions
+from rigkit.workflows.options.cameras import Cache, CalibrateOptions, FolderOptions
 
 _log = logging.getLogger(__name__)
 

@@ -23,10 +23,10 @@ from rigkit.io.manifests.rig_session import frames_of_images, load_rig_session
 from rigkit.io.media.images import Image, read_image
 from rigkit.workflows.calibration.calibrate_any import calibrate_sources
 from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration
-from rigkit.workflows.inputs.corners import Cache, named_images
+from rigkit.workflows.inputs.corners import named_images
 from rigkit.workflows.inputs.folder_session import session_of_folders
 from rigkit.workflows.inputs.layout_evidence import cameras_seen
-from rigkit.workflows.options.cameras import CalibrateOptions, FolderOptions
+from rigkit.workflows.options.cameras import Cache, CalibrateOptions, FolderOptions
 
 BOARD = board_of_words("9x6x30")
 
