@@ -94,6 +94,11 @@ class JointRig:
         """Index of the frame of every pose, (F,): `frame_numbers`."""
         return frame_numbers(self.views, self.observations)
 
+    @property
+    def times(self) -> FloatArray:
+        """Time of every pose, (F,): `times_of`."""
+        return _times(self.views, self.observations)
+
     def folds(self, count: int) -> IntArray:
         """Return the fold of every pose (F,), of `count` folds; with fewer frames each is a fold."""
         pixels = [view.pixels for own in self.observations.cameras for view in own.views]
@@ -215,8 +220,12 @@ def _with_lags(
     views: RigViews, observations: RigObservations, solution: Solution[RigState], sigma: float, timing: Timing
 ) -> tuple[RigObservations, Solution[RigState]]:
     """Return the observations and the solution, with the lags of cameras if they are significant."""
-    times = times_of(observations.keys, {entry.key: entry.frame for own in views.seen for entry in own.values()})
+    times = _times(views, observations)
     return with_lags(observations, solution, sigma, times, frame_numbers(views, observations), timing=timing)
+
+
+def _times(views: RigViews, observations: RigObservations) -> FloatArray:
+    return times_of(observations.keys, {entry.key: entry.frame for own in views.seen for entry in own.values()})
 
 
 def _boards_px(seen: Sequence[FrameObservations]) -> float:

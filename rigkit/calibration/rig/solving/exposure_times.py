@@ -126,19 +126,22 @@ def without_own_times(
     )
 
 
-def trajectories_through(rotation: Mat3, place: Points, targets: Sequence[str], times: FloatArray) -> FloatArray:
-    """Return the trajectories (F, POINTS - 1, 6) through the poses (F, 3, 3) and (F, 3) of `targets`, at `times` (F,):
-    zeros where times are unknown, or where fewer than MIN_POINTS poses are within MAX_TIME_OF_TRAJECTORY."""
+def trajectories_through(
+    rotation: Mat3, place: Points, targets: Sequence[str], times: FloatArray, points: int = POINTS
+) -> FloatArray:
+    """Return the trajectories (F, POINTS - 1, 6) through the poses (F, 3, 3) and (F, 3) of `targets`, at `times` (F,),
+    each through so many `points`: zeros where times are unknown, or where fewer than MIN_POINTS poses are within
+    MAX_TIME_OF_TRAJECTORY."""
     trajectories = np.zeros((len(times), POINTS - 1, 6))
     for target in dict.fromkeys(targets):
         own = np.array([f for f, t in enumerate(targets) if t == target and np.isfinite(times[f])], dtype=np.int64)
         own = own[np.argsort(times[own])]
         for i, f in enumerate(own):
-            first = min(max(i - POINTS // 2, 0), max(len(own) - POINTS, 0))
+            first = min(max(i - points // 2, 0), max(len(own) - points, 0))
             near = np.array(
                 [
                     k
-                    for k in own[first : first + POINTS]
+                    for k in own[first : first + points]
                     if k != f and abs(times[k] - times[f]) <= MAX_TIME_OF_TRAJECTORY
                 ]
             )

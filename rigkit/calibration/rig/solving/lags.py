@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 
 from rigkit.calibration.rig.certainty.frame_covariance import frame_covariance, residual_sigma
-from rigkit.calibration.rig.solving.exposure_times import ExposureTimes, Lag, trajectories_through
+from rigkit.calibration.rig.solving.exposure_times import POINTS, ExposureTimes, Lag, trajectories_through
 from rigkit.calibration.rig.solving.flatness import STEP_DAMPING
 from rigkit.calibration.rig.solving.pose_jacobians import pose_jacobians_at_exposure
 from rigkit.calibration.rig.solving.shutters import readout_steps, with_longer_readouts
@@ -85,7 +85,7 @@ def with_lags(
     cameras, keys = len(observations.cameras), len(observations.keys)
     none = np.zeros((cameras, keys))
     start = ExposureTimes(none[:, 0], np.zeros((keys, 0, 6)), none, np.full_like(none, np.inf), none[:, 0])
-    start = _with_trajectories(start, solution.state, observations, times)
+    start = with_trajectories(start, solution.state, observations, times)
     if (
         timing == "trigger"
         or cameras < 2
@@ -115,7 +115,7 @@ def _solved_again(
     """Return the solution with trajectories through its own poses, and with the images' times estimated from them."""
     state = lagging.state
     assert state.exposures is not None
-    exposures = _with_trajectories(state.exposures, state, observations, times)
+    exposures = with_trajectories(state.exposures, state, observations, times)
     if own_times:
         sigma = residual_sigma(observations, lagging, sigma_px)
         exposures = _with_own_times(replace(state, exposures=exposures), exposures, observations, sigma)
@@ -165,12 +165,13 @@ def lags_of(names: Sequence[str], state: RigState, covariance: FloatArray, lags:
     return out
 
 
-def _with_trajectories(
-    exposures: ExposureTimes, state: RigState, observations: RigObservations, times: FloatArray
+def with_trajectories(
+    exposures: ExposureTimes, state: RigState, observations: RigObservations, times: FloatArray, points: int = POINTS
 ) -> ExposureTimes:
-    """Return the exposure times with trajectories through the poses of a state."""
+    """Return the exposure times with trajectories through `points` poses of a state each."""
     targets = [target for _, target in observations.keys]
-    return replace(exposures, trajectories=trajectories_through(state.frame_rotation, state.frame_mm, targets, times))
+    through = trajectories_through(state.frame_rotation, state.frame_mm, targets, times, points)
+    return replace(exposures, trajectories=through)
 
 
 def _lags_lower_cost(observations: RigObservations, state: RigState, start: ExposureTimes, sigma_px: float) -> bool:

@@ -71,9 +71,25 @@ def _step(score: FloatArray, information: FloatArray) -> tuple[float, float, flo
     return step, float(np.linalg.norm((score - step * information) / (1.0 - share))) / total, freedom
 
 
-def _readout_information(observations: RigObservations, state: RigState, c: int) -> tuple[FloatArray, FloatArray]:
-    """Return score and information (V,) of every view of camera `c` on its readout, the view's pose eliminated."""
-    motion, by_pose, residuals = _readout_displacements(observations, state, c)
+def readout_errors_of_speeds(observations: RigObservations, state: RigState, coarser: RigState) -> FloatArray:
+    """Return the standard deviations (n,) of the readouts due to errors of the boards' speeds. These are as large as
+    the difference to a `coarser` state, with fewer poses in each trajectory, and independent between views."""
+    assert state.exposures is not None
+    out = np.zeros(len(state.cameras))
+    for c, readout in enumerate(state.exposures.readouts.tolist()):
+        other, own = (_readout_displacements(observations, of, c)[0] for of in (coarser, state))
+        score, information = _readout_information(observations, state, c, readout * (other - own))
+        out[c] = np.linalg.norm(score) / max(float(information.sum()), np.finfo(float).tiny)
+    return out
+
+
+def _readout_information(
+    observations: RigObservations, state: RigState, c: int, residuals: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return score and information (V,) of every view of camera `c` on its readout, the view's pose eliminated, for
+    `residuals` (V, C, 2) other than those of the state if given."""
+    motion, by_pose, own_residuals = _readout_displacements(observations, state, c)
+    residuals = own_residuals if residuals is None else residuals
     weight = observations.weights[c][:, :, None]
     views = len(weight)
     motion, residuals = ((weight * part).reshape(views, -1) for part in (motion, residuals))

@@ -14,11 +14,13 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.certainty.readouts import readout_error
 from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.rig.solving.lags import Timing, cost_of_own_times, times_of
-from rigkit.calibration.rig.solving.shutters import readout_steps, with_longer_readouts
+from rigkit.calibration.rig.solving.exposure_times import POINTS
+from rigkit.calibration.rig.solving.lags import Timing, cost_of_own_times, times_of, with_trajectories
+from rigkit.calibration.rig.solving.shutters import readout_errors_of_speeds, readout_steps, with_longer_readouts
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
@@ -171,6 +173,18 @@ def test_readouts_are_solved_for_until_they_settle() -> None:
     joint = joint_with_readouts(0)
     step, sigma, _ = readout_steps(joint.observations, joint.solution.state)
     assert (np.abs(step) <= 0.1 * sigma).all()
+
+
+def test_sigmas_of_readouts_count_errors_of_speeds() -> None:
+    """Boards that swing within a few frames are faster or slower than a polynomial, in all residuals alike."""
+    joint = joint_with_readouts(0)
+    observations, state = joint.observations, joint.solution.state
+    assert state.exposures is not None
+    coarse = with_trajectories(state.exposures, state, observations, joint.times, POINTS - 1)
+    by_speeds = readout_errors_of_speeds(observations, state, replace(state, exposures=coarse))
+    assert (readout_errors_of_speeds(observations, state, state) == 0.0).all()
+    assert (readout_error(joint)[1] > np.hypot(readout_steps(observations, state)[1], by_speeds)).all()
+    assert (by_speeds > 0.0).all()
 
 
 def test_heldout_frames_do_not_choose_their_readouts() -> None:
