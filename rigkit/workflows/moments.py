@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from rigkit.core.errors import InputError
@@ -11,8 +13,21 @@ from rigkit.io.manifests.rig_session import frames_of_images
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.folder_session import cameras_in, images_of_camera
 
+_log = logging.getLogger(__name__)
+
 ImagesByMoment = list[list[Path]]
 """The images of every moment, one per camera."""
+
+
+def warn_of_several_cameras(sources: Sequence[Path]) -> None:
+    """Warn of a folder whose images are of several cameras by their names, where those of one are meant."""
+    for source in filter(Path.is_dir, sources):
+        with suppress(InputError):
+            if len(cameras := list(cameras_in([source]))) > 1:
+                _log.warning(
+                    f"by their names the images in '{source}' are of {len(cameras)} cameras ({', '.join(cameras)}), "
+                    "and all are taken as one camera's; give those of one"
+                )
 
 
 def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[ImagesByMoment, list[Path]]:
@@ -23,6 +38,7 @@ def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[ImagesByM
     else moment by moment, in the order of the cameras. Raises InputError for unequal numbers of images.
     """
     if len(names) == 1:
+        warn_of_several_cameras(sources)
         return [[image] for image in images_in(sources)], []
     if not all(source.is_dir() for source in sources):
         images = list(images_in(sources))

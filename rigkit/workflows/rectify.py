@@ -28,7 +28,7 @@ from rigkit.rectification.targets import target_camera
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_camera, import_pair
 from rigkit.workflows.inputs.folder_session import cameras_in, images_of_camera
-from rigkit.workflows.moments import grouped_by_moment
+from rigkit.workflows.moments import grouped_by_moment, warn_of_several_cameras
 from rigkit.workflows.options.cameras import RectifyOptions
 
 
@@ -93,6 +93,7 @@ def rectify_image(
     if holds_several(image) and options.output.suffix:
         what = "folder" if Path(image).is_dir() else "video"
         raise InputError(f"rectify: '{image}' is a {what}, so -o must name a folder, not '{options.output.name}'")
+    warn_of_several_cameras([Path(image)])
     with ExitStack() as stack:
         sources = _sources(Path(image), stack)
         jobs = _outputs(sources, options.output) if _is_folder(options.output) else [(sources[0], options.output)]

@@ -192,3 +192,11 @@ def test_the_only_folder_with_images_is_meant(tmp_path: Path) -> None:
     folders = [tmp_path / "cam0", tmp_path / "cam1"]
     assert {name: own[0][0] for name, own in cameras_in(folders).items()} == {f.name: f / "data" for f in folders}
     assert len(moments_of(("cam0", "cam1"), folders)[0]) == 2
+
+
+def test_a_folder_of_two_cameras_for_one_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    _images(tmp_path, "left01", "left02")
+    assert len(moments_of(("cam",), [tmp_path])[0]) == 2 and not caplog.text
+    _images(tmp_path, "right01", "right02")
+    assert len(moments_of(("cam",), [tmp_path])[0]) == 4
+    assert "are of 2 cameras (left, right), and all are taken as one camera's" in caplog.text

@@ -264,7 +264,8 @@ def require_size(given_px: tuple[int, int], what: str, size_px: tuple[int, int],
 
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
-    """Silence OpenCV's log in the block: errors are reported by rigkit."""
+    """Silence OpenCV's log in the block, and that of its FFmpeg, which reads its level once: rigkit reports errors."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     # OpenCV 5 moved the two functions; level 0 is silent in both.
     log: Any = cv2.utils.logging if hasattr(cv2.utils, "logging") else cv2
     level = log.getLogLevel()

@@ -19,6 +19,7 @@ from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.unknown import BoardGuess, difference, guess_board
 from rigkit.detection.whole_grids import MIN_IMAGES_OF_GUESS
 from rigkit.io.boards.board_words import words_of_board
+from rigkit.io.disk.reading import about
 from rigkit.io.media.images import read_image
 from rigkit.io.media.video import Video, is_video
 
@@ -334,7 +335,9 @@ def _pictures(
             if is_video(path):
                 yield from _frames(path, max(1, max_images // len(paths)))
             else:
-                yield str(path), grey_image(read_image(path))
+                with about(path):
+                    image = grey_image(read_image(path))
+                yield str(path), image
         except InputError as error:
             yield str(path), error
 

@@ -42,6 +42,9 @@ def test_images_that_cannot_be_read_are_not_without_a_board(tmp_path: Path, caps
     for arguments in (["--square-mm", "40"], []):
         assert main(["calibrate", str(tmp_path), *arguments]) == 2
         assert "float32 pixels; save it with 8 or 16 bits" in capsys.readouterr().err
+    cv2.imwrite(str(tmp_path / "one.tif"), np.zeros((1, 1), np.uint8))
+    assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
+    assert f"'{tmp_path / 'one.tif'}': image: 1x1 pixels are too few" in capsys.readouterr().err
 
 
 def mirrored(image: np.ndarray) -> np.ndarray:
