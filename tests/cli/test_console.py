@@ -1,14 +1,18 @@
 """Arguments made from the fields of option classes."""
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
 import pytest
 
 from rigkit.cli.console import add_options, options_of
+from rigkit.io.disk.schema_words import attributes_of
+from rigkit.workflows.options import cameras, clouds
 from rigkit.workflows.options.base import WrittenFiles
+
+KINDS = [kind for module in (cameras, clouds) for name, kind in vars(module).items() if name.endswith("Options")]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,3 +79,8 @@ def test_help_is_the_description_of_the_field_with_its_default(parser: argparse.
     assert "--pair ID only this pair (repeatable) --names ONE TWO of two cameras" in words
     assert "--chain {raw,rectified} pixels to use (default: raw)" in words
     assert "--depth N of a tree (default: 9) --force replace existing files; input files are never replaced" in words
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_field_of_options_is_described_and_nothing_else(kind: type) -> None:
+    assert set(attributes_of(kind)) == {field.name for field in fields(kind)}
