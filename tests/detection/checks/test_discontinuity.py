@@ -161,6 +161,14 @@ def test_only_suspicious_lattices_need_the_full_search() -> None:
     assert may_be_discontinuous(replace(whole, residual=uneven), SIZE_PX)
 
 
+def test_a_sheet_bent_like_a_wave_is_not_searched() -> None:
+    """It is no two smooth surfaces, and the search alone would cut it."""
+    bent = smooth(15, 7)
+    bent[..., 1] += np.sin(np.arange(15) * (2.0 * np.pi / 6.0))
+    assert len(split_at_discontinuities(sheet(bent))) > 1
+    assert not may_be_discontinuous(sheet(bent), SIZE_PX)
+
+
 def test_what_fits_badly_goes_where_it_lies_aside_and_else_stays(rng: np.random.Generator) -> None:
     pixels = smooth(9, 6) + rng.normal(0.0, 0.01, (6, 9, 2))
     pixels[:, 8] += [3.0, 0.0]
