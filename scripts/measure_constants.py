@@ -12,7 +12,7 @@ Prints for each constant, on both sides, the first factor that has an effect, an
 MAX_LOST_SHARE of them), false boards found, corners moved (more than MAX_MOVED of their sigmas, rms), or sigmas changed
 (more than MAX_SIGMA_CHANGE, rms of the logarithm). "-" if there is none at the largest factor; "same" if not even a
 digit of any result changes then: in these images the constant decides nothing. "not read" are constants that no
-function reads when called, such as defaults of arguments. The whole takes about half an hour of one core.
+function reads when called, such as defaults of arguments. The whole takes some 20 minutes of one core.
 `--page` enters what was printed in docs/pages/detection-constants.md, in place of older rows.
 """
 
