@@ -76,7 +76,8 @@ def find_lattices(
 
     `sizes` : (columns, rows) of all possible boards, if known.
     `vouched` : for boards with markers in their squares, which affect edges and fit. Lattices with edge offsets
-    (`has_edge_offset`) are then not rejected, and those for which it is true are accepted regardless of their evidence.
+    (`has_edge_offset`) are then not rejected, and those for which it is true are accepted regardless of their evidence
+    and shape.
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
@@ -104,7 +105,13 @@ def find_lattices(
         found = max(found, looked(coarser, _corners_of(found)), key=_corners_of)
     if min_corners < MIN_BOARD_CORNERS:
         return found
-    return [item for item in found if _of_size(item.lattice, sizes) or compact(item.lattice, size_px)]
+    return [
+        item
+        for item in found
+        if _of_size(item.lattice, sizes)
+        or compact(item.lattice, size_px)
+        or (vouched is not None and vouched(grey, item.lattice))
+    ]
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import product
 
+import cv2
 import numpy as np
 import pytest
 from detection_bench.scenes import one_board
@@ -17,6 +18,7 @@ from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.subpixel.consistent import checked
 from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.synthetic.render import Optics
 
 BOARD = Board("b", 8, 6, 30.0, 30.0)
 MARKED = Board("b", 7, 7, 30.0, 30.0, pattern=Charuco("DICT_4X4_100", 22.5))
@@ -50,6 +52,24 @@ def test_the_visible_part_of_covered_boards_is_found_and_nothing_else() -> None:
 def test_corners_with_something_else_in_their_windows_are_not_claimed(seed: int, lens: str) -> None:
     """Of 240 such boards five had a false corner."""
     assert covered(seed, lens, "texture").false == 0
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_strips_of_a_board_on_both_sides_of_an_arm_are_known_by_their_markers(seed: int) -> None:
+    """The larger strip, not compact, has two rows and three corners of a third."""
+    board, rng = replace(MARKED, columns=6, rows=8), np.random.default_rng(seed)
+    scene = one_board(rng, board=board, max_tilt_deg=20.0)
+    image = np.asarray(scene.render(optics=Optics(0.7, supersample=2), noise_levels=2.0, rng=rng), np.uint8)
+    (truth,) = scene.truth()
+    pixel_from_grid, _ = cv2.findHomography(truth.grid.astype(np.float64), truth.pixels)
+    arm = np.array([[[-2.0, 1.2], [9.0, 3.4], [9.0, 6.9], [-2.0, 4.7]]])
+    cv2.fillPoly(image, [np.rint(cv2.perspectiveTransform(arm, pixel_from_grid)[0]).astype(np.int32)], [130.0])
+    (found,) = detect_boards(image, [board])
+    assert found.board_id == board.board_id
+    off = np.hypot(*(found.pixels - truth.lattice()[tuple(found.grid[:, ::-1].T)]).T)
+    # Two corners are partly under the arm.
+    assert np.sort(off)[-3] < 0.03
+    assert off.max() < 1.0
 
 
 @pytest.mark.parametrize(("seed", "lens"), [(7, "regular"), (0, "fisheye")])

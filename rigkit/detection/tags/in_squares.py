@@ -39,12 +39,12 @@ ADJACENT_MARKERS = 2
 
 
 def vouched_by_markers(boards: Sequence[Board], image: GreyImage, lattice: Lattice) -> bool:
-    """Return whether all markers in a lattice's squares, together, place it on one of these ChArUco boards.
+    """Return whether the markers in a lattice's squares place it on one of these ChArUco boards.
 
     The blurred ink of markers disturbs the fit of the corners beside them, so that the evidence of the corners is that
     of no board: -0.2 to -4 with squares of 12 to 22 px, blurred by 1.5 and 2 px (REAL).
     """
-    return any(_place_together(image, lattice, board) is not None for board in boards)
+    return any(place_by_markers(image, lattice, board) is not None for board in boards)
 
 
 def place_by_markers(image: GreyImage, lattice: Lattice, board: Board) -> tuple[int, IntArray] | None:

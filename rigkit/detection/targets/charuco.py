@@ -115,8 +115,9 @@ def _charuco_boards(
     out = []
     for board in boards:
         whole, left = _by_squares(image, rest, board)
-        if not whole.count:
-            whole, left = _by_outlines(pictures, rest, board)
+        if 2 * whole.count < whole.known.size:
+            # Strips on both sides of an arm may be no lattices.
+            whole, left = max((whole, left), _by_outlines(pictures, rest, board), key=lambda way: way[0].count)
         if not whole.count:
             continue
         placed = _beside_markers(image, refine(image, [whole])[0], board, search.camera)
