@@ -128,11 +128,14 @@ def _with_readouts(
     """Return observations and solution with the readouts of rolling shutters, or both unchanged where no readout is
     significant."""
     # Imported here: scipy is slow to import, and few rigs need it.
-    from scipy.special import stdtr
+    from scipy.special import chdtrc, stdtr
 
     step, sigma, freedom = readout_steps(observations, lagging.state)
     size = np.abs(step) / np.where(sigma > 0.0, sigma, np.inf)
-    if 2.0 * float(stdtr(np.maximum(freedom, 1.0), -size).min()) * len(step) > CHANCE:
+    each = np.maximum(2.0 * stdtr(np.maximum(freedom, 1.0), -size), np.finfo(float).tiny)
+    # All cameras of a rig may have rolling shutters (Fisher's combination of their p-values), or one of them.
+    together, one = float(chdtrc(2 * len(each), -2.0 * np.log(each).sum())), float(each.min()) * len(each)
+    if 2.0 * min(together, one) > CHANCE:
         return observations, lagging
     relaxation = 1.0
     for _ in range(MAX_READOUT_ROUNDS):
