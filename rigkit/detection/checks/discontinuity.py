@@ -24,8 +24,7 @@ SUSPECT_FACTOR = 2.0
 OUTLIER_SIGMAS = 5.0
 """A suspect is dropped if it is further from its predictions than this times their errors and its own standard
 deviation, and predicts others if it is closer than this times the error of one: the sigma of a suspect is too large for
-that. Of 10582 corners of single boards in 212 REAL images this drops none with 4 and more, and 5 with 2.5; in RENDERED
-boards that touch in line 6 leaves one wrong corner."""
+that. Of 10582 corners of single boards in 212 REAL images this drops none with 4 and more, and 5 with 2.5."""
 
 UNUSUAL, MIN_UNUSUAL = 1.3, 3
 """There may be a discontinuity if at least MIN_UNUSUAL corners have residuals above UNUSUAL times the median: a sheet
