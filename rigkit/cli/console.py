@@ -83,7 +83,8 @@ def add_options(parser: argparse._ActionsContainer, kind: type, /, **spelled: st
         if not any(flag.startswith("--") for flag in flags):
             flags.append(f"--{name.replace('_', '-')}")
         given = _argument_of(own[name], places)
-        text = words[name].rstrip(".")
+        # python -OO removes docstrings.
+        text = words.get(name, "").rstrip(".")
         if given.get("action") == "append":
             text += " (repeatable)"
         elif given.get("default") not in (None, []) and "default" not in text:

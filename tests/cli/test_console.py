@@ -1,6 +1,8 @@
 """Arguments made from the fields of option classes."""
 
 import argparse
+import subprocess
+import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
@@ -8,6 +10,7 @@ from typing import Literal
 import pytest
 
 from rigkit.cli.console import add_options, options_of
+from rigkit.cli.main import VERBS
 from rigkit.io.disk.schema_words import attributes_of
 from rigkit.workflows.options import cameras, clouds
 from rigkit.workflows.options.base import WrittenFiles
@@ -84,3 +87,8 @@ def test_help_is_the_description_of_the_field_with_its_default(parser: argparse.
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_field_of_options_is_described_and_nothing_else(kind: type) -> None:
     assert set(attributes_of(kind)) == {field.name for field in fields(kind)}
+
+
+def test_without_docstrings_all_verbs_work() -> None:
+    code = f"from rigkit.cli.main import build_parser\nfor verb in {list(VERBS)}: build_parser(verb).format_help()"
+    subprocess.run([sys.executable, "-OO", "-c", code], check=True)

@@ -93,7 +93,7 @@ class FolderOptions(NamesFiles):
     Attributes
     ----------
     boards : 9x6x25 (inner corners, mm a square), circles:10x8x25,diameter_mm=15, or a board file.
-    square_mm : instead of boards: side of a square (tag; distance of circles); the images say which board it is.
+    square_mm : instead of --board: side of a square (tag; distance of circles); the images say which board it is.
     model : pinhole, brown, kannala_brandt, scaramuzza, ucm, eucm, double_sphere (default: auto, the lowest held-out
         error).
     cameras : number of cameras whose images the folders hold (default: by the names of images and folders, and by the
@@ -203,7 +203,7 @@ class DemoOptions(NamesFiles):
 
     Attributes
     ----------
-    output : new folder for the capture, and for the results its subfolder `out`.
+    output : new folder for the capture, and for the results its subfolder out.
     seed : seed of the random scene.
     jobs : number of processes (default: one per core).
     """
