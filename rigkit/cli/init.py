@@ -75,7 +75,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _session(args: argparse.Namespace) -> int:
     from rigkit.cli.console import progress_on_stderr
+    from rigkit.cli.manifest_words import parse_length
+    from rigkit.io.boards.board_words import board_files
     from rigkit.io.disk.writing import ensure_writable, write_together
+    from rigkit.io.media.images import images_below, require_folder
     from rigkit.workflows.calibration.calibrate_any import new_session
     from rigkit.workflows.options.cameras import FolderOptions
 
@@ -84,8 +87,11 @@ def _session(args: argparse.Namespace) -> int:
         raise InputError(
             "init --session: only --board, --square-mm, --cameras and --model apply; leave the other options out"
         )
+    if args.square_mm is not None:
+        parse_length("--square-mm", args.square_mm)
+    require_folder(args.folder)
     path = args.output or args.folder / "session.toml"
-    ensure_writable([path], force=args.force)
+    ensure_writable([path], force=args.force, inputs=[*board_files(args.board), *images_below(args.folder)])
     options = FolderOptions(
         boards=tuple(args.board), square_mm=args.square_mm, model=args.model, cameras=_number_of_cameras(args.cameras)
     )

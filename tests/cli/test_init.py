@@ -233,6 +233,31 @@ def test_a_session_of_as_many_cameras_as_are_known(tmp_path: Path, capsys: pytes
     assert len(load_session(tmp_path / "session.toml").images) == 6
 
 
+@pytest.mark.parametrize(
+    ("words", "refusal"),
+    [
+        ("photos --square-mm -3", "init: --square-mm: a positive number of mm is needed, got '-3.0'"),
+        ("photos --square-mm nan", "init: --square-mm: a positive number of mm is needed, got 'nan'"),
+        ("photos --square-mm 50 --board 8x6x50", "rigkit: --board states the square size already"),
+        ("photos/1.jpg --board 8x6x50", "'photos/1.jpg' is an image; give the folder that holds it instead, 'photos'"),
+        ("photos --board b.toml -o b.toml --force", "'b.toml'"),
+        ("photos --board 8x6x50 -o photos/1.jpg --force", "'photos/1.jpg'"),
+    ],
+)
+def test_impossible_sessions_are_refused(
+    words: str, refusal: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Inputs stay also with --force."""
+    monkeypatch.chdir(tmp_path)
+    Path("photos").mkdir()
+    Path("photos/1.jpg").write_bytes(b"an image")
+    Path("b.toml").write_text("a board")
+    assert main(["init", "--session", *words.split()]) == 2
+    assert refusal in capsys.readouterr().err
+    assert Path("photos/1.jpg").read_bytes() == b"an image" and Path("b.toml").read_text() == "a board"
+    assert not list(tmp_path.rglob("session.toml"))
+
+
 @pytest.mark.parametrize("declared", ["90", "first=90+-x", "190+-1", "90+-0"])
 def test_impossible_angles_are_refused(declared: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "first").mkdir()

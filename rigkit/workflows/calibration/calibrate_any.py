@@ -197,7 +197,7 @@ def _keep_corners(path: Path, found: Mapping[Path, FoundCorners]) -> None:
 def _boards(places: Sequence[Path], declared: FolderOptions, progress: Progress) -> tuple[str, ...]:
     """Return the declared boards, or those that the images show, with squares of `declared.square_mm`."""
     if declared.boards and declared.square_mm is not None:
-        raise InputError("calibrate: --board states the square size already; leave --square-mm out")
+        raise InputError("--board states the square size already; leave --square-mm out")
     if declared.square_mm is None:
         return declared.boards
     boards = boards_seen(places, declared.square_mm, progress)
