@@ -116,8 +116,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             if not arguments:
                 say("no verb given; choose one of the list above", before=build_parser(None).format_help())
                 return ExitCode.BAD_INPUT
-            if "" in arguments:
-                # As a path it would be the current folder.
+            # As a path it would be the current folder.
+            if any(not one or (one.startswith("--") and one.endswith("=")) for one in arguments):
                 raise InputError("an argument is empty (''), perhaps an unset shell variable; give a value")
             args = build_parser(verb).parse_args(arguments)
             with logging_to(verbose=args.verbose, log_file=args.log_file):

@@ -46,9 +46,10 @@ def test_a_file_of_another_kind_is_not_called_a_session(
 
 
 def test_an_empty_argument_is_not_the_current_folder(capsys: pytest.CaptureFixture[str]) -> None:
-    for words in (["calibrate", "", "--board", "9x6x25"], ["mesh", ""], ["mesh", "."]):
+    empty = (["calibrate", "", "--board", "9x6x25"], ["mesh", ""], ["detect", "a.png", "--overlay="])
+    for words in (*empty, ["mesh", "."]):
         assert main(words) == 2
-        assert ("an argument is empty" in (printed := capsys.readouterr().err)) == ("" in words), printed
+        assert ("an argument is empty" in (printed := capsys.readouterr().err)) == (words in empty), printed
 
 
 def test_a_camera_of_a_rig_that_sees_no_board(
