@@ -38,8 +38,9 @@ def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[ImagesByM
     else moment by moment, in the order of the cameras. Raises InputError for unequal numbers of images.
     """
     if len(names) == 1:
+        moments = [[image] for image in images_in(sources)]
         warn_of_several_cameras(sources)
-        return [[image] for image in images_in(sources)], []
+        return moments, []
     if not all(source.is_dir() for source in sources):
         images = list(images_in(sources))
         return _by_names(names, images) or _in_order(names, images), []

@@ -93,9 +93,9 @@ def rectify_image(
     if holds_several(image) and options.output.suffix:
         what = "folder" if Path(image).is_dir() else "video"
         raise InputError(f"rectify: '{image}' is a {what}, so -o must name a folder, not '{options.output.name}'")
-    warn_of_several_cameras([Path(image)])
     with ExitStack() as stack:
         sources = _sources(Path(image), stack)
+        warn_of_several_cameras([Path(image)])
         jobs = _outputs(sources, options.output) if _is_folder(options.output) else [(sources[0], options.output)]
         _ensure_all([out for _, out in jobs], options, (*map(_file, sources), camera))
         source = import_camera(camera)

@@ -200,3 +200,9 @@ def test_a_folder_of_two_cameras_for_one_is_named(tmp_path: Path, caplog: pytest
     _images(tmp_path, "right01", "right02")
     assert len(moments_of(("cam",), [tmp_path])[0]) == 4
     assert "are of 2 cameras (left, right), and all are taken as one camera's" in caplog.text
+    caplog.clear()
+    for name in ("left", "right"):
+        _images(tmp_path / "apart" / name, "1", "2")
+    with pytest.raises(InputError, match="give one folder a camera"):
+        moments_of(("cam",), [tmp_path / "apart"])
+    assert not caplog.text, "they are not taken as one camera's"
