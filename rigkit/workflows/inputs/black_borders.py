@@ -16,7 +16,8 @@ from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
-from rigkit.io.media.images import Image, read_image, to_grey
+from rigkit.detection.saddles.response import GreyImage, grey_image
+from rigkit.io.media.images import read_image
 
 BLACK_LEVEL = 8
 """Largest grey level, of 255, of black: JPEG moves that of a border by a few levels."""
@@ -42,7 +43,7 @@ def black_borders(calibration: Calibration, images: Mapping[str, Path]) -> list[
     found = []
     for name in (there[k] for k in chosen):
         try:
-            found.append(_widths(to_grey(read_image(images[name]))))
+            found.append(_widths(grey_image(read_image(images[name]))))
         except InputError:
             # Corners are kept beside the session: the image itself may have gone bad since.
             continue
@@ -61,9 +62,9 @@ def black_borders(calibration: Calibration, images: Mapping[str, Path]) -> list[
     ]
 
 
-def _widths(grey: Image) -> FloatArray:
+def _widths(grey: GreyImage) -> FloatArray:
     """Return the widths (4, LINES_OF_SIDE) px of the black border at the left, right, top and bottom."""
-    black = grey <= BLACK_LEVEL * (np.iinfo(grey.dtype).max // 255)
+    black = grey <= BLACK_LEVEL
     out = []
     for lines in (black, black.T):
         some = lines[(np.linspace(*ALONG_SIDE, LINES_OF_SIDE) * len(lines)).astype(int)]

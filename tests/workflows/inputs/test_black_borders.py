@@ -41,6 +41,16 @@ def behind_a_rail(image: Image) -> Image:
     return np.asarray(np.where((abs(x - 319.5) > 300.0) & (abs(y - 239.5) < 120.0), 0, image), dtype=np.uint8)
 
 
+def twelve_bits(image: Image) -> Image:
+    return (image.astype(np.uint16) << 4).astype(np.uint16)
+
+
+def dim_sides(image: Image) -> Image:
+    """Return the image with sides that bulge as black ones do, at a quarter of the brightness."""
+    white = np.full_like(image, 255)
+    return np.asarray(np.where(undistorted(white, 1.0) == 255, image, image // 4), dtype=np.uint8)
+
+
 @pytest.mark.parametrize(
     ("change", "reported"),
     [
@@ -50,8 +60,10 @@ def behind_a_rail(image: Image) -> Image:
         (in_circle, False),
         (with_bars, False),
         (behind_a_rail, False),
+        (lambda image: twelve_bits(undistorted(image, 1.0)), True),
+        (lambda image: twelve_bits(dim_sides(image)), False),
     ],
-    ids=["kept whole", "cropped", "as they are", "image circle", "bars", "rail"],
+    ids=["kept whole", "cropped", "as they are", "image circle", "bars", "rail", "12 bits", "12 bits, dim sides"],
 )
 def test_black_borders_of_undistorted_images_are_named(
     change: Callable[[Image], Image], reported: bool, tmp_path: Path, rng: np.random.Generator
@@ -61,7 +73,10 @@ def test_black_borders_of_undistorted_images_are_named(
     images = {view.image: tmp_path / view.image for view in result.views}
     for path in images.values():
         picture = rng.integers(60, 200, size=SIZE[::-1]).astype(np.uint8)
-        cv2.imwrite(str(path), change(picture), [cv2.IMWRITE_JPEG_QUALITY, 90])
+        changed = change(picture)
+        jpeg = changed.dtype == np.uint8
+        data = cv2.imencode(*((".jpg", changed, [cv2.IMWRITE_JPEG_QUALITY, 90]) if jpeg else (".png", changed)))[1]
+        path.write_bytes(data.tobytes())
     found = black_borders(result, images)
     assert [("black bulges into the images" in str(finding)) for finding in found] == [True] * reported
     for path in list(images.values())[1:]:
