@@ -22,7 +22,7 @@ class DatasetOptions(WrittenFiles):
 
     Attributes
     ----------
-    pairs : only this pair.
+    pairs : only the pair of this name (default: all).
     output : folder for the results; None: nothing is written.
     recalibrate : calibrate from the images again, even if there are calibration files.
     chain : work on raw pixels (default) or rectified perspective views.
