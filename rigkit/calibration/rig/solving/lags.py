@@ -43,8 +43,9 @@ CHANCE = 0.01
 MAX_ROUNDS, SETTLED = 8, 0.01
 """Trajectories and times of images are recomputed until the cost changes by less than this part."""
 MAX_READOUT_ROUNDS, SETTLED_SIGMAS, MAX_RELAXATION = 16, 0.1, 10.0
-"""A step of readouts holds the rig, which follows and leaves a part of the error: steps are lengthened by Aitken's
-relaxation (U. Kuettler, W. A. Wall, Comput. Mech. 43, 2008) until they are this small a part of their sigmas."""
+"""A step of readouts holds the rig, which follows: a part of the error is left, or the step goes too far. Steps are
+lengthened or shortened, up to so many times, by Aitken's relaxation (U. Kuettler, W. A. Wall, Comput. Mech. 43, 2008)
+until they are this small a part of their sigmas."""
 FIRST_SPREAD, MIN_SPREAD, SPREAD_ROUNDS = 0.1, 1e-4, 50
 """Standard deviation of the lags of a camera's images, in the time between frames: the initial value, the least one
 that is distinguishable from zero, and the number of iterations."""
@@ -148,8 +149,8 @@ def _with_readouts(
         before, (step, sigma, _) = step, readout_steps(observations, lagging.state)
         change = before - step
         relaxation *= float(before @ change) / max(float(change @ change), np.finfo(float).tiny)
-        relaxation = min(max(relaxation, 1.0), MAX_RELAXATION)
-        if (np.abs(relaxation * step) <= SETTLED_SIGMAS * sigma).all():
+        relaxation = min(max(relaxation, 1.0 / MAX_RELAXATION), MAX_RELAXATION)
+        if (np.abs(max(relaxation, 1.0) * step) <= SETTLED_SIGMAS * sigma).all():
             break
     return observations, lagging
 

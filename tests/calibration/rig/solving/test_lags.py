@@ -18,9 +18,11 @@ from rigkit.calibration.rig.certainty.readouts import readout_error
 from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.solving import lags
 from rigkit.calibration.rig.solving.exposure_times import POINTS
 from rigkit.calibration.rig.solving.lags import Timing, cost_of_own_times, times_of, with_trajectories
 from rigkit.calibration.rig.solving.shutters import readout_errors_of_speeds, readout_steps, with_longer_readouts
+from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
@@ -173,6 +175,25 @@ def test_readouts_are_solved_for_until_they_settle() -> None:
     joint = joint_with_readouts(0)
     step, sigma, _ = readout_steps(joint.observations, joint.solution.state)
     assert (np.abs(step) <= 0.1 * sigma).all()
+
+
+@pytest.mark.parametrize("reach", [(0.2, 0.5), (1.0, 2.4), (2.2, 2.4)])
+def test_steps_of_readouts_that_fall_short_or_go_too_far_settle(
+    reach: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A step takes `reach` times the error of each camera's readout away: with more than two it grows."""
+    joint, asked = joint_with_readouts(0), np.array([0.1, -0.05])
+
+    def steps(observations: RigObservations, state: RigState) -> tuple[FloatArray, FloatArray, FloatArray]:
+        assert state.exposures is not None
+        return np.array(reach) * (asked - state.exposures.readouts), np.full(2, 1e-3), np.full(2, 10.0)
+
+    monkeypatch.setattr(lags, "readout_steps", steps)
+    monkeypatch.setattr(lags, "with_longer_readouts", lambda observations, state, step: observations)
+    monkeypatch.setattr(lags, "_solved_again", lambda observations, lagging, *_, **__: lagging)
+    _, found = lags._with_readouts(joint.observations, joint.solution, joint.sigma_px, joint.times)
+    assert found.state.exposures is not None
+    assert (np.abs(found.state.exposures.readouts - asked) * np.array(reach) <= 1e-4).all()
 
 
 def test_sigmas_of_readouts_count_errors_of_speeds() -> None:
