@@ -121,13 +121,15 @@ def gradients(
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
     """Return d quantity / d pixel (N, M, K, 2 C) for C cameras, one or two, d quantity / d calibration (N, M, P) in the
     order of `Layout.of_cameras`, d point / d pixel (N, K, 3, 2 C), and a mask (N,) of the places that all cameras
-    see. The rig's frame is that of the first camera."""
+    see. `points` (N, K, 3) mm and the weights are in the frame of the first camera."""
     layout, placed = Layout.of_cameras(cameras), zip(cameras, cam_from_rig, strict=True)
-    each = [RigProjection.of(camera, pose, points, layout, k) for k, (camera, pose) in enumerate(placed)]
+    rig_from_first = cam_from_rig[0].inverse()
+    in_rig = rig_from_first.apply(points)
+    each = [RigProjection.of(camera, pose, in_rig, layout, k) for k, (camera, pose) in enumerate(placed)]
     seen = np.all([own.seen for own in each], axis=(0, 2))
     J, D = (
         np.where(seen[:, None, None, None], np.concatenate(part, axis=2), 0.0)
-        for part in ([own.by_point for own in each], [own.by_globals for own in each])
+        for part in ([own.by_point @ rig_from_first.rotation for own in each], [own.by_globals for own in each])
     )
     if len(cameras) > 1:
         normal = np.swapaxes(J, -1, -2) @ J

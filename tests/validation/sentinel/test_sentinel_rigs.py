@@ -177,15 +177,19 @@ def test_pictures_too_far_off_to_linearise_are_not_of_these_cameras(tmp_path: Pa
         evaluate_evidence(rig, lambda _: replace(far, rms_px=0.1))
 
 
-def test_what_a_change_of_a_rig_costs_in_a_length() -> None:
+@pytest.mark.parametrize("turn", [0.0, 0.3], ids=["first camera's frame", "own frame"])
+def test_what_a_change_of_a_rig_costs_in_a_length(turn: float) -> None:
     """The old rig measures points that the changed one sees."""
-    monitored, task = _rig(), Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=700.0)
+    from_frame = Rigid3(exp_so3(np.array([0.0, turn, 0.0])), 500.0 * np.array([turn, 0.0, -turn]))
+    placed = tuple(pose @ from_frame for pose in _rig().cam_from_rig)
+    monitored = replace(_rig(), cam_from_rig=placed)
+    task = Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=700.0)
     step = np.zeros(monitored.layout.count)
     step[monitored.layout.cameras[0]][:2] = 0.3
     step[monitored.layout.mount(1)] = 2e-4, 4e-4, -3e-4, 0.02, 0.0, 0.01
     now, (goal,) = monitored.changed(step), length_goals(monitored.cameras, monitored.cam_from_rig, task)
     rays, valid = monitored.cameras[0].unproject(grid_pixels(monitored.cameras[0].size_px, TASK_CELLS).reshape(-1, 2))
-    points = measured_points(rays[valid], task, is_rig=True)[0]
+    points = placed[0].inverse().apply(measured_points(rays[valid], task, is_rig=True)[0])
     seen, shown = np.ones(len(points), dtype=bool), []
     for camera, pose in zip(now.cameras, now.cam_from_rig, strict=True):
         pixels, sees = camera.project(pose.apply(points))
