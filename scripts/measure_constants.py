@@ -29,6 +29,7 @@ import re
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from types import CodeType, FrameType, ModuleType
@@ -307,14 +308,32 @@ def measure(looks: Sequence[Look], modules: Sequence[str], jobs: int = 1) -> Non
         found, false = sum(len(one.corners) for one in own), sum(one.false for one in own)
         print(f"{kind}: {len(own)} images, {found} corners, {false} false boards", flush=True)
     MEASURED.extend(measured)
-    # Forked processes have what was measured.
-    with multiprocessing.get_context("fork").Pool(jobs) as pool:
-        for row in pool.imap(_row, [(module.__name__, name) for module, name in constants]):
+    with ThreadPoolExecutor(jobs) as pool:
+        for row in pool.map(_row_of_own_process, [(module.__name__, name) for module, name in constants]):
             print(row, flush=True)
 
 
 MEASURED: list[tuple[Look, Found, set[Line]]] = []
 """The looks, what they find, and the lines that they run."""
+
+
+def _row_of_own_process(constant: tuple[str, str]) -> str:
+    """Return the row of a constant. A number such as the degree of a surface, for which a kernel has memory up to the
+    largest that it knows, may end the process."""
+    # A forked process has what was measured.
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=lambda: sender.send(_row(constant)))
+    process.start()
+    sender.close()
+    try:
+        return str(receiver.recv())
+    except EOFError:
+        path, name = constant
+        shown = f"{path.removeprefix('rigkit.detection.')}.{name}"
+        return f"| {shown} | {value_of(sys.modules[path], name):g} | 0 | {' | '.join(['no other value'] * 2)} |"
+    finally:
+        process.join()
 
 
 def _row(constant: tuple[str, str]) -> str:

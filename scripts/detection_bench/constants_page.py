@@ -9,7 +9,7 @@ from pathlib import Path
 PAGE = Path(__file__).parents[2] / "docs/pages/detection-constants.md"
 ROW = re.compile(r"^\| ([a-z_.]+)\.(\w+(?:\[\d+\])?) \| (\S+) \| (\d+) \| (.*) \| (.*) \|$", re.MULTILINE)
 IMAGES = re.compile(r"^(?:REAL|RENDERED): \d+ images.*$", re.MULTILINE)
-NO_FACTOR = ("same", "-", "not called", "not read")
+NO_FACTOR = ("same", "-", "not called", "not read", "no other value")
 
 Row = tuple[str, str, str, str, str, str]
 """Module, constant, value, images, and what smaller and larger values do."""
@@ -21,7 +21,8 @@ Each number that `rigkit.detection` decides by was divided and multiplied by 1.2
 gives, on both sides, the smallest of these factors that has an effect, and the effect: corners lost (more than 1 %),
 false boards found, corners moved (more than 0.3 of their sigmas, rms), or sigmas changed (more than 10 %, rms). "-"
 means that even a factor of 4 has none of these effects, "same" that it changes no digit, "not called" that no image
-leads to the constant. What each constant separates is said beside it in the source.
+leads to the constant, "no other value" that the kernels know none. What each constant separates is said beside it in
+the source.
 
 {images}
 
