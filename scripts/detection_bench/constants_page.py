@@ -21,14 +21,14 @@ Each number that `rigkit.detection` decides by was divided and multiplied by 1.2
 gives, on both sides, the smallest of these factors that has an effect, and the effect: corners lost (more than 1 %),
 false boards found, corners moved (more than 0.3 of their sigmas, rms), or sigmas changed (more than 10 %, rms). "-"
 means that even a factor of 4 has none of these effects, "same" that it changes no digit, "not called" that no image
-leads to the constant, "no other value" that the kernels know none. What each constant separates is said beside it in
+leads to the constant, "no other value" that the code takes none. What each constant separates is said beside it in
 the source.
 
 {images}
 
 Measured on {date} by `scripts/measure_constants.py`; `scripts/detection_bench/constant_looks.py` lists the images. Of
 {total} numbers, {both} have an effect on both sides, {one} on one side, {none} on none; for {near} of them a factor of
-1.25 has one. {missing} numbers are not measured yet.
+1.25 has one.
 """
 
 
@@ -50,7 +50,6 @@ def page(printed: str, constants: Sequence[tuple[str, str]], date: str) -> str:
             both=counts.count(2),
             one=counts.count(1),
             none=counts.count(0),
-            missing=len(constants) - len(kept),
             near=sum(any(_factor(side).startswith("1.25: ") for side in row[4:]) for row in kept),
         )
     ]
