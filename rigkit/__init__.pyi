@@ -29,6 +29,8 @@ from rigkit.core.errors import InputError as InputError
 from rigkit.core.errors import RigkitError as RigkitError
 from rigkit.core.matches import DirectionPairs as DirectionPairs
 from rigkit.core.matches import Matches as Matches
+from rigkit.core.measurement_task import Quantity as Quantity
+from rigkit.core.measurement_task import Task as Task
 from rigkit.core.posetype import PoseType as PoseType
 from rigkit.core.truth import PairTruth as PairTruth
 from rigkit.detection.detect import detect_boards as detect_boards
@@ -64,8 +66,6 @@ from rigkit.relative_pose.solvers.registry import fundamental_for as fundamental
 from rigkit.report.notebook import notebook_progress as notebook_progress
 from rigkit.report.pages.calibration_page import CalibrationSection as CalibrationSection
 from rigkit.report.pages.calibration_page import build_calibration_page as build_calibration_page
-from rigkit.validation.certificate.contracts import Quantity as Quantity
-from rigkit.validation.certificate.contracts import Task as Task
 from rigkit.validation.checks import ValidationReport as ValidationReport
 from rigkit.validation.checks import validate as validate
 from rigkit.validation.crosscheck import CrossCheckReport as CrossCheckReport
@@ -108,8 +108,6 @@ from rigkit.workflows.inputs.identify_board import identify_board as identify_bo
 from rigkit.workflows.options.cameras import Cache as Cache
 from rigkit.workflows.options.cameras import CalibrateOptions as CalibrateOptions
 from rigkit.workflows.options.cameras import CertifyOptions as CertifyOptions
-from rigkit.workflows.options.cameras import CheckOptions as CheckOptions
-from rigkit.workflows.options.cameras import CoachOptions as CoachOptions
 from rigkit.workflows.options.cameras import DemoOptions as DemoOptions
 from rigkit.workflows.options.cameras import DetectOptions as DetectOptions
 from rigkit.workflows.options.cameras import DiffOptions as DiffOptions
@@ -119,6 +117,7 @@ from rigkit.workflows.options.cameras import HandEyeOptions as HandEyeOptions
 from rigkit.workflows.options.cameras import PrintOptions as PrintOptions
 from rigkit.workflows.options.cameras import RectifyOptions as RectifyOptions
 from rigkit.workflows.options.cameras import StudyOptions as StudyOptions
+from rigkit.workflows.options.check import CheckOptions as CheckOptions
 from rigkit.workflows.options.clouds import DatasetOptions as DatasetOptions
 from rigkit.workflows.options.clouds import ExportCloudOptions as ExportCloudOptions
 from rigkit.workflows.options.clouds import MeshOptions as MeshOptions
@@ -127,6 +126,7 @@ from rigkit.workflows.options.clouds import ReconstructOptions as ReconstructOpt
 from rigkit.workflows.options.clouds import RigSceneOptions as RigSceneOptions
 from rigkit.workflows.options.clouds import SceneOptions as SceneOptions
 from rigkit.workflows.options.clouds import ValidateOptions as ValidateOptions
+from rigkit.workflows.options.coach import CoachOptions as CoachOptions
 from rigkit.workflows.outputs.export_camera import ExportedCamera as ExportedCamera
 from rigkit.workflows.outputs.export_camera import ExportedRig as ExportedRig
 from rigkit.workflows.outputs.export_camera import export_camera as export_camera

@@ -39,14 +39,15 @@ from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
+from rigkit.core.measurement_task import Quantity, Task
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.synthetic.scene import place_board
 from rigkit.validation.certificate.certify import certify
-from rigkit.validation.certificate.contracts import Quantity, Task, instrument_of
 from rigkit.validation.certificate.propagation import gradients, measured_points, variances
+from rigkit.validation.certificate.result import instrument_of
 from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.validation.sentinel.watch import monitored_camera, monitored_rig
 

@@ -11,18 +11,15 @@ have first-order errors under perspective; harmonic means, or a projective fit, 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.choices import SUPPORTS, Support
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.base import Pattern
-
-Support = Literal["chord", "neighbours", "line", "patch"]
-SUPPORTS: tuple[Support, ...] = get_args(Support)
 
 MIN_COSINE = 0.2
 """Corners whose rays are more than 78 degrees from that of a corner are not used for its directions."""

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
+    from rigkit.core.measurement_task import Task
     from rigkit.planning.candidates import Reach
-    from rigkit.validation.certificate.contracts import Task
 
 
 def add_board_argument(parser: argparse._ActionsContainer, words: str, *, required: bool = False) -> None:
@@ -37,7 +37,7 @@ def reach_of(args: argparse.Namespace) -> Reach:
 
 def length_of(args: argparse.Namespace, verb: str) -> Task | None:
     """Return the length to be measured, or None; raises InputError for a length without distance or vice versa."""
-    from rigkit.validation.certificate.contracts import Quantity, Task
+    from rigkit.core.measurement_task import Quantity, Task
 
     if (args.length is None) != (args.distance is None):
         raise InputError(f"{verb}: --length and --distance belong together")

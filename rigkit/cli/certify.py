@@ -35,9 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.core.errors import ExitCode, InputError
+    from rigkit.core.measurement_task import Quantity, Task
     from rigkit.report.pages.certificate_page import basis, causes_table
     from rigkit.report.tables import tables_to_text
-    from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.workflows.checks.certify import certify_file
 
     quantity = next(q for q in Quantity if getattr(args, q) is not None)

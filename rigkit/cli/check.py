@@ -19,7 +19,7 @@ from rigkit.cli.console import (
     progress_on_stderr,
 )
 from rigkit.core.errors import ExitCode, InputError
-from rigkit.workflows.options.cameras import CheckOptions
+from rigkit.workflows.options.check import CheckOptions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from rigkit.cli.aim_arguments import add_board_argument, add_reach_arguments, length_of, reach_of
 from rigkit.cli.console import add_options, options_of, progress_on_stderr
 from rigkit.core.errors import ExitCode, InputError
-from rigkit.workflows.options.cameras import CoachOptions
+from rigkit.workflows.options.coach import CoachOptions
 
 MAX_CAMERAS = 8
 """Of a browser: more streams than this no machine carries."""

@@ -8,7 +8,7 @@ The squares give the scale, as for free points.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,11 +27,9 @@ from rigkit.reconstruction.board_planes import (
     variance_and_covariance,
 )
 from rigkit.reconstruction.coplanar_problem import CoplanarProblem, CoplanarState
+from rigkit.reconstruction.geometry import PairGeometry
 from rigkit.reconstruction.moved_cameras import Known, moved_cameras, moved_pixels, visible_in_all
 from rigkit.reconstruction.scale import board_scales_and_gradients, square_sigmas
-
-if TYPE_CHECKING:
-    from rigkit.reconstruction.geometry import PairGeometry
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

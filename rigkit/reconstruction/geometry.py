@@ -7,7 +7,6 @@ poses. The squares give the scale, and the points are triangulated. Affine estim
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,15 +16,13 @@ from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.core.printing import brief
 from rigkit.reconstruction.metric import MetricPose, TriangulatedPoints, metric_pose, triangulate_matches
+from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.relative_pose.refinement.noise_level import POSE_FREEDOM, variance_factor
 from rigkit.relative_pose.refinement.refine import RefinedPose, refine_pose, rules_out
 from rigkit.relative_pose.refinement.select import DEFAULT_LEVEL_RAD, PoseTypeEvidence, pose_type_evidence
 from rigkit.relative_pose.solvers.pose import choose_pose, essential_from_pose
 from rigkit.relative_pose.solvers.registry import fundamental_for
-
-if TYPE_CHECKING:
-    from rigkit.reconstruction.pairing import MatchedPair
 
 MAX_BASELINE_SIGMA = 0.2
 """Largest relative standard deviation of the baseline: above, the reconstruction would be noise."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -31,11 +31,8 @@ from rigkit.reconstruction.board_planes import (
     maximum_likelihood,
     variance_and_covariance,
 )
+from rigkit.reconstruction.geometry import PairGeometry
 from rigkit.reconstruction.moved_cameras import Known, moved_cameras, moved_pixels
-
-if TYPE_CHECKING:
-    from rigkit.reconstruction.geometry import PairGeometry
-
 
 PlacedLattices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """cam2_from_cam1 (4, 4), cam1_from_board (K, 4, 4), and log (K,) of the boards' true over declared sizes."""

@@ -10,13 +10,14 @@ from typing import Literal
 import numpy as np
 
 from rigkit.affine.affinities import DirectionNoise
-from rigkit.affine.directions import Support, direction_field
+from rigkit.affine.directions import direction_field
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import board_with_fixed_pupil
 from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
+from rigkit.core.choices import Support
 from rigkit.core.detections import BoardDetection, common_corners
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import DirectionPairs, Matches

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +20,10 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, RayJacobians, Rays, in_8_bits
 from rigkit.core.boards import Board
+from rigkit.core.choices import PLANE_CHOICES, Planes
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
-from rigkit.core.planes import PLANE_CHOICES, Planes
 from rigkit.core.posetype import PoseType
 from rigkit.core.printing import brief, drawn
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
@@ -35,10 +34,8 @@ from rigkit.reconstruction.coplanar_planes import coplanar_planes
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.lattice_planes import lattice_planes
 from rigkit.reconstruction.metric import TriangulatedPoints
+from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.relative_pose.solvers.pose import essential_from_pose
-
-if TYPE_CHECKING:
-    from rigkit.reconstruction.pairing import MatchedPair
 
 GREY = 160
 

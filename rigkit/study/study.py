@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.affine.affinities import EpipolarNormals
-from rigkit.affine.directions import SUPPORTS, direction_field
+from rigkit.affine.directions import direction_field
 from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import AFFINE_METHODS, affines_from_directions, needs_epipolar
 from rigkit.affine.unscaled import SCALES
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.boards import Board
+from rigkit.core.choices import SUPPORTS
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs

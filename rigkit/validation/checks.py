@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from rigkit.core.arrays import FloatArray, without_nan
+from rigkit.core.choices import Planes
 from rigkit.core.errors import InputError
-from rigkit.core.planes import Planes
 from rigkit.core.printing import brief
 from rigkit.core.truth import PairTruth
 from rigkit.reconstruction.calibration_shifts import CalibrationShifts

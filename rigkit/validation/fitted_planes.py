@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rigkit.core.arrays import FloatArray
+from rigkit.core.choices import Planes
 from rigkit.core.errors import InputError
-from rigkit.core.planes import Planes
 from rigkit.reconstruction.board_planes import BoardPlanes
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.planes import NormalErrors, normal_errors

@@ -24,7 +24,7 @@ from rigkit.io.media.video import read_timestamps
 from rigkit.workflows.calibration.calibrate import calibrate_session
 from rigkit.workflows.capture.coach import coach_frames, coach_recording, open_coach
 from rigkit.workflows.inputs.frames import frames_of_videos
-from rigkit.workflows.options.cameras import CoachOptions
+from rigkit.workflows.options.coach import CoachOptions
 
 SMALL = Board("small", 5, 4, 30.0, 30.0)
 GUIDE = GuideOptions(boards=(SMALL,))

@@ -18,7 +18,7 @@ from rigkit.coach.guide import GuideOptions
 from rigkit.coach.server import LOCAL, MAX_UPLOAD_BYTES, coach_app
 from rigkit.core.boards import Board
 from rigkit.workflows.capture.coach import open_coach
-from rigkit.workflows.options.cameras import CoachOptions
+from rigkit.workflows.options.coach import CoachOptions
 
 TOKEN = "s3cret-of-this-page"
 HOST = "127.0.0.1:8137"

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from helpers.board_scenes import Scene, detection, fisheye_camera, regular_camera, trihedral_scene
 
-from rigkit.affine.directions import Support, direction_field
+from rigkit.affine.directions import direction_field
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
+from rigkit.core.choices import Support
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3

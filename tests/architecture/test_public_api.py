@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 from helpers.data import REPOSITORY
@@ -72,6 +74,16 @@ def test_names_for_type_checkers_are_those_that_are_imported_on_first_use() -> N
     }
     assert declared == vars(rigkit)["_homes"]()
     assert sorted(declared) == rigkit.__all__ == sorted(set(dir(rigkit)) - {"__all__", "__version__"})
+
+
+def test_types_of_public_names_can_be_read() -> None:
+    """By tools that read annotations while the program runs: notebooks, forms, validators."""
+    for name in rigkit.__all__:
+        public = getattr(rigkit, name)
+        inside = vars(public).values() if isinstance(public, type) else ()
+        functions = [getattr(own, "fget", None) or getattr(own, "__func__", own) for own in inside]
+        for annotated in (public, *filter(inspect.isfunction, functions)):
+            get_type_hints(annotated)
 
 
 def test_every_verb_has_its_functions_on_the_page_of_python() -> None:

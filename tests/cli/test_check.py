@@ -37,7 +37,7 @@ from rigkit.validation.sentinel.hypotheses import hypotheses_of
 from rigkit.validation.sentinel.judge import Change, SentinelCheck
 from rigkit.validation.sentinel.power import Power
 from rigkit.workflows.checks.check import _replaced_by_known, _require_right_order, check_pictures
-from rigkit.workflows.options.cameras import CheckOptions
+from rigkit.workflows.options.check import CheckOptions
 
 BOARD = Board("board", 9, 6, 25.0, 25.0)
 CAMERA = Brown((640, 480), np.array([620.0, 621.0, 322.0, 236.0, -0.12, 0.05, 0.0, 0.0, 0.0]))

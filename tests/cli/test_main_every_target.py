@@ -30,7 +30,7 @@ from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard, place_board, sees_paper
 from rigkit.workflows.capture.coach import open_coach
-from rigkit.workflows.options.cameras import CoachOptions
+from rigkit.workflows.options.coach import CoachOptions
 
 SIZE = (640, 480)
 LEFT = Pinhole(SIZE, np.array([520.0, 520.0, 321.3, 236.1]))

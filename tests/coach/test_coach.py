@@ -29,7 +29,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibrations.calibration_file import load_calibration
 from rigkit.planning.goal import projection_goal
 from rigkit.workflows.capture.coach import coach_frames, coach_recording, open_coach, run_coach
-from rigkit.workflows.options.cameras import CoachOptions
+from rigkit.workflows.options.coach import CoachOptions
 
 FRAMES = 9
 

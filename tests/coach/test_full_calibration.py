@@ -28,7 +28,7 @@ from rigkit.planning.candidates import Reach, board_poses_in_view
 from rigkit.planning.goal import Goal, projection_goal
 from rigkit.workflows.calibration.calibrate import SessionCalibration
 from rigkit.workflows.capture.coach import finished_words, open_coach
-from rigkit.workflows.options.cameras import CoachOptions
+from rigkit.workflows.options.coach import CoachOptions
 
 FRAMES, NOISE_PX = 10, 0.05
 EMPTY = FrameObservation(size_px=SIZE, view=None)

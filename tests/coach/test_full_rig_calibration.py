@@ -23,10 +23,10 @@ from rigkit.coach.guide import CHECKING, GuideOptions
 from rigkit.coach.look import FrameObservation
 from rigkit.coach.rig import MAX_HELP, RigGuide
 from rigkit.core.errors import DegenerateError
+from rigkit.core.measurement_task import Quantity, Task
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import Knowledge
-from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.capture.coach import finished_words

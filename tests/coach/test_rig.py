@@ -34,6 +34,7 @@ from rigkit.coach.look import FrameObservation, observe_frame
 from rigkit.coach.rig import SHARED_FRAMES, RigGuide
 from rigkit.coach.sources import frames_of_folders
 from rigkit.core.errors import InputError
+from rigkit.core.measurement_task import Quantity, Task
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.rigid3 import Rigid3
@@ -42,9 +43,8 @@ from rigkit.io.manifests.rig_session import load_rig_session
 from rigkit.planning.candidates import board_poses_in_view
 from rigkit.planning.information import CornerError
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
-from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.workflows.capture.coach import open_coach
-from rigkit.workflows.options.cameras import CoachOptions
+from rigkit.workflows.options.coach import CoachOptions
 
 DRAWS = 120
 

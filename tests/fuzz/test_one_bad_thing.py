@@ -25,7 +25,8 @@ from rigkit.io.calibrations.history_file import load_history
 from rigkit.workflows.capture.coach import open_coach
 from rigkit.workflows.handeye import calibrate_hand_eye
 from rigkit.workflows.inputs.frames import frames_of_videos
-from rigkit.workflows.options.cameras import CoachOptions, HandEyeOptions
+from rigkit.workflows.options.cameras import HandEyeOptions
+from rigkit.workflows.options.coach import CoachOptions
 
 BOARD = Board("small", 5, 4, 30.0, 30.0)
 CHECK = ["check", "calibration.json", "--board", "floor.toml"]

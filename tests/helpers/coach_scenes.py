@@ -22,7 +22,7 @@ from rigkit.planning.information import BoardPoses
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.workflows.options.cameras import CoachOptions
+from rigkit.workflows.options.coach import CoachOptions
 
 SIZE = (640, 480)
 BOARD = Board("board-9x6x25", 9, 6, 25.0, 25.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.core.arrays import FloatArray
-from rigkit.validation.certificate.contracts import Quantity
+from rigkit.core.measurement_task import Quantity
 
 
 def read_off(quantity: Quantity, points: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
-from rigkit.core.planes import Planes
+from rigkit.core.choices import Planes
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rotation import angle_between
 from rigkit.reconstruction.calibration_shifts import calibration_shifts

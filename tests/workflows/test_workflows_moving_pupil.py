@@ -21,8 +21,8 @@ from rigkit.core.arrays import Pixels, Points
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
+from rigkit.core.measurement_task import Quantity, Task
 from rigkit.io.calibrations.calibration_file import calibration_text, load_calibration, load_camera, save_calibration
-from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import check_views

@@ -18,10 +18,10 @@ from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
+from rigkit.core.measurement_task import Quantity, Task
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibrations.rig_file import load_saved_rig, rig_text
-from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.sentinel.change_aim import informative_views
 from rigkit.validation.sentinel.evidence import FreshView

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from rigkit.core.boards import Board
+from rigkit.core.choices import PLANE_CHOICES, Planes
 from rigkit.core.errors import InputError
-from rigkit.core.planes import PLANE_CHOICES, Planes
 from rigkit.core.posetype import PoseType
 from rigkit.core.printing import brief
 from rigkit.core.truth import PairTruth

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigkit.core.findings import Finding, Severity
+from rigkit.core.measurement_task import Quantity
 from rigkit.core.tables import Table, cells, columns
 from rigkit.report.pages.page_facts import PageFacts, build_facts_page
 from rigkit.report.pictures.figures import DPI, as_pdf, as_png, new_figure
-from rigkit.validation.certificate.contracts import Certificate, Quantity
+from rigkit.validation.certificate.result import Certificate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

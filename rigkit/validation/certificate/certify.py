@@ -17,7 +17,7 @@ from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
-from rigkit.validation.certificate.contracts import Certificate, Quantity, Task
+from rigkit.core.measurement_task import Quantity, Task
 from rigkit.validation.certificate.propagation import (
     OF_CORNERS,
     OF_DISTANCE,
@@ -28,6 +28,7 @@ from rigkit.validation.certificate.propagation import (
     measured_points,
     variances,
 )
+from rigkit.validation.certificate.result import Certificate
 from rigkit.validation.sentinel.evidence import Monitored
 
 MAP_CELLS = (33, 25)

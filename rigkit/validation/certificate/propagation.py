@@ -31,8 +31,8 @@ from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays, scaled_pinv
 from rigkit.core.errors import DegenerateError
+from rigkit.core.measurement_task import Quantity, Task
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.sentinel.evidence import Monitored
 
 PLANE_POINTS = 5

@@ -13,13 +13,13 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.measurement_task import Quantity, Task
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Goal, projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.planning.rig_goal import rig_goal
-from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import gradients, measured_points
 from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.validation.sentinel.frames import Frames

@@ -40,7 +40,8 @@ from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.folder_session import session_of_future_images
 from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos, timestamps_next_to
-from rigkit.workflows.options.cameras import Cache, CalibrateOptions, CoachOptions
+from rigkit.workflows.options.cameras import Cache, CalibrateOptions
+from rigkit.workflows.options.coach import CoachOptions
 
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 LAN_WARNING = (

@@ -10,6 +10,7 @@ from rigkit.calibration.views.usable import without_parts
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.measurement_task import Task
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Table
@@ -25,7 +26,6 @@ from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.report.pages.check_page import power_table
 from rigkit.report.pages.plan_page import plan_page
-from rigkit.validation.certificate.contracts import Task
 from rigkit.validation.sentinel.change_aim import informative_views
 from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.validation.sentinel.watch import monitored_camera

@@ -10,6 +10,7 @@ import numpy as np
 from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
+from rigkit.core.measurement_task import Task
 from rigkit.core.printing import brief
 from rigkit.io.calibrations.rig_file import is_rig_file
 from rigkit.io.disk.reading import about
@@ -17,7 +18,7 @@ from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.report.pages.certificate_page import certificate_facts, certificate_page, certificate_pdf
 from rigkit.report.pages.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
-from rigkit.validation.certificate.contracts import Certificate, Task, instrument_of
+from rigkit.validation.certificate.result import Certificate, instrument_of
 from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.workflows.checks.check import load_monitored
 from rigkit.workflows.inputs.camera_files import bad_verdict_in_file

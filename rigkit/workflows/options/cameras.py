@@ -8,15 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from rigkit.core.errors import InputError
 from rigkit.workflows.options.base import NamesFiles, WrittenFiles
-
-if TYPE_CHECKING:
-    from rigkit.coach.guide import GuideOptions
-    from rigkit.core.boards import Board
-    from rigkit.validation.certificate.contracts import Task
 
 
 class Cache(StrEnum):
@@ -234,32 +229,6 @@ class CertifyOptions(WrittenFiles):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CheckOptions(WrittenFiles):
-    """What the images show, which errors matter, and the files to write.
-
-    Attributes
-    ----------
-    boards : boards that may be in the images; (): those of the calibration.
-    before : reference images of when it held: report changes since then only.
-    scene : without a board: match features of any textured scene (rigs).
-    length : a length at a distance: the effect of a change is stated for it, in mm.
-    fix : if it does not hold: write the corrected calibration, with the smallest change that explains the images.
-    report : write an HTML report.
-    history : append the check to this register (see rigkit history).
-    temperature_c : temperature during the capture, for the register.
-    """
-
-    boards: "tuple[Board, ...]" = ()
-    before: tuple[Path, ...] = ()
-    scene: bool = False
-    length: "Task | None" = None
-    fix: Path | None = None
-    report: Path | None = None
-    history: Path | None = None
-    temperature_c: float | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DiffOptions(WrittenFiles):
     """Where to write the map of the difference of two cameras.
 
@@ -271,36 +240,6 @@ class DiffOptions(WrittenFiles):
 
     output: Path | None = None
     report: Path | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CoachOptions(NamesFiles):
-    """Where the session goes, what is shown, and where frames come from.
-
-    Attributes
-    ----------
-    folder : of the session: a new one, or one to continue.
-    boards : COLUMNSxROWSxMM, or files of boards.
-    guide : what to reach.
-    length : a length at a distance that is to be measured as well as `guide.goal_mm` says.
-    cameras : number of cameras of the browser, whose frames are taken together.
-    watch : use images that another program writes into it; one for each camera of a rig.
-    video : choose the best frames of a recording; one for each camera of a rig.
-    device : use camera N of this machine; one for each camera of a rig.
-    port : port of the page; 0: any that is free.
-    lan : serve the page to the local network, unencrypted.
-    """
-
-    folder: Path
-    boards: tuple[str, ...]
-    guide: "GuideOptions"
-    length: "Task | None" = None
-    cameras: int = 1
-    watch: tuple[Path, ...] = ()
-    video: tuple[Path, ...] = ()
-    device: tuple[int, ...] = ()
-    port: int = 8137
-    lan: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

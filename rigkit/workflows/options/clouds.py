@@ -6,14 +6,11 @@ evaluated.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+from rigkit.core.choices import Planes, Support
 from rigkit.core.errors import InputError
-from rigkit.core.planes import Planes
 from rigkit.workflows.options.base import WrittenFiles
-
-if TYPE_CHECKING:
-    from rigkit.affine.directions import Support
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +32,7 @@ class DatasetOptions(WrittenFiles):
     output: Path | None = None
     recalibrate: bool = False
     chain: Literal["raw", "rectified"] = "raw"
-    support: "Support" = "patch"
+    support: Support = "patch"
     det_scale: str = "area"
     jobs: int | None = None
 

@@ -9,12 +9,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.affine.directions import Support
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import far_camera
+from rigkit.core.choices import Planes, Support
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError, RigkitError
-from rigkit.core.planes import Planes
 from rigkit.detection.detect import detect_boards
 from rigkit.identification.wrong_squares import fitting_squares
 from rigkit.io.manifests.manifest import Pair

@@ -11,9 +11,9 @@ from typing import Any
 from numpy.typing import NDArray
 
 from rigkit.affine.registry import AFFINE_METHODS
+from rigkit.core.choices import PLANE_CHOICES, Planes
 from rigkit.core.errors import DegenerateError, RigkitError
 from rigkit.core.findings import Finding, Severity
-from rigkit.core.planes import PLANE_CHOICES, Planes
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.manifests.manifest import Dataset

@@ -15,13 +15,13 @@ from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Severity
+from rigkit.core.measurement_task import Quantity, Task
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.report.pages.certificate_page import bound_figure
 from rigkit.report.pictures.figures import _drawn
 from rigkit.validation.certificate.certify import certify
-from rigkit.validation.certificate.contracts import Certificate, Quantity, Task, instrument_of
 from rigkit.validation.certificate.propagation import (
     OF_CORNERS,
     OF_LENSES,
@@ -30,6 +30,7 @@ from rigkit.validation.certificate.propagation import (
     measured_points,
     variances,
 )
+from rigkit.validation.certificate.result import Certificate, instrument_of
 from rigkit.validation.sentinel.evidence import Monitored
 
 TRIALS = 800

@@ -16,11 +16,11 @@ from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
+from rigkit.core.measurement_task import Quantity, Task
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.goal import GOAL_GRID
 from rigkit.planning.rig_goal import rig_goal
-from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.workflows.calibration.next_pictures import next_frames
 

@@ -1,10 +1,9 @@
-"""A certificate: the instrument, the measurement task, and the result."""
+"""A certificate: the instrument, and the error bound of a measurement with it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -13,17 +12,9 @@ from rigkit.cameras.uncertain import UncertainRig
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, without_nan
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
+from rigkit.core.measurement_task import Task
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.validation.sentinel.evidence import Monitored
-
-
-class Quantity(StrEnum):
-    """The measured quantity."""
-
-    LENGTH = "length"
-    DEPTH = "depth"
-    PLANE = "plane"
-    ANGLE = "angle"
 
 
 def instrument_of(known: Monitored, pair: tuple[str, str] | None = None) -> Monitored:
@@ -47,42 +38,6 @@ def instrument_of(known: Monitored, pair: tuple[str, str] | None = None) -> Moni
     return replace(
         known, names=tuple(names), cameras=cameras, cam_from_rig=poses, covariance=both.covariance, warped=()
     )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Task:
-    """A measurement task.
-
-    Attributes
-    ----------
-    quantity : a length perpendicular to the line of sight (the worse of vertical and horizontal), a depth along it, the
-        flatness of a plane of `size_mm` x `size_mm` that faces the camera (its worst point), or the angle between a
-        horizontal and a vertical edge of `size_mm`.
-    size_mm : the length, or the sides.
-    distance_mm : from the first camera to the middle of the measured object.
-    distance_sigma_mm : standard deviation of that distance; one camera measures lengths with it.
-    confidence : probability that the error is within the bound.
-    """
-
-    quantity: Quantity
-    size_mm: float
-    distance_mm: float
-    distance_sigma_mm: float = 0.0
-    confidence: float = 0.95
-
-    def __post_init__(self) -> None:
-        for name, value in (("size", self.size_mm), ("distance", self.distance_mm)):
-            if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"certificate: the {name} must be positive, got {value} mm")
-        if not (np.isfinite(self.distance_sigma_mm) and self.distance_sigma_mm >= 0.0):
-            raise InputError(f"certificate: the distance cannot be known to {self.distance_sigma_mm} mm")
-        if not 0.0 < self.confidence < 1.0:
-            raise InputError(f"certificate: the confidence must lie between 0 and 1, got {self.confidence}")
-
-    @property
-    def unit(self) -> str:
-        """Unit of the error: "mm", or "deg" for angles."""
-        return "deg" if self.quantity is Quantity.ANGLE else "mm"
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
