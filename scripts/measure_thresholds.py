@@ -9,7 +9,7 @@ blank pictures of the benchmark, grids of dots) are always used; `--boards` adds
 `--without` folders of images without boards. Each real image and pattern is used with degraded copies: blurred, noisy,
 compressed, sharpened, faint, shrunk, covered, cut. Lattices at boards found in the original image are positives; other
 lattices of such images are left out. Random blocks of codes and mosaics, which are real pieces of chessboards, are left
-to `validate.compact`.
+to `validate.is_compact`.
 
 Prints the weights of a logistic regression (equal weights of the kinds of images; with the prior of
 `rigkit.detection.checks.evidence`), its errors when cross-validated over kinds of images, and the scores, by the
@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from rigkit.core.arrays import FloatArray
-from rigkit.detection.checks.border import ends_quietly
+from rigkit.detection.checks.border import squares_end
 from rigkit.detection.checks.evidence import (
     MIN_EXPECTED_CORNERS,
     MIN_MEASURE,
@@ -54,11 +54,11 @@ from rigkit.detection.checks.evidence import (
     SCORE,
     Evidence,
 )
-from rigkit.detection.checks.validate import compact, has_edge_offset
+from rigkit.detection.checks.validate import has_edge_offset, is_compact
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.lattices import Seen, candidates
+from rigkit.detection.lattices import SearchedImage, candidate_lattices
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image
 from rigkit.detection.subpixel.subpixel import refine
@@ -210,8 +210,8 @@ def _judged(kind: str, image: str, board: bool, pixels: Grey, boards: list[Float
 
     least = MIN_BOARD if board else MIN_CORNERS
     size_px = (grey.shape[1], grey.shape[0])
-    fitted = refine(grey, candidates(Seen.of(grey), MIN_CORNERS, promising))
-    kept = [item for item in fitted if item.lattice.count >= least and compact(item.lattice, size_px)]
+    fitted = refine(grey, candidate_lattices(SearchedImage.of(grey), MIN_CORNERS, promising))
+    kept = [item for item in fitted if item.lattice.count >= least and is_compact(item.lattice, size_px)]
     mine = [item for item in kept if not board or any(_of_board(item.lattice, corners) for corners in boards)]
     return [
         Candidate(
@@ -222,7 +222,7 @@ def _judged(kind: str, image: str, board: bool, pixels: Grey, boards: list[Float
             size=item.lattice.size,
             cell_px=_cell_px(item.lattice),
             evidence=Evidence.of(item),
-            ends=ends_quietly(grey, item.lattice),
+            ends=squares_end(grey, item.lattice),
         )
         for item in mine
     ]

@@ -11,19 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import known_median
-from rigkit.detection.checks.border import ends_quietly
+from rigkit.detection.checks.border import squares_end
 from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at_discontinuities, without_outliers
 from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS, OF_EXPECTED_SIZE, Evidence
 from rigkit.detection.checks.validate import (
-    compact,
+    exceeds_known_sizes,
     has_edge_offset,
-    known_part,
-    large,
+    is_board,
+    is_compact,
+    is_large_enough,
+    part_of_known_size,
     sample_of,
-    separate,
-    tidy,
-    too_large,
-    trustworthy,
+    without_shared_corners,
+    without_stray_rows,
 )
 from rigkit.detection.lattice.grow import MAX_FAILED_GROWTHS, grow_all
 from rigkit.detection.lattice.lattice import MIN_ROWS, Lattice, build_lattices
@@ -56,9 +56,15 @@ SAME_PX = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class Sought:
-    """The boards sought: smallest number of corners, (columns, rows) of all possible boards if known, and the test that
-    proves a lattice to be one of them."""
+class BoardCriteria:
+    """What a lattice must fulfil to be a board.
+
+    Attributes
+    ----------
+    min_corners : smallest number of corners.
+    sizes : (columns, rows) of all possible boards, if known.
+    vouched : the test that proves a lattice to be one of them.
+    """
 
     min_corners: int
     sizes: Sequence[tuple[int, int]] = ()
@@ -81,41 +87,44 @@ def find_lattices(
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
-    sought = Sought(min_corners, sizes, vouched)
-    seen, plausible = Seen.of(grey), _Counting(_is_plausible if vouched is None else _or_vouched(vouched))
+    criteria = BoardCriteria(min_corners, sizes, vouched)
+    searched, plausible = (
+        SearchedImage.of(grey),
+        _RejectionCounter(_is_plausible if vouched is None else _plausible_or_vouched(vouched)),
+    )
 
-    def looked(at: Seen, more_than: int = 0) -> list[RefinedLattice]:
-        boards = candidates(at, min_corners, plausible)
+    def search(at: SearchedImage, more_than: int = 0) -> list[RefinedLattice]:
+        boards = candidate_lattices(at, min_corners, plausible)
         if sum(item.count for item in boards) <= more_than:
             return []
-        out = fitted(grey, boards, sought)
+        out = fit_and_confirm(grey, boards, criteria)
         plausible.rejected += 0 if out else len(boards)
         return out
 
-    found = looked(seen)
-    if _needs_second_search(seen, found, sizes):
-        found = max(looked(seen.with_smeared()), found, key=_corners_of)
-    for k in range(1, len(seen.levels)):
+    found = search(searched)
+    if _needs_second_search(searched, found, sizes):
+        found = max(search(searched.with_smeared()), found, key=_corner_count)
+    for k in range(1, len(searched.levels)):
         # Coarser levels help only where squares do not meet at their corners; those of clutter do.
-        if _whole(found, sizes) or plausible.rejected >= MAX_FAILED_GROWTHS:
+        if _has_whole_board(found, sizes) or plausible.rejected >= MAX_FAILED_GROWTHS:
             break
-        coarser = seen.coarser(k)
+        coarser = searched.coarser(k)
         if coarser is None:
             break
-        found = max(found, looked(coarser, _corners_of(found)), key=_corners_of)
+        found = max(found, search(coarser, _corner_count(found)), key=_corner_count)
     if min_corners < MIN_BOARD_CORNERS:
         return found
     return [
         item
         for item in found
         if _of_size(item.lattice, sizes)
-        or compact(item.lattice, size_px)
+        or is_compact(item.lattice, size_px)
         or (vouched is not None and vouched(grey, item.lattice))
     ]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Seen:
+class SearchedImage:
     """An image in grey levels, the finest level of its pyramid, the levels searched, and the corners found in them."""
 
     grey: GreyImage
@@ -125,11 +134,11 @@ class Seen:
     saddles: Saddles
 
     @classmethod
-    def of(cls, grey: GreyImage) -> Seen:
+    def of(cls, grey: GreyImage) -> SearchedImage:
         levels = pyramid(grey)
         return cls(grey, levels[0], levels, *find_corners(levels))
 
-    def coarser(self, without: int) -> Seen | None:
+    def coarser(self, without: int) -> SearchedImage | None:
         """Return the corners of the coarser levels only, `without` the finest ones; None if there are too few.
 
         With saturation or thin print bright squares merge at the corners, with spreading ink dark ones. The borders of
@@ -141,65 +150,67 @@ class Seen:
             return None
         return replace(self, levels=self.levels[without:], corners=corners)
 
-    def with_smeared(self) -> Seen:
+    def with_smeared(self) -> SearchedImage:
         """Return this with the corners that only motion blur explains added."""
         return replace(self, corners=joined([self.corners, self.saddles.smeared]))
 
 
 @dataclass(slots=True)
-class _Counting:
-    """Returns whether lattices are plausible, and counts those that are not, or are rejected later."""
+class _RejectionCounter:
+    """A test of lattices that counts those that it, or a later test, rejects."""
 
     plausible: IsPlausible
     rejected: int = 0
 
     def __call__(self, grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
-        good = self.plausible(grey, finest, lattice)
-        self.rejected += not good
-        return good
+        passed = self.plausible(grey, finest, lattice)
+        self.rejected += not passed
+        return passed
 
 
-def _corners_of(found: Sequence[RefinedLattice]) -> int:
+def _corner_count(found: Sequence[RefinedLattice]) -> int:
     return sum(item.lattice.count for item in found)
 
 
-def _whole(found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
+def _has_whole_board(found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
     """Return whether one of `found` is complete and has one of `sizes`, or any size if none is known."""
     whole = {frozenset(item.lattice.size) for item in found if item.lattice.known.all()}
     return not whole.isdisjoint(map(frozenset, sizes)) if sizes else bool(whole)
 
 
-def _needs_second_search(seen: Seen, found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
+def _needs_second_search(
+    searched: SearchedImage, found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]
+) -> bool:
     """Return whether a search with motion-blurred corners may find more: no whole board of `sizes` was `found`, or no
     board at all without `sizes`, or a board with uneven blur."""
-    if sizes and _whole(found, sizes):
+    if sizes and _has_whole_board(found, sizes):
         return False
     if any(item.picture is not None for item in found):
-        return len(seen.saddles.smeared) > 0
-    return (bool(sizes) or not found) and len(seen.saddles.smeared) >= SMEARED_CORNERS
+        return len(searched.saddles.smeared) > 0
+    return (bool(sizes) or not found) and len(searched.saddles.smeared) >= SMEARED_CORNERS
 
 
-def candidates(seen: Seen, min_corners: int, plausible: IsPlausible) -> list[Lattice]:
+def candidate_lattices(searched: SearchedImage, min_corners: int, plausible: IsPlausible) -> list[Lattice]:
     """Return the lattices of an image that may be boards, before the sub-pixel fit; only `plausible` ones are grown."""
-    size_px = (seen.grey.shape[1], seen.grey.shape[0])
-    level = seen.levels[0]
-    lattices = build_lattices(seen.corners, find_links(seen.corners, level))
-    grown = grow_all(lattices, seen.saddles, level, functools.partial(plausible, seen.grey, seen.finest))
+    size_px = (searched.grey.shape[1], searched.grey.shape[0])
+    level = searched.levels[0]
+    lattices = build_lattices(searched.corners, find_links(searched.corners, level))
+    grown = grow_all(lattices, searched.saddles, level, functools.partial(plausible, searched.grey, searched.finest))
     grown = [item for item in grown if item.count >= MIN_PART_CORNERS]
     if not any(item.solid or min_corners < MIN_BOARD_CORNERS for item in grown):
         return []
     boards = [board for item in grown for part in split_at_turns(item) for board in split_necks(part)]
-    parts = separate([tidy(board, size_px) for board in boards], MIN_PART_CORNERS)
-    return [board for board in join_parts(parts) if large(board, min_corners)]
+    parts = without_shared_corners([without_stray_rows(board, size_px) for board in boards], MIN_PART_CORNERS)
+    return [board for board in join_parts(parts) if is_large_enough(board, min_corners)]
 
 
-def fitted(grey: GreyImage, boards: Sequence[Lattice], sought: Sought) -> list[RefinedLattice]:
+def fit_and_confirm(grey: GreyImage, boards: Sequence[Lattice], criteria: BoardCriteria) -> list[RefinedLattice]:
     """Return those of `boards` that the fit confirms, refined, without corners of boards that they touch.
 
     Boards with uneven blur are fitted in a resampled part of the image with even blur (`RefinedLattice.picture`).
     """
-    refined = refine(grey, boards, _evidence_score(grey, sought))
-    found = _fitted(grey, boards, refined, sought)
+    refined = refine(grey, boards, _evidence_score(grey, criteria))
+    found = _confirmed_parts(grey, boards, refined, criteria)
     if any(known_median(item.blur_px) <= LOOKED_AT_PX for item in found):
         # Blurred lattices in an image with a sharp board are background.
         return found
@@ -208,25 +219,25 @@ def fitted(grey: GreyImage, boards: Sequence[Lattice], sought: Sought) -> list[R
         if picture is None:
             continue
         there = [replace(board, pixels=picture.of(board.pixels))]
-        room = replace(sought, sizes=sought.sizes if len(found) < len(sought.sizes) else ())
+        room = replace(criteria, sizes=criteria.sizes if len(found) < len(criteria.sizes) else ())
         again = refine(picture.grey, there, _evidence_score(picture.grey, room), radius_px=picture.radius_px)
-        found = _with_better(found, [one.out_of(picture) for one in _fitted(picture.grey, there, again, room)])
+        found = _with_better(found, [one.out_of(picture) for one in _confirmed_parts(picture.grey, there, again, room)])
     return found
 
 
-def _evidence_score(grey: GreyImage, sought: Sought) -> EvidenceScore:
-    """Return the function that scores the evidence for a lattice, given the lattices already fitted (`_confirmed`)."""
-    sizes = sought.sizes
+def _evidence_score(grey: GreyImage, criteria: BoardCriteria) -> EvidenceScore:
+    """Return the function that scores the evidence for a lattice, given the lattices already fitted (`_accepted`)."""
+    sizes = criteria.sizes
     every = {frozenset({(c, r), (r, c)}) for c, r in sizes}
 
     def score(item: RefinedLattice, placed: Sequence[tuple[Lattice, RefinedLattice]]) -> float:
         own, (columns, rows) = Evidence.of(item).score, item.lattice.size
-        if own <= 0.0 and sought.vouched is not None and sought.vouched(grey, item.lattice):
+        if own <= 0.0 and criteria.vouched is not None and criteria.vouched(grey, item.lattice):
             return np.inf
-        # The fit removes additional rows and columns (`known_part`), but adds none.
+        # The fit removes additional rows and columns (`part_of_known_size`), but adds none.
         if own > 0.0 or not any(columns >= c and rows >= r for both in every for c, r in both):
             return own
-        sure = sum(trustworthy(after, before.count, sought.min_corners) for before, after in placed)
+        sure = sum(is_board(after, before.count, criteria.min_corners) for before, after in placed)
         return own + OF_EXPECTED_SIZE if sure < len(sizes) else own
 
     return score
@@ -247,40 +258,40 @@ def _with_better(found: list[RefinedLattice], others: Sequence[RefinedLattice]) 
     return found
 
 
-def _fitted(
-    grey: GreyImage, boards: Sequence[Lattice], refined: Sequence[RefinedLattice], sought: Sought
+def _confirmed_parts(
+    grey: GreyImage, boards: Sequence[Lattice], refined: Sequence[RefinedLattice], criteria: BoardCriteria
 ) -> list[RefinedLattice]:
     """Return those of `refined` (the fits of `boards`) that are boards, split where they touch."""
     size_px = (grey.shape[1], grey.shape[0])
     out = []
-    for item in _confirmed(grey, boards, refined, sought):
+    for item in _accepted(grey, boards, refined, criteria):
         own = without_outliers(item, size_px)
         parts = (
-            split_at_discontinuities(own, several=too_large(own.lattice, sought.sizes))
+            split_at_discontinuities(own, several=exceeds_known_sizes(own.lattice, criteria.sizes))
             if may_be_discontinuous(item, size_px)
             else [own]
         )
         if len(parts) == 1:
-            if large(own.lattice, sought.min_corners):
+            if is_large_enough(own.lattice, criteria.min_corners):
                 # Corners of squares with markers are fitted again by their finder.
-                out.append(_scattered(placed_together(grey, own, sought.vouched)))
+                out.append(_with_scatter(placed_together(grey, own, criteria.vouched)))
             continue
         # The fits of these corners used edges on the other side of the discontinuity: fit them again.
         alone = [part.lattice.trimmed() for part in parts]
-        own_parts = [part for part in alone if large(part, sought.min_corners)]
-        out += _fitted(grey, own_parts, refine(grey, own_parts, _evidence_score(grey, sought)), sought)
+        own_parts = [part for part in alone if is_large_enough(part, criteria.min_corners)]
+        out += _confirmed_parts(grey, own_parts, refine(grey, own_parts, _evidence_score(grey, criteria)), criteria)
     return out
 
 
-def _scattered(item: RefinedLattice) -> RefinedLattice:
+def _with_scatter(item: RefinedLattice) -> RefinedLattice:
     """Return `item` with the sigmas of a small board raised for the scatter of its corners
     (`scatter.small_scatter`)."""
     raised = small_scatter(item.lattice.pixels, item.sigma_px)
     return item if raised == 1.0 else replace(item, sigma_px=item.sigma_px * raised, scatter=item.scatter * raised)
 
 
-def _confirmed(
-    grey: GreyImage, boards: Sequence[Lattice], refined: Sequence[RefinedLattice], sought: Sought
+def _accepted(
+    grey: GreyImage, boards: Sequence[Lattice], refined: Sequence[RefinedLattice], criteria: BoardCriteria
 ) -> list[RefinedLattice]:
     """Return those of `refined` (the fits of `boards`) that are boards.
 
@@ -288,31 +299,33 @@ def _confirmed(
     the sigmas of their corners account for their uncertainty. In addition to all listed boards such a lattice would be
     something else: a board in the background, or a mirror image.
     """
-    every, sizes, min_corners = list(zip(boards, refined, strict=True)), sought.sizes, sought.min_corners
+    every, sizes, min_corners = list(zip(boards, refined, strict=True)), criteria.sizes, criteria.min_corners
     sure = [
         after
         for before, after in every
-        if trustworthy(after, before.count, min_corners) or _marked(grey, before, after, sought)
+        if is_board(after, before.count, min_corners) or _is_proven_by_markers(grey, before, after, criteria)
     ]
     room = len(sizes) - len(sure)
     if room <= 0:
         return sure
-    rest = [(before.count, known_part(after, sizes)) for before, after in every if not any(after is s for s in sure)]
+    rest = [
+        (before.count, part_of_known_size(after, sizes)) for before, after in every if not any(after is s for s in sure)
+    ]
     likely = [
         after
         for before, after in rest
         if _of_size(after.lattice, sizes)
-        if trustworthy(after, min(before, after.lattice.known.size), min_corners, OF_EXPECTED_SIZE)
-        if ends_quietly(grey, after.lattice)
+        if is_board(after, min(before, after.lattice.known.size), min_corners, OF_EXPECTED_SIZE)
+        if squares_end(grey, after.lattice)
     ]
     return sure + sorted(likely, key=lambda item: -Evidence.of(item).score)[:room]
 
 
-def _marked(grey: GreyImage, before: Lattice, after: RefinedLattice, sought: Sought) -> bool:
+def _is_proven_by_markers(grey: GreyImage, before: Lattice, after: RefinedLattice, criteria: BoardCriteria) -> bool:
     """Return whether markers in the squares of a fitted lattice prove that it is a board."""
-    if sought.vouched is None or not trustworthy(after, before.count, sought.min_corners, np.inf):
+    if criteria.vouched is None or not is_board(after, before.count, criteria.min_corners, np.inf):
         return False
-    return sought.vouched(grey, after.lattice)
+    return criteria.vouched(grey, after.lattice)
 
 
 def _of_size(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
@@ -322,26 +335,26 @@ def _of_size(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
 
 def _is_plausible(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
     """Return whether `lattice` may be a board, by the offsets of its edges and a fit of a sample."""
-    return not (lattice.solid and has_edge_offset(lattice, finest)) and _sampled(grey, finest, lattice)
+    return not (lattice.solid and has_edge_offset(lattice, finest)) and _sample_is_plausible(grey, finest, lattice)
 
 
-def _or_vouched(vouched: Vouched) -> IsPlausible:
+def _plausible_or_vouched(vouched: Vouched) -> IsPlausible:
     """Return the plausibility test of lattices that may have markers in their squares."""
-    return lambda grey, finest, lattice: _sampled(grey, finest, lattice) or vouched(grey, lattice)
+    return lambda grey, finest, lattice: _sample_is_plausible(grey, finest, lattice) or vouched(grey, lattice)
 
 
-def _sampled(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
+def _sample_is_plausible(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
     """Return whether `lattice` may be a board, by a fit of a sample of its corners."""
     sample = sample_of(lattice)
     if sample is None:
         return True
-    (refined,) = refine(grey, [sample], _evidence_score(grey, Sought(0)))
-    if trustworthy(refined, sample.count, 0):
+    (refined,) = refine(grey, [sample], _evidence_score(grey, BoardCriteria(0)))
+    if is_board(refined, sample.count, 0):
         return True
     # Of clutter the fit leaves few corners.
     picture = with_uniform_blur(grey, sample, refined) if refined.lattice.count >= MIN_BOARD_CORNERS else None
     if picture is None:
         return False
     there = [replace(sample, pixels=picture.of(sample.pixels))]
-    (again,) = refine(picture.grey, there, _evidence_score(grey, Sought(0)), radius_px=picture.radius_px)
-    return trustworthy(again, sample.count, 0)
+    (again,) = refine(picture.grey, there, _evidence_score(grey, BoardCriteria(0)), radius_px=picture.radius_px)
+    return is_board(again, sample.count, 0)

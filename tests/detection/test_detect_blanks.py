@@ -9,7 +9,7 @@ from detection_bench.blanks import BLANKS, blank
 from detection_bench.scenes import one_board
 
 from rigkit.detection import lattices as lattices_of_images
-from rigkit.detection.checks.validate import compact, has_edge_offset
+from rigkit.detection.checks.validate import has_edge_offset, is_compact
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice import grow
 from rigkit.detection.lattice.lattice import Lattice
@@ -70,16 +70,16 @@ def lattice_of(rows: list[str], side_px: float = 20.0, first_px: tuple[float, fl
 def test_chance_makes_chains_and_boards_have_blocks(rows: list[str], solid: bool, whole: bool) -> None:
     for lattice in (lattice_of(rows), lattice_of([*map("".join, zip(*rows, strict=True))])):
         assert lattice.solid == solid
-        assert compact(lattice, SIZE_PX) == whole
+        assert is_compact(lattice, SIZE_PX) == whole
 
 
 def test_what_the_frame_cuts_off_is_not_missing() -> None:
     cut = ["######", "#####.", "####..", "###...", "##....", "#....."]
-    assert not compact(lattice_of(cut), SIZE_PX)
+    assert not is_compact(lattice_of(cut), SIZE_PX)
     inside = lattice_of(cut, first_px=(0.0, 0.0))
     turned = inside.pixels @ (np.array([[1.0, -1.0], [1.0, 1.0]]) / np.sqrt(2.0))
     at_the_right = Lattice(turned + np.array([630.0 - np.nanmax(turned[..., 0]), 240.0]), inside.contrast, True)
-    assert compact(at_the_right, SIZE_PX)
+    assert is_compact(at_the_right, SIZE_PX)
 
 
 def test_edges_of_dots_lean_and_those_of_boards_do_not(rng: np.random.Generator) -> None:

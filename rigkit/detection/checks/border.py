@@ -92,12 +92,12 @@ class Side(Enum):
     """The image beyond one side of a lattice."""
 
     BORDER = "border"
-    GOES_ON = "goes on"
+    CONTINUES = "continues"
     UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True, slots=True)
-class Beyond:
+class BoardSide:
     """The image beyond one side of a lattice, and its brightness: 0 as the dark squares, 1 as the white ones."""
 
     side: Side
@@ -105,9 +105,9 @@ class Beyond:
 
     def agrees(self, missing: int) -> bool:
         """Return whether the side is consistent with `missing` further rows."""
-        return {Side.BORDER: missing == 0, Side.GOES_ON: missing > 0, Side.UNKNOWN: True}[self.side]
+        return {Side.BORDER: missing == 0, Side.CONTINUES: missing > 0, Side.UNKNOWN: True}[self.side]
 
-    def proven(self, every: Sequence[Beyond]) -> bool:
+    def is_certain_border(self, every: Sequence[BoardSide]) -> bool:
         """Return whether the side is certainly a border, given `every` side of the board."""
         if self.side is not Side.BORDER:
             return False
@@ -131,10 +131,10 @@ def place_part(image: GreyImage, refined: RefinedLattice, sizes: Sequence[tuple[
     larger = [(c - columns, r - rows) for c, r in known if c >= columns and r >= rows]
     if not larger:
         return None
-    every = sides(image, refined.lattice)
+    every = board_sides(image, refined.lattice)
     cell_px = fit_cells(refined.lattice.pixels, refined.lattice.known).cell_px()
     if known_median(refined.blur_px) > EDGE_WIDTH * float(np.median(cell_px)):
-        every = _ending_in_blur(image, refined.lattice, every)
+        every = _with_blurred_borders(image, refined.lattice, every)
     top, left, bottom, right = every
     fits = {
         (across, down, before, above)
@@ -145,39 +145,39 @@ def place_part(image: GreyImage, refined: RefinedLattice, sizes: Sequence[tuple[
         if top.agrees(above) and bottom.agrees(down - above)
     }
     # An additional row (of a shadow or the background) may make a part as wide as the board: the size is no proof.
-    seen = all(any(side.proven(every) for side in axis) for axis in ((left, right), (top, bottom)))
+    seen = all(any(side.is_certain_border(every) for side in axis) for axis in ((left, right), (top, bottom)))
     if len(fits) != 1 or not seen:
         return None
     across, down, before, above = fits.pop()
     return refined.padded((above, down - above), (before, across - before))
 
 
-def sides(image: GreyImage, lattice: Lattice) -> list[Beyond]:
+def board_sides(image: GreyImage, lattice: Lattice) -> list[BoardSide]:
     """Return the four sides: beyond the first row, the first column, the last row and the last column."""
-    return [_above(image, lattice.turned(turns)) for turns in range(4)]
+    return [_side_above_first_row(image, lattice.turned(turns)) for turns in range(4)]
 
 
-def _ending_in_blur(image: GreyImage, lattice: Lattice, every: Sequence[Beyond]) -> list[Beyond]:
+def _with_blurred_borders(image: GreyImage, lattice: Lattice, every: Sequence[BoardSide]) -> list[BoardSide]:
     """Return the sides of a blurred board: unknown ones beyond which squares do not alternate are borders."""
     return [
         replace(one, side=Side.BORDER) if quiet and one.side is Side.UNKNOWN else one
-        for one, quiet in zip(every, _alternations(image, lattice) < MAX_ALTERNATION, strict=True)
+        for one, quiet in zip(every, _alternations_beyond(image, lattice) < MAX_ALTERNATION, strict=True)
     ]
 
 
-def ends_quietly(image: GreyImage, lattice: Lattice) -> bool:
+def squares_end(image: GreyImage, lattice: Lattice) -> bool:
     """Return whether the squares do not continue to alternate beyond the sides of `lattice`."""
-    every = _alternations(image, lattice)
+    every = _alternations_beyond(image, lattice)
     seen = every[np.isfinite(every)]
     return len(seen) >= MIN_SIDES_SEEN and bool((seen < MAX_ALTERNATION).all())
 
 
-def _alternations(image: GreyImage, lattice: Lattice) -> FloatArray:
+def _alternations_beyond(image: GreyImage, lattice: Lattice) -> FloatArray:
     """Return the alternation (4,) of squares beyond each side over the contrast of the last ones; NaN if unseen."""
-    return np.array([_alternation_above(image, lattice.turned(turns)) for turns in range(4)])
+    return np.array([_alternation_above_first_row(image, lattice.turned(turns)) for turns in range(4)])
 
 
-def _alternation_above(image: GreyImage, lattice: Lattice) -> float:
+def _alternation_above_first_row(image: GreyImage, lattice: Lattice) -> float:
     squares = _Squares.above(lattice)
     seen = squares.inside(image, float(NEXT_SQUARE[1]), float(WITHIN[-1])) & squares.near
     seen &= squares.supported(MIN_NEXT_SUPPORT)
@@ -189,17 +189,17 @@ def _alternation_above(image: GreyImage, lattice: Lattice) -> float:
     return float(np.median(beyond[dark]) - np.median(beyond[bright])) / max(contrast, 1e-3)
 
 
-def _above(image: GreyImage, lattice: Lattice) -> Beyond:
+def _side_above_first_row(image: GreyImage, lattice: Lattice) -> BoardSide:
     """Return the side beyond the first row of `lattice`."""
     squares = _Squares.above(lattice)
     usable = squares.usable(image)
     if usable.sum() < 2 * MIN_OF_KIND:
-        return Beyond(Side.UNKNOWN)
+        return BoardSide(Side.UNKNOWN)
     inner, outer, beyond = (squares.brightness(image, places) for places in (-SQUARE, SQUARE, BEYOND))
     contrast = np.where(squares.bright, outer - inner, inner - outer)
     usable &= contrast > MIN_OUTER_CONTRAST * float(np.nanmedian(lattice.contrast))
     if any((usable & kind).sum() < MIN_OF_KIND for kind in (squares.bright, ~squares.bright)):
-        return Beyond(Side.UNKNOWN)
+        return BoardSide(Side.UNKNOWN)
     dark = np.minimum(inner, outer)
     relative = (beyond - dark) / np.maximum(contrast, 1e-3)
     level = float(np.median(relative[usable]))
@@ -207,9 +207,9 @@ def _above(image: GreyImage, lattice: Lattice) -> Beyond:
     border = squares.end_on_one_line(image, outer, beyond, usable & steps) | ~steps
     border &= np.abs(relative - level) < EVEN
     if (usable & steps).sum() >= MIN_OF_KIND and border[usable].mean() >= AGREEING_SQUARES:
-        return Beyond(Side.BORDER, level)
-    goes_on = np.where(squares.bright, relative < MAX_NEXT_DARK, relative > 1.0 - MAX_NEXT_DARK)
-    return Beyond(Side.GOES_ON if goes_on[usable].mean() >= AGREEING_SQUARES else Side.UNKNOWN)
+        return BoardSide(Side.BORDER, level)
+    continues = np.where(squares.bright, relative < MAX_NEXT_DARK, relative > 1.0 - MAX_NEXT_DARK)
+    return BoardSide(Side.CONTINUES if continues[usable].mean() >= AGREEING_SQUARES else Side.UNKNOWN)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -59,7 +59,7 @@ WORSE_FIT = 1.5
 """Smallest ratio of the residuals of additional rows to those of the board's corners."""
 
 
-def tidy(lattice: Lattice, size_px: tuple[int, int]) -> Lattice:
+def without_stray_rows(lattice: Lattice, size_px: tuple[int, int]) -> Lattice:
     """Return `lattice` without stray outer rows, trimmed.
 
     `size_px` is the (width, height) of the full-resolution image.
@@ -94,18 +94,18 @@ def stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
     return None
 
 
-def large(lattice: Lattice, min_corners: int) -> bool:
+def is_large_enough(lattice: Lattice, min_corners: int) -> bool:
     """Return whether `lattice` has `min_corners` and, if these are 9 or more, three rows and three columns."""
     return lattice.count >= min_corners and min(lattice.size) >= (MIN_ROWS if min_corners >= MIN_ROWS**2 else 2)
 
 
-def separate(lattices: Sequence[Lattice], min_corners: int) -> list[Lattice]:
-    """Return those of `lattices` that are `large` enough, without the corners that they share with larger ones.
+def without_shared_corners(lattices: Sequence[Lattice], min_corners: int) -> list[Lattice]:
+    """Return those of `lattices` that are large enough, without the corners that they share with larger ones.
 
     A lattice that shares many of its corners is a duplicate and left out; one that grew across the border of another
     board keeps its own corners.
     """
-    candidates = sorted((item for item in lattices if large(item, min_corners)), key=lambda item: -item.count)
+    candidates = sorted((item for item in lattices if is_large_enough(item, min_corners)), key=lambda item: -item.count)
     if len(candidates) < 2:
         return candidates
     corners = [item.pixels[item.known] for item in candidates]
@@ -121,7 +121,7 @@ def separate(lattices: Sequence[Lattice], min_corners: int) -> list[Lattice]:
             if np.count_nonzero(again) > 1:
                 shared |= again
         rest = _without_shared(item, shared)
-        if rest is not None and large(rest, min_corners):
+        if rest is not None and is_large_enough(rest, min_corners):
             kept.append(rest)
     return kept
 
@@ -171,7 +171,7 @@ def _edge_offsets(lattice: Lattice, level: Level, reach: float, along: Sequence[
     return native.shifts_of_edges(lattice.pixels, lattice.rising, *seen, reach, along, STEPS_ACROSS, MAX_EDGES)
 
 
-def compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:
+def is_compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:
     """Return whether `lattice` is large, nearly full, or has a large full block; `size_px` is (width, height).
 
     Squares of random brightness that happen to alternate make crooked chains of corners. On boards that are partly
@@ -191,21 +191,24 @@ def compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:
     return False
 
 
-def trustworthy(refined: RefinedLattice, before: int, min_corners: int, prior: float = 0.0) -> bool:
-    """Return whether the fit of a lattice of `before` corners is a board; `prior` is added to its evidence score."""
+def is_board(refined: RefinedLattice, before: int, min_corners: int, prior: float = 0.0) -> bool:
+    """Return whether the fit of a lattice of `before` corners is a board.
+
+    It must keep most corners, and its evidence score plus `prior` must be positive.
+    """
     lattice = refined.lattice
     if lattice.count < max(min_corners, (1.0 - MAX_LOST) * before) or min(lattice.size) < MIN_ROWS:
         return False
     return Evidence.of(refined).score + prior > 0.0
 
 
-def too_large(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
+def exceeds_known_sizes(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
     """Return whether `lattice` is larger than all of the known `sizes` by more than stray rows; False for none."""
     short, long = sorted(lattice.size)
     return bool(sizes) and all(short > min(size) + MAX_EXTRA or long > max(size) + MAX_EXTRA for size in sizes)
 
 
-def known_part(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice:
+def part_of_known_size(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice:
     """Return the part of a grid that is a board of a known size, if its additional rows clearly do not belong to it.
 
     The border or the background of a board sometimes gives a row of few corners, or of corners with large residuals.
@@ -225,7 +228,7 @@ def known_part(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> Ref
                 part = (slice(top, top + r), slice(left, left + c))
                 inside = np.zeros((rows, columns), bool)
                 inside[part] = True
-                if not _sticks_out(refined.lattice.known, relative, inside):
+                if not _has_foreign_rows(refined.lattice.known, relative, inside):
                     continue
                 rank = (int(refined.lattice.known[part].sum()), -float(np.nanmedian(relative[part])))
                 if best is None or rank > best[:2]:
@@ -233,8 +236,8 @@ def known_part(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> Ref
     return refined if best is None else best[2]
 
 
-def _sticks_out(known: BoolArray, relative: np.ndarray, inside: BoolArray) -> bool:
-    """Return whether the corners outside `inside` are few or have large residuals, and those inside nearly complete."""
+def _has_foreign_rows(known: BoolArray, relative: np.ndarray, inside: BoolArray) -> bool:
+    """Return whether the corners inside are nearly complete, and those outside are few or have large residuals."""
     outside = ~inside
     if known[inside].mean() < 0.9:
         return False

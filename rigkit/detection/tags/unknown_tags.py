@@ -20,7 +20,7 @@ from rigkit.core.patterns.aprilgrid import MAX_BORDER, TAG_FAMILIES, AprilGrid
 from rigkit.core.patterns.aruco import dictionary_modules, marker_count, smallest_dictionary
 from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
-from rigkit.detection.lattices import Seen
+from rigkit.detection.lattices import SearchedImage
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.codes import Codes, TagCode, read_tags, transferred
 from rigkit.detection.tags.module_size import module_size
@@ -114,7 +114,7 @@ class TagObservations:
     def look(self, index: int, image: GreyImage) -> bool:
         """Read the tags of an image; return whether there are any."""
         image = 255 - image if self.inverted else image
-        seen = Seen.of(image)
+        seen = SearchedImage.of(image)
         # Where light or ink spreads, tags and the squares between them touch on coarser levels only.
         for k in range(len(seen.levels)):
             at = seen.coarser(k) if k else seen

@@ -13,7 +13,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
-from rigkit.detection.lattices import MIN_BOARD_CORNERS, Sought, find_lattices, fitted
+from rigkit.detection.lattices import MIN_BOARD_CORNERS, BoardCriteria, find_lattices, fit_and_confirm
 from rigkit.detection.saddles.local_contrast import equalised, stretched
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.refined import RefinedLattice
@@ -90,7 +90,7 @@ class Search:
             seen = [item.lattice for item in find_lattices(equalised(self.grey), self.min_corners_seen, only)]
             # Equalisation shifts corners beside bright objects: they are fitted on a linearly stretched image.
             self.grey = stretched(self.grey, [lattice.pixels for lattice in seen])
-            found = fitted(self.grey, seen, Sought(self.min_corners_seen, only, vouched))
+            found = fit_and_confirm(self.grey, seen, BoardCriteria(self.min_corners_seen, only, vouched))
         return found
 
 

@@ -11,7 +11,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.checks.border import place_part
-from rigkit.detection.checks.validate import known_part
+from rigkit.detection.checks.validate import part_of_known_size
 from rigkit.detection.guided.guided import completed
 from rigkit.detection.guided.rejoin import rejoined
 from rigkit.detection.guided.relit import relit
@@ -59,7 +59,7 @@ def _in_image(
     evaluated in the image itself.
     """
     sizes = tuple(dict.fromkeys(board.size for board in boards))
-    lattices = [known_part(item, sizes) for item in found]
+    lattices = [part_of_known_size(item, sizes) for item in found]
     placed = _placed(grey, lattices, boards, camera)
     if picture is not None:
         grey, placed = picture.grey, [item.within(picture) for item in placed]

@@ -10,7 +10,7 @@ from detection_bench.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, o
 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
-from rigkit.detection.checks.border import Side, ends_quietly, sides
+from rigkit.detection.checks.border import Side, board_sides, squares_end
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattices import find_lattices
 from rigkit.detection.saddles.response import grey_image
@@ -113,12 +113,12 @@ def test_what_lies_beyond_each_side_is_read_from_the_image(rng: np.random.Genera
     image = straight(Board("b", 9, 6, 30.0, 30.0), (-210.0, 0.0)).render(noise_levels=2.0, rng=rng)
     (item,) = find_lattices(grey_image(image), 12)
     assert item.lattice.size[0] < 9
-    top, left, bottom, right = (beyond.side for beyond in sides(grey_image(image), item.lattice))
+    top, left, bottom, right = (beyond.side for beyond in board_sides(grey_image(image), item.lattice))
     assert {top, bottom} == {Side.BORDER}
     assert {left, right} == {Side.BORDER, Side.UNKNOWN}
     # Without its last two columns the board goes on beyond what is left.
     inner = item.lattice.cut(slice(0, 6), slice(0, item.lattice.size[0] - 2))
-    assert sides(grey_image(image), inner)[3].side is Side.GOES_ON
+    assert board_sides(grey_image(image), inner)[3].side is Side.CONTINUES
 
 
 def test_a_board_cut_on_one_side_has_its_place_and_its_name(rng: np.random.Generator) -> None:
@@ -151,6 +151,6 @@ def test_a_board_ends_quietly_and_a_part_of_it_does_not(blur_px: float) -> None:
     truth = scene.truth()[0]
     image = grey_image(scene.render(rng=np.random.default_rng(1), blur_px=blur_px, noise_levels=2.0))
     (found,) = find_lattices(image, 12, [(truth.columns, truth.rows)])
-    assert ends_quietly(image, found.lattice)
+    assert squares_end(image, found.lattice)
     for part in ((slice(None), slice(1, None)), (slice(0, -1), slice(None))):
-        assert not ends_quietly(image, found.lattice.cut(*part))
+        assert not squares_end(image, found.lattice.cut(*part))

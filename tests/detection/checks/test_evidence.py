@@ -12,7 +12,7 @@ from detection_bench.scenes import CONDITIONS, one_board
 
 from rigkit.core.boards import Board
 from rigkit.detection.checks.evidence import Evidence
-from rigkit.detection.checks.validate import separate
+from rigkit.detection.checks.validate import without_shared_corners
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.subpixel.scatter import excess_scatter, scatter_factors
@@ -82,7 +82,7 @@ def grid(rows: int, columns: int, first_px: tuple[float, float]) -> Lattice:
 
 def test_a_grid_that_grew_over_a_seam_keeps_its_own_corners() -> None:
     large, grown, again = grid(8, 8, (0.0, 0.0)), grid(7, 8, (0.0, 140.0)), grid(6, 7, (20.0, 20.0))
-    kept = separate([again, grown, large], 9)
+    kept = without_shared_corners([again, grown, large], 9)
     assert [item.size for item in kept] == [(8, 8), (8, 6)]
     assert not np.isclose(kept[1].pixels[..., 1], 140.0).any()
 

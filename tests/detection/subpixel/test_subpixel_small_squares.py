@@ -93,7 +93,7 @@ def test_a_board_that_is_expected_promises_more_until_there_is_one(scene: tuple[
     assert own < 0.0
 
     def promised(sizes: list[tuple[int, int]]) -> EvidenceScore:
-        return lattices_of_images._evidence_score(image, lattices_of_images.Sought(12, sizes))
+        return lattices_of_images._evidence_score(image, lattices_of_images.BoardCriteria(12, sizes))
 
     promise = promised([(ROWS, COLUMNS)])
     assert promise(doubtful, []) == own + OF_EXPECTED_SIZE
