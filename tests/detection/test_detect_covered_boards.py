@@ -16,7 +16,7 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.subpixel.consistent import checked
+from rigkit.detection.subpixel.consistent import without_inconsistent
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.synthetic.render import Optics
 
@@ -98,4 +98,4 @@ def test_a_corner_that_has_no_other_beside_it_is_dropped() -> None:
     pixels[~lone] = np.nan
     ones = np.where(lone, 1.0, np.nan)
     item = RefinedLattice(Lattice(pixels, 100.0 * ones, True), 0.02 * ones, 0.8 * ones, 2.0 * ones, 2.0 * ones)
-    assert np.array_equal(checked(item, [(slice(6), slice(9))]).lattice.known, known)
+    assert np.array_equal(without_inconsistent(item, [(slice(6), slice(9))]).lattice.known, known)

@@ -15,7 +15,7 @@ from rigkit.detection.saddles.response import pyramid
 from rigkit.detection.saddles.saddle import find_corners
 from rigkit.detection.subpixel.blur_shape import blur_covariance
 from rigkit.detection.subpixel.resampled import resampled
-from rigkit.detection.subpixel.uncertain_corners import strays
+from rigkit.detection.subpixel.uncertain_corners import uncertain_outliers
 from rigkit.detection.subpixel.uniform_blur import UNEVEN_WIDTHS
 from rigkit.io.media.images import read_image
 
@@ -130,10 +130,10 @@ def test_uncertain_corners_are_kept_where_the_others_predict_them() -> None:
     gain[5] = 2.7
     sigma[5] = 0.2
     off[5, :4], off[5, 4:] = 0.04, 0.2
-    assert np.argwhere(strays(sigma, off, gain)).tolist() == [[5, column] for column in range(4, 8)]
+    assert np.argwhere(uncertain_outliers(sigma, off, gain)).tolist() == [[5, column] for column in range(4, 8)]
     # On a board that a lens bends, predictions err by more, and those at the end of a row by the most.
     off[:5] = 0.1
-    assert not strays(sigma, off, gain).any()
+    assert not uncertain_outliers(sigma, off, gain).any()
 
 
 @pytest.mark.parametrize("length_px", [10.0, 15.0])

@@ -57,7 +57,7 @@ used to predict others, and the tolerance of corners is limited to that standard
 class BoardState:
     """Corners of the board (R, C) with the results of their fits, NaN where missing; contrast is positive.
 
-    `together` : whether pixels and sigmas are those of a joint fit (`placed_together`).
+    `jointly` : whether pixels and sigmas are those of a joint fit (`placed_together`).
     """
 
     pixels: FloatArray
@@ -68,7 +68,7 @@ class BoardState:
     blur: FloatArray
     _: KW_ONLY
     signs: FloatArray
-    together: bool = False
+    jointly: bool = False
 
     @classmethod
     def unfitted(cls, pixels: FloatArray, signs: FloatArray) -> BoardState:
@@ -104,14 +104,14 @@ class BoardState:
         for value, name in zip(values, FITTED, strict=True):
             new = getattr(fit, name)
             value.reshape(-1, *new.shape[1:])[where] = new[mine]
-        return BoardState(*values, signs=self.signs, together=self.together)
+        return BoardState(*values, signs=self.signs, jointly=self.jointly)
 
     def without(self, drop: BoolArray) -> BoardState:
         """Return the state without the corners `drop` (R, C)."""
         values = self._copied()
         for value in values:
             value[drop] = np.nan
-        return BoardState(*values, signs=self.signs, together=self.together)
+        return BoardState(*values, signs=self.signs, jointly=self.jointly)
 
     def _copied(self) -> list[FloatArray]:
         """Return copies of the fields FITTED."""

@@ -59,7 +59,7 @@ def fit_corners(
         fit = fitted_beside_paper(image, every, fit, fitted, signs, np.zeros(len(start), np.int64))
     if isinstance(board.pattern, Charuco):
         # Residuals due to markers in the windows are no noise, but affect the corners: all residuals count.
-        fit = fit.less_sure(fit.residual / np.maximum(fit.noise, MIN_NOISE_LEFT), all_is_noise=True)
+        fit = fit.with_sigma_factors(fit.residual / np.maximum(fit.noise, MIN_NOISE_LEFT), all_is_noise=True)
     return fit
 
 

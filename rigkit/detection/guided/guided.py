@@ -33,7 +33,7 @@ from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
 from rigkit.detection.subpixel.subpixel import FIRST_BLUR
-from rigkit.detection.subpixel.uncertain_corners import IN_PLACE_CELLS, UNCERTAIN_FACTOR, strays
+from rigkit.detection.subpixel.uncertain_corners import IN_PLACE_CELLS, UNCERTAIN_FACTOR, uncertain_outliers
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
@@ -120,39 +120,41 @@ def _board_of(found: BoardDetection, boards: Sequence[Board]) -> Board | None:
 
 
 def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Camera | None) -> BoardDetection:
-    opened = _opened(image, found, board)
-    if opened is None:
+    first = _fit_of_detected(image, found, board)
+    if first is None:
         return found
-    state = opened
+    state = first
     guide = Guide.of(board, camera, state)
     if guide.camera is not None:
-        state = _tested(image, guide, state)
+        state = _fitted_and_checked(image, guide, state)
     before = state
-    while (more := _added(image, guide := guide.by(state), state)) is not None:
+    while (more := _with_next_corners(image, guide := guide.by(state), state)) is not None:
         state = more
     if guide.camera is None:
-        return found if state is before else _with_added(image, guide, found, opened, state)
+        return found if state is before else _with_added(image, guide, found, first, state)
     if state is not before:
-        state = _tested(image, guide, state)
+        state = _fitted_and_checked(image, guide, state)
     state = state.without(~np.isfinite(state.sigma_px))
     row, column = np.nonzero(state.known)
     if len(row) < MIN_GUIDE_CORNERS:
         return found
     # The factor of correlated noise is applied only if it reduces sigmas; larger ones follow from the scatter.
-    alike = state if state.together else opened
-    state = replace(state, sigma_px=min(1.0, _known_factor(found, alike)) * state.sigma_px)
-    sigma = _scatter(guide, state) * state.sigma_px[row, column]
+    alike = state if state.jointly else first
+    state = replace(state, sigma_px=min(1.0, _detector_factor(found, alike)) * state.sigma_px)
+    sigma = _scatter_factor(guide, state) * state.sigma_px[row, column]
     return replace(found, grid=np.stack([column, row], axis=-1), pixels=state.pixels[row, column], sigma_px=sigma)
 
 
 def _with_added(
-    image: GreyImage, guide: Guide, found: BoardDetection, opened: BoardState, state: BoardState
+    image: GreyImage, guide: Guide, found: BoardDetection, first: BoardState, state: BoardState
 ) -> BoardDetection:
     """Return `found` with the additional corners of `state` that do not contradict the others."""
-    state = _together(image, guide.board, _settled(image, guide.board, state, state.known & ~opened.known))
-    added = state.known & ~opened.known & (_contradiction(guide, state, state) <= 1.0)
-    added &= ~_strays(state)
-    sigma = _known_factor(found, state if state.together else opened) * state.sigma_px
+    state = _fitted_jointly(
+        image, guide.board, _fitted_with_neighbours(image, guide.board, state, state.known & ~first.known)
+    )
+    added = state.known & ~first.known & (_excess_distances(guide, state, state) <= 1.0)
+    added &= ~_uncertain_outliers(state)
+    sigma = _detector_factor(found, state if state.jointly else first) * state.sigma_px
     row, column = np.nonzero(added)
     grid = np.concatenate([found.grid, np.stack([column, row], axis=-1)])
     order = np.lexsort((grid[:, 0], grid[:, 1]))
@@ -164,17 +166,17 @@ def _with_added(
     )
 
 
-def _strays(state: BoardState) -> BoolArray:
+def _uncertain_outliers(state: BoardState) -> BoolArray:
     """Return which corners of `state` are uncertain and contradict their predictions by the others."""
     known = state.known
     shape = fit_cells(state.pixels, known, leave_out=True)
     off, gain = np.full((2, *known.shape), np.nan)
     off[known] = np.linalg.norm(state.pixels[known] - shape.pixels, axis=1) / shape.cell_px()
     gain[known] = shape.gain
-    return strays(state.sigma_px, off, gain)
+    return uncertain_outliers(state.sigma_px, off, gain)
 
 
-def _settled(image: GreyImage, board: Board, state: BoardState, cells: BoolArray) -> BoardState:
+def _fitted_with_neighbours(image: GreyImage, board: Board, state: BoardState, cells: BoolArray) -> BoardState:
     """Return the state with the `cells` fitted again, after corners around them were added."""
     if not cells.any():
         return state
@@ -183,15 +185,15 @@ def _settled(image: GreyImage, board: Board, state: BoardState, cells: BoolArray
     curvatures = line_curvatures_to_fit(state.pixels, state.sigma_px, known, shape.sides, RADIUS_PX)
     blur = known_median(state.blur)
     fit = fit_corners(image, board, known, shape, state.pixels[known], state.signs[known], blur, curvatures)
-    fit = _with_uneven(fit, shape.sides, board)
+    fit = _with_correlated_noise(fit, shape.sides, board)
     return state.with_fit(known, fit, fit.valid & (fit.contrast > 0.0) & cells[known])
 
 
-def _with_uneven(fit: EdgeFit, sides: FloatArray, board: Board) -> EdgeFit:
+def _with_correlated_noise(fit: EdgeFit, sides: FloatArray, board: Board) -> EdgeFit:
     return with_uneven(fit, sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))[0]
 
 
-def _known_factor(found: BoardDetection, state: BoardState) -> float:
+def _detector_factor(found: BoardDetection, state: BoardState) -> float:
     """Return the median factor by which the detector multiplied its sigmas, for scatter and correlated noise.
 
     `state` : the same corners, fitted separately or jointly as by the detector.
@@ -199,7 +201,7 @@ def _known_factor(found: BoardDetection, state: BoardState) -> float:
     return known_median(found.sigma_px / state.sigma_px[found.grid[:, 1], found.grid[:, 0]])
 
 
-def _scatter(guide: Guide, state: BoardState) -> float:
+def _scatter_factor(guide: Guide, state: BoardState) -> float:
     """Return the ratio of the corners' scatter about their predictions to their sigmas; 1 if not significant."""
     cells = state.known
     shape, seen = guide.at(state, cells)
@@ -210,7 +212,7 @@ def _scatter(guide: Guide, state: BoardState) -> float:
     return ratio if ratio > UNEXPLAINED else 1.0
 
 
-def _opened(image: GreyImage, found: BoardDetection, board: Board) -> BoardState | None:
+def _fit_of_detected(image: GreyImage, found: BoardDetection, board: Board) -> BoardState | None:
     """Return the fit results of the detected corners; None if there are too few valid ones."""
     shape = (found.rows, found.columns)
     signs = np.where(np.add.outer(np.arange(shape[0]), np.arange(shape[1])) % 2 == 1, -1.0, 1.0)
@@ -229,11 +231,11 @@ def _opened(image: GreyImage, found: BoardDetection, board: Board) -> BoardState
     if good.sum() < MIN_GUIDE_CORNERS:
         return None
     # Positions remain those of the detector.
-    opened = state.with_fit(cells, fit, good)
-    return replace(opened, pixels=state.pixels)
+    first = state.with_fit(cells, fit, good)
+    return replace(first, pixels=state.pixels)
 
 
-def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | None:
+def _with_next_corners(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | None:
     """Return the state with the missing corners that can be added now, None if there are none."""
     missing = ~state.known
     if not missing.any():
@@ -257,11 +259,11 @@ def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | No
     rough = fit_corners(image, guide.board, cells, shape, shape.pixels, signs, wide)
     start = np.where(rough.valid[:, None], rough.pixels, shape.pixels)
     fit = fit_corners(image, guide.board, cells, shape, start, signs, blur)
-    good = _confirmed(guide, state, cells, shape, side, fit)
+    good = _is_confirmed(guide, state, cells, shape, side, fit)
     return state.with_fit(cells, fit, good) if good.any() else None
 
 
-def _confirmed(
+def _is_confirmed(
     guide: Guide, state: BoardState, cells: BoolArray, shape: LocalFit, side: FloatArray, fit: EdgeFit
 ) -> BoolArray:
     """Return which of the corners fitted at `cells` of geometry `shape` (M,) are confirmed."""
@@ -284,7 +286,7 @@ def _confirmed(
     return np.asarray(good)
 
 
-def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
+def _fitted_with_guide(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
     """Return the state with every corner fitted again with the geometry predicted by the camera."""
     cells = state.known.copy()
     shape, seen = guide.at(state, cells)
@@ -294,11 +296,11 @@ def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
         return state
     blur = known_median(state.blur)
     fit = fit_corners(image, guide.board, cells, shape.of(seen), state.pixels[cells], state.signs[cells], blur)
-    fit = _with_uneven(fit, shape.sides[seen], guide.board)
-    return replace(state.with_fit(cells, fit, fit.valid & (fit.contrast > 0.0)), together=False)
+    fit = _with_correlated_noise(fit, shape.sides[seen], guide.board)
+    return replace(state.with_fit(cells, fit, fit.valid & (fit.contrast > 0.0)), jointly=False)
 
 
-def _together(image: GreyImage, board: Board, state: BoardState) -> BoardState:
+def _fitted_jointly(image: GreyImage, board: Board, state: BoardState) -> BoardState:
     """Return the state with its corners fitted jointly if the blur requires it (`placed_together`).
 
     Corners of ChArUco boards are not: with markers their squares are not uniform.
@@ -312,41 +314,41 @@ def _together(image: GreyImage, board: Board, state: BoardState) -> BoardState:
     placed = placed_together(image, alone)
     if placed is alone:
         return state
-    return replace(state, pixels=placed.lattice.pixels, sigma_px=placed.sigma_px, together=True)
+    return replace(state, pixels=placed.lattice.pixels, sigma_px=placed.sigma_px, jointly=True)
 
 
-def _tested(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
+def _fitted_and_checked(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
     """Return the state with every corner fitted again, without those that contradict the camera and the others."""
-    again = _again(image, guide, state)
-    state = _together(image, guide.board, again)
-    kept = _unanimous(guide, state)
-    if not state.together or np.array_equal(kept.known, state.known):
+    again = _fitted_with_guide(image, guide, state)
+    state = _fitted_jointly(image, guide.board, again)
+    kept = _without_contradicting(guide, state)
+    if not state.jointly or np.array_equal(kept.known, state.known):
         return kept
     # Dropped corners affected the joint fit of the others.
-    return _together(image, guide.board, again.without(~kept.known))
+    return _fitted_jointly(image, guide.board, again.without(~kept.known))
 
 
-def _unanimous(guide: Guide, state: BoardState) -> BoardState:
+def _without_contradicting(guide: Guide, state: BoardState) -> BoardState:
     """Return the state without the corners that contradict the camera and their neighbours.
 
     The worst are dropped first, as they affect the predictions of their neighbours.
     """
     rest = state
     while True:
-        share = _contradiction(guide, rest, rest)
+        share = _excess_distances(guide, rest, rest)
         outlying = (share > 1.0) & (share >= cv2.dilate(share, np.ones((5, 5))))
         if not outlying.any():
             break
         rest = rest.without(outlying)
         guide = guide.by(rest)
-    return state.without(_contradiction(guide, state, rest) > 1.0)
+    return state.without(_excess_distances(guide, state, rest) > 1.0)
 
 
-def _contradiction(guide: Guide, state: BoardState, judges: BoardState) -> FloatArray:
-    """Return the distances (R, C) of the corners of `state` from predictions by `judges`, over the allowed ones."""
-    cells, own = state.known, judges.known
+def _excess_distances(guide: Guide, state: BoardState, predicting: BoardState) -> FloatArray:
+    """Return the distances (R, C) of the corners of `state` from predictions by `predicting`, over the allowed ones."""
+    cells, own = state.known, predicting.known
     off = np.zeros(cells.shape)
-    shape, _ = guide.at(judges, cells)
+    shape, _ = guide.at(predicting, cells)
     # NaN beyond the lens model's field of view counts as 0.
     off[cells] = np.nan_to_num(np.linalg.norm(state.pixels[cells] - shape.pixels, axis=1) / np.maximum(shape.gain, 1.0))
     typical = max(float(np.median(off[own])), SCATTER_FLOOR_PX) if own.any() else SCATTER_FLOOR_PX

@@ -84,18 +84,18 @@ def relit(
     doubtful = ~plain & ((cv2.dilate(known.astype(np.uint8), CROSS) > 0) | known)
     if np.count_nonzero(doubtful) < MIN_SHADED:
         return found
-    suspect = _suspect(image, board, pixels, doubtful)
+    suspect = _lit_unevenly(image, board, pixels, doubtful)
     even = known & ~suspect
     if np.count_nonzero(suspect) < MIN_SHADED or np.count_nonzero(even) < MIN_EVEN:
         return found
     assumed = board or Board("found", found.columns, found.rows, 1.0, 1.0)
-    fits = refined if board is None else _as_it_is(image, board, found, refined, _near(even, suspect))
+    fits = refined if board is None else _fitted_with_markers(image, board, found, refined, _near(even, suspect))
     reference = _near(even & np.isfinite(fits.blur_px), suspect)
     if np.count_nonzero(reference) < MIN_EVEN:
         return found
     typical = _typical(pixels, fits, reference)
     shape = fit_cells(np.where(even[..., None], pixels, np.nan), suspect, **FLEXIBLE._asdict())
-    was = _left(image, assumed, suspect, shape, fits.relative_residual, typical)
+    was = _relative_residuals(image, assumed, suspect, shape, fits.relative_residual, typical)
     tried = (shape.support >= MIN_PREDICTORS) & (shape.gain < MAX_RELIT_GAIN) & (was > TIMES_BETTER * typical.relative)
     tried &= np.linalg.norm(shape.sides, axis=2).min(axis=1) > MIN_SHADED_CELL_PX
     if np.count_nonzero(tried) < MIN_SHADED:
@@ -109,7 +109,7 @@ def relit(
     return replace(found, grid=grid, pixels=pixels[row, column], sigma_px=own[row, column])
 
 
-def _left(
+def _relative_residuals(
     image: GreyImage, board: Board, cells: BoolArray, shape: LocalFit, relative: FloatArray, typical: _Typical
 ) -> FloatArray:
     """Return the residuals over contrast (M,) of the corners at `cells`: `relative` (R, C) where known, else those of
@@ -131,7 +131,7 @@ def _in_even_light(
     `was` (M,) is the residual over contrast before the correction.
     """
     side, signs = np.linalg.norm(shape.sides, axis=2).min(axis=1), typical.signs[cells]
-    lateral = _plain_distance(board, shape.sides)
+    lateral = _uniform_distance(board, shape.sides)
     steps, seen = light_steps(image, shape.pixels, shape.sides, shape.curvature(), typical.blur, lateral)
     picture, moved = in_even_light(image, steps)
     start = np.where(np.abs(steps.pixels - shape.pixels) < 1.0, steps.pixels, shape.pixels)
@@ -145,18 +145,18 @@ def _in_even_light(
     return pixels, sigma, np.asarray(good)
 
 
-def _suspect(image: GreyImage, board: Board | None, pixels: FloatArray, cells: BoolArray) -> BoolArray:
+def _lit_unevenly(image: GreyImage, board: Board | None, pixels: FloatArray, cells: BoolArray) -> BoolArray:
     """Return which of the `cells` (R, C) of a board with corners `pixels` (R, C, 2) are lit unevenly."""
     shape = fit_cells(pixels, cells)
     ends = np.ones_like(cells)
     ends[1:-1, 1:-1] = False
     at = np.where(np.isfinite(pixels[cells]), pixels[cells], shape.pixels)
     out = cells.copy()
-    out[cells] = beside_shadows(image, at, shape.sides, _plain_distance(board, shape.sides), ends[cells])
+    out[cells] = beside_shadows(image, at, shape.sides, _uniform_distance(board, shape.sides), ends[cells])
     return out
 
 
-def _plain_distance(board: Board | None, sides: FloatArray) -> FloatArray:
+def _uniform_distance(board: Board | None, sides: FloatArray) -> FloatArray:
     """Return the distance from the lines of a board within which its squares are uniform (N,), px."""
     if board is None or not isinstance(board.pattern, Charuco):
         return np.full(len(sides), RADIUS_PX)
@@ -170,7 +170,7 @@ def _near(even: BoolArray, suspect: BoolArray) -> BoolArray:
     return near if np.count_nonzero(near) >= MIN_EVEN else even
 
 
-def _as_it_is(
+def _fitted_with_markers(
     image: GreyImage, board: Board, found: BoardDetection, refined: RefinedLattice, cells: BoolArray
 ) -> RefinedLattice:
     """Return `refined` with fits of about MAX_EVEN of the `cells` (R, C) in the image with markers, and of no others.

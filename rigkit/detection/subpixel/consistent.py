@@ -11,7 +11,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, upper_median
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells, predicted
 from rigkit.detection.subpixel.refined import RefinedLattice
-from rigkit.detection.subpixel.uncertain_corners import strays
+from rigkit.detection.subpixel.uncertain_corners import uncertain_outliers
 
 MIN_NEIGHBOURS = 3
 """Smallest number of known corners among the eight neighbours of an empty cell that is tried."""
@@ -41,7 +41,7 @@ sides unequal. On RENDERED boards under a ruler the factor is 12 and more and th
 markers the factor is seldom 6; glare on single squares of blurred boards with little noise gives 0.04."""
 
 
-def with_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray]:
+def with_predicted_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray]:
     """Return the lattice with predictions in those empty cells `inside` that have known neighbours, and these cells."""
     known = lattice.known
     holes: BoolArray = inside & ~known
@@ -56,7 +56,7 @@ def with_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray]
     return Lattice(pixels, lattice.contrast, lattice.rising), holes
 
 
-def confirmed(item: RefinedLattice, start: Lattice, holes: BoolArray) -> RefinedLattice:
+def without_unconfirmed_holes(item: RefinedLattice, start: Lattice, holes: BoolArray) -> RefinedLattice:
     """Return `item` without those of the `holes` where the fit does not confirm a corner."""
     known = item.lattice.known
     settled = known & ~holes
@@ -64,12 +64,14 @@ def confirmed(item: RefinedLattice, start: Lattice, holes: BoolArray) -> Refined
     cell = np.full(known.shape, np.nan)
     cell[holes] = fit_cells(start.pixels, holes, degree=1).cell_px()
     with np.errstate(invalid="ignore"):
-        good = (moved < MOVED_CELLS * cell) & (item.residual < HOLE_RESIDUAL * _around(item.residual, settled))
-        good &= item.sigma_px < HOLE_SIGMA * _around(item.sigma_px, settled)
+        good = (moved < MOVED_CELLS * cell) & (
+            item.residual < HOLE_RESIDUAL * _mean_of_neighbours(item.residual, settled)
+        )
+        good &= item.sigma_px < HOLE_SIGMA * _mean_of_neighbours(item.sigma_px, settled)
     return item.without(holes & ~good)
 
 
-def _around(values: FloatArray, known: BoolArray) -> FloatArray:
+def _mean_of_neighbours(values: FloatArray, known: BoolArray) -> FloatArray:
     """Return the mean of `values` (R, C) over the `known` among each cell and its eight neighbours, NaN for none."""
     box = np.ones((3, 3))
     total, count = (
@@ -79,7 +81,7 @@ def _around(values: FloatArray, known: BoolArray) -> FloatArray:
     return np.where(count > 0.5, total / np.maximum(count, 0.5), np.nan)
 
 
-def checked(item: RefinedLattice, parts: Sequence[tuple[slice, slice]]) -> RefinedLattice:
+def without_inconsistent(item: RefinedLattice, parts: Sequence[tuple[slice, slice]]) -> RefinedLattice:
     """Return `item` without corners of its `parts` that are partly covered or contradict their neighbours."""
     known = item.lattice.known
     shape = fit_cells(item.lattice.pixels, known, leave_out=True)
@@ -106,7 +108,7 @@ def checked(item: RefinedLattice, parts: Sequence[tuple[slice, slice]]) -> Refin
         here, sure = known[part], judged[part]
         if here.sum() < MIN_CHECKED:
             continue
-        drop[part] = alone[part] | strays(item.sigma_px[part], cells[part], gain[part])
+        drop[part] = alone[part] | uncertain_outliers(item.sigma_px[part], cells[part], gain[part])
         if sure.sum() < MIN_TESTED:
             continue
         typical = upper_median(cells[part][sure])

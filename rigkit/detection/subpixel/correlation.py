@@ -81,7 +81,7 @@ def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bo
     noise = _noise_of(fit, fit.valid & (fit.contrast > 0.0), sides, np.zeros(len(sides), np.int64))
     rules = factor_rules(radius_px)
     typical = np.maximum(edges.sigma_factors(noise, 1, rules), 1.0 if marked else 0.0)
-    return fit.less_sure(edges.uneven_factors(noise, typical, rules)), float(typical[0])
+    return fit.with_sigma_factors(edges.uneven_factors(noise, typical, rules)), float(typical[0])
 
 
 @functools.cache

@@ -132,7 +132,7 @@ class EdgeFit:
         out[which] = part.outcomes
         return EdgeFit(out)
 
-    def less_sure(self, times: FloatArray, *, all_is_noise: bool = False) -> EdgeFit:
+    def with_sigma_factors(self, times: FloatArray, *, all_is_noise: bool = False) -> EdgeFit:
         """Return the fit with sigmas multiplied by `times` (N,); `all_is_noise` : all residuals count as noise."""
         out = EdgeFit(self.outcomes.copy())
         out.sigma_px[:] *= times

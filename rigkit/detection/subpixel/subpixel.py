@@ -15,7 +15,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, upper_median
 from rigkit.detection.lattice.lattice import Lattice, LatticeStack
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.subpixel.consistent import checked, confirmed, with_holes
+from rigkit.detection.subpixel.consistent import with_predicted_holes, without_inconsistent, without_unconfirmed_holes
 from rigkit.detection.subpixel.correlation import board_factors
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
@@ -66,7 +66,7 @@ def refine(
     # All lattices are stacked, so that each step is one call.
     stack = LatticeStack.of(lattices)
     first = _first_pass(image, Lattice(stack.pixels, stack.contrast, True), stack.signs)
-    start, holes = with_holes(first.lattice, stack.signs != 0.0)
+    start, holes = with_predicted_holes(first.lattice, stack.signs != 0.0)
     before, blur = first.of(start), _typical_blur(first, stack.parts)
     shape = fit_cells(start.pixels, start.known)
     gaps = shape.gaps()
@@ -225,8 +225,8 @@ class _Stacked:
         parts = [self.parts[k] for k in numbers]
         last, factors = _last_pass(self, self.windows(before, lines, blur, aslant=aslant), parts)
         if self.holes.any():
-            last = confirmed(last, self.start, self.holes)
-        good = checked(last, parts)
+            last = without_unconfirmed_holes(last, self.start, self.holes)
+        good = without_inconsistent(last, parts)
         # Sigmas are raised if corners scatter by more than the noise of the image explains (JPEG blocks, aliasing, wavy
         # paper).
         scatter = scatter_factors(good.lattice.pixels, good.sigma_px, parts)

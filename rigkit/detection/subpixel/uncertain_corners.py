@@ -15,7 +15,7 @@ IN_PLACE_CELLS, IN_PLACE_TIMES = 0.05, 2.0
 error of the prediction, which is larger at the end of a row."""
 
 
-def strays(sigma_px: FloatArray, off_cells: FloatArray, gain: FloatArray) -> BoolArray:
+def uncertain_outliers(sigma_px: FloatArray, off_cells: FloatArray, gain: FloatArray) -> BoolArray:
     """Return which corners (R, C) of a board are uncertain and contradict their predictions by the others.
 
     Parameters

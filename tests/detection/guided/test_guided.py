@@ -14,7 +14,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.guided.board_guide import BoardState
-from rigkit.detection.guided.guided import _together, complete_boards
+from rigkit.detection.guided.guided import _fitted_jointly, complete_boards
 from rigkit.detection.saddles.response import grey_image
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
@@ -221,6 +221,6 @@ def test_a_corner_without_a_fit_of_its_own_does_not_spoil_the_others() -> None:
         signs=np.where((row + column) % 2, 1.0, -1.0),
     )
     state.sigma_px[2, 4] = state.blur[2, 4] = np.nan
-    placed = _together(grey_image(image), BOARD, state)
-    assert placed.together
+    placed = _fitted_jointly(grey_image(image), BOARD, state)
+    assert placed.jointly
     assert np.argwhere(~placed.known).tolist() == [[2, 4]]
