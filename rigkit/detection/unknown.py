@@ -23,13 +23,13 @@ from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.unknown_charuco import MarkerObservations, guessed_charuco
 from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, GuessedGrid, TagObservations, guessed_grids
-from rigkit.detection.whole_charuco import begins, next_row, of_pattern
+from rigkit.detection.whole_charuco import choose_pattern, has_first_row, has_next_row
 from rigkit.detection.whole_grids import (
     MIN_IMAGES_OF_GUESS,
-    GridSeen,
+    GridExtent,
     Size,
     board_size_in,
-    grid_seen,
+    grid_extent,
     other_sizes,
     whole_sizes,
 )
@@ -60,9 +60,9 @@ class BoardGuess:
     beside : other boards in the images; of chessboards the visible part.
     sizes : empty if the size of the board is known. Otherwise a lower bound of its columns and rows, or several
         possible sizes.
-    rough : light or ink has shifted the edges of tags in all images, so that the spacing is known only to some
+    edges_moved : light or ink has shifted the edges of tags in all images, so that the spacing is known only to some
         hundredths.
-    either : another possible board, if the edges of tags are shifted so much that the width of their border is
+    other_border : another possible board, if the edges of tags are shifted so much that the width of their border is
         ambiguous.
     either_pattern : the images do not show the column in which the current pattern of a ChArUco board differs from that
         before OpenCV 4.6.
@@ -73,14 +73,14 @@ class BoardGuess:
     images: tuple[int, ...]
     beside: tuple[Board, ...] = ()
     sizes: tuple[Size, ...] = ()
-    rough: bool = False
-    either: Board | None = None
+    edges_moved: bool = False
+    other_border: Board | None = None
     either_pattern: bool = False
     marked: bool = False
 
     @property
     def determined(self) -> bool:
-        return not self.sizes and not self.rough and self.either is None
+        return not self.sizes and not self.edges_moved and self.other_border is None
 
 
 def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> BoardGuess | None:
@@ -94,32 +94,32 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
     # The pixels of a mosaic look like markers in every square.
     images = [without_mosaic(image) for image in images]
     tags, markers = TagObservations(), MarkerObservations()
-    plain: list[list[GridSeen]] = []
+    plain: list[list[GridExtent]] = []
     sure: list[int] = []
     for k, found in enumerate(in_threads(detect_boards, images)):
         progress(LOOKING, k, len(images))
-        grids = [(one, seen) for one in found if (seen := grid_seen(one, images[k])) is not None]
+        grids = [(one, seen) for one in found if (seen := grid_extent(one, images[k])) is not None]
         plain.append([seen for _, seen in grids])
-        if any(_without_marks(images[k], one) for one, _ in grids):
+        if any(_has_empty_squares(images[k], one) for one, _ in grids):
             sure.append(k)
     for k in (k for k in range(len(images)) if k not in sure):
         if not tags.look(k, images[k]):
             markers.look(k, images[k])
     # A tiled floor is a chessboard without markers in every image, but seldom of one size in most.
-    if tags.seen or markers.images or not _in_most(plain):
+    if tags.seen or markers.images or not _most_show_one_size(plain):
         for k in sure:
             if not tags.look(k, images[k]):
                 markers.look(k, images[k])
-    guess = _guess_of(images, plain, tags, markers, marked=not sure)
+    guess = _guess_from_observations(images, plain, tags, markers, marked=not sure)
     progress(LOOKING, len(images), len(images))
     if guess is not None and guess.board.pattern.type == Chessboard.type:
         return replace(guess, marked=not sure)
     return guess
 
 
-def _guess_of(
+def _guess_from_observations(
     images: Sequence[GreyImage],
-    plain: Sequence[Sequence[GridSeen]],
+    plain: Sequence[Sequence[GridExtent]],
     tags: TagObservations,
     markers: MarkerObservations,
     *,
@@ -127,28 +127,30 @@ def _guess_of(
 ) -> BoardGuess | None:
     grids = guessed_grids(tags)
     if grids:
-        return _of_grids(grids)
+        return _guess_from_grids(grids)
     charuco = guessed_charuco(markers)
     if charuco:
         shown = [images[k] for k in markers.images]
-        more = next_row(charuco[0], shown)
+        more = has_next_row(charuco[0], shown)
         while more and (taller := guessed_charuco(markers, charuco[0].rows + 1)):
-            charuco, more = taller, next_row(taller[0], shown)
-        board, sure = of_pattern(charuco, shown)
-        sizes = () if more is False and begins(board, shown) else (board.size,)
+            charuco, more = taller, has_next_row(taller[0], shown)
+        board, sure = choose_pattern(charuco, shown)
+        sizes = () if more is False and has_first_row(board, shown) else (board.size,)
         return BoardGuess(board=board, images=tuple(markers.images), sizes=sizes, either_pattern=not sure)
-    guess = _plain_guess(images, plain)
+    guess = _guess_without_marks(images, plain)
     determined = guess is not None and guess.determined
     # There may be a chessboard in the background, or markers that were not read.
     unexplained = [k for k in range(len(images)) if guess is None or k not in guess.images]
     possibly_marked = marked and guess is not None and guess.board.pattern.type == Chessboard.type
     if determined and not unexplained and not possibly_marked:
         return guess
-    grids = _rarer_grids(images, unexplained or range(len(images)), determined=determined)
-    return _of_grids(grids) if grids else guess
+    grids = _inverted_or_aruco_grids(images, unexplained or range(len(images)), determined=determined)
+    return _guess_from_grids(grids) if grids else guess
 
 
-def _rarer_grids(images: Sequence[GreyImage], some: Sequence[int], *, determined: bool) -> list[GuessedGrid]:
+def _inverted_or_aruco_grids(
+    images: Sequence[GreyImage], some: Sequence[int], *, determined: bool
+) -> list[GuessedGrid]:
     """Return the grids of tags that are white on black, if `some` of the images show tags; without any, and if no other
     board is `determined`, those of ArUco markers."""
     white = TagObservations(inverted=True)
@@ -161,23 +163,23 @@ def _rarer_grids(images: Sequence[GreyImage], some: Sequence[int], *, determined
     for inverted in (False, True) if not grids and not determined else ():
         aruco = TagObservations(ARUCO_TAGS, inverted=inverted)
         for k, image in enumerate(images):
-            aruco.look_alone(k, image)
+            aruco.read_lone_tags(k, image)
         grids = grids or guessed_grids(aruco)
     return grids
 
 
-def _of_grids(grids: Sequence[GuessedGrid]) -> BoardGuess:
+def _guess_from_grids(grids: Sequence[GuessedGrid]) -> BoardGuess:
     first, *others = grids
     return BoardGuess(
         board=first.board,
         images=first.images,
         beside=tuple(grid.board for grid in others),
-        rough=first.rough,
-        either=first.either,
+        edges_moved=first.edges_moved,
+        other_border=first.other_border,
     )
 
 
-def _without_marks(image: GreyImage, found: BoardDetection) -> bool:
+def _has_empty_squares(image: GreyImage, found: BoardDetection) -> bool:
     """Return whether a lattice is certainly a chessboard: large, with empty squares."""
     if len(found.grid) < MIN_EXPECTED_CORNERS:
         return False
@@ -195,15 +197,15 @@ def _without_marks(image: GreyImage, found: BoardDetection) -> bool:
     return all(float(np.median(np.ptp(levels[:, of], axis=0))) < MAX_LEVEL_DIFFERENCE * contrast for of in (odd, ~odd))
 
 
-def _in_most(plain: Sequence[Sequence[GridSeen]]) -> bool:
+def _most_show_one_size(plain: Sequence[Sequence[GridExtent]]) -> bool:
     """Return whether at least half of the images, and at least MIN_IMAGES_OF_GUESS, show whole grids of one size."""
     counts = Counter(size for found in plain for size in whole_sizes(found))
     return max(counts.values(), default=0) >= max(0.5 * len(plain), MIN_IMAGES_OF_GUESS)
 
 
-def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[GridSeen]]) -> BoardGuess | None:
+def _guess_without_marks(images: Sequence[GreyImage], plain: Sequence[Sequence[GridExtent]]) -> BoardGuess | None:
     """Return the chessboard, or grid of circles, that most of the images show; None if there is none."""
-    circles, settled = CircleObservations(), _in_most(plain)
+    circles, settled = CircleObservations(), _most_show_one_size(plain)
     for k, (image, found) in enumerate(zip(images, plain, strict=True)):
         if not (found and settled):
             circles.look(k, image)

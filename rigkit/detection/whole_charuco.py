@@ -46,7 +46,7 @@ MARKER_SEEN = 0.5
 """Smallest likeness of a marker that is not hidden, relative to the median of the row."""
 
 
-def of_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> tuple[Board, bool]:
+def choose_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> tuple[Board, bool]:
     """Return the board with today's or the former pattern, and whether the images determine which.
 
     If a row has an odd number of squares, only one marker in every second row differs: it is at one end of the row or
@@ -56,11 +56,11 @@ def of_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> tuple[Bo
     if len({_squares_of(board).tobytes() for board in boards}) == 1:
         return boards[0], True
     some = images[:: -(-len(images) // IMAGES_OF_PATTERN)]
-    excess, places = np.sum(list(in_threads(lambda image: _for_the_second(boards, image), some)), axis=0)
+    excess, places = np.sum(list(in_threads(lambda image: _evidence_for_second(boards, image), some)), axis=0)
     return boards[int(excess > 0.0)], bool(abs(excess) >= SURE_OF_PATTERN * np.sqrt(max(places, 1.0)))
 
 
-def next_row(board: Board, images: Sequence[GreyImage]) -> bool | None:
+def has_next_row(board: Board, images: Sequence[GreyImage]) -> bool | None:
     """Return whether images show one more row of squares than a board has; None if they do not determine it, because
     its place is not visible, or its markers could not be recognised."""
     pattern = board.pattern
@@ -88,10 +88,10 @@ def next_row(board: Board, images: Sequence[GreyImage]) -> bool | None:
 
     likeness, ends = zip(*in_threads(like, images[:: -(-len(images) // IMAGES_OF_ROWS)]), strict=True)
     of_last, beyond = (np.concatenate([one[row] for one in likeness]) for row in (last, ~last))
-    return _like_the_last(beyond[np.isfinite(beyond)], of_last[np.isfinite(of_last)], sum(ends))
+    return _resembles_last_row(beyond[np.isfinite(beyond)], of_last[np.isfinite(of_last)], sum(ends))
 
 
-def begins(board: Board, images: Sequence[GreyImage]) -> bool:
+def has_first_row(board: Board, images: Sequence[GreyImage]) -> bool:
     """Return whether no row is before a board's first one: its markers are numbered from 0, or images show it."""
     pattern = board.pattern
     assert isinstance(pattern, Charuco)
@@ -142,7 +142,7 @@ def _ends(image: GreyImage, pixels: FloatArray, marked: IntArray, board: Board, 
     return count
 
 
-def _like_the_last(beyond: FloatArray, last: FloatArray, ends: int) -> bool | None:
+def _resembles_last_row(beyond: FloatArray, last: FloatArray, ends: int) -> bool | None:
     """Return whether squares beyond a row resemble their markers as much as those of the row itself; None if unknown.
 
     Paper beyond squares, `ends` of them, is evidence against markers, unless other squares beyond the row resemble
@@ -165,7 +165,7 @@ def _squares_of(board: Board) -> IntArray:
     return board.pattern.places(*board.size)
 
 
-def _for_the_second(boards: Sequence[Board], image: GreyImage) -> tuple[float, int]:
+def _evidence_for_second(boards: Sequence[Board], image: GreyImage) -> tuple[float, int]:
     """Return by how much the likeness of the markers at different places on two boards is larger for the second, in
     standard deviations of one marker, and the number of places."""
     found = next((item for item in detect_boards(image, boards[:1]) if item.board_id is not None), None)

@@ -50,7 +50,7 @@ Size = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class GridSeen:
+class GridExtent:
     """The extent of a grid along its columns and rows.
 
     Attributes
@@ -72,7 +72,7 @@ class GridSeen:
     def whole(self) -> bool:
         return all(self.ends)
 
-    def may_be_of(self, size: Size) -> bool:
+    def may_be_part_of(self, size: Size) -> bool:
         """Return whether the grid may be the visible part of a board of this size."""
         return any(
             all(
@@ -83,7 +83,7 @@ class GridSeen:
         )
 
 
-def grid_seen(found: BoardDetection, image: GreyImage) -> GridSeen | None:
+def grid_extent(found: BoardDetection, image: GreyImage) -> GridExtent | None:
     """Return the extent of a grid in an image; None if too few of its corners are known."""
     if not found.complete and len(found.grid) < max(
         MIN_EXPECTED_CORNERS, MIN_SHARE_OF_GRID * found.columns * found.rows
@@ -97,14 +97,14 @@ def grid_seen(found: BoardDetection, image: GreyImage) -> GridSeen | None:
     )
     ends = tuple(
         min(inside for inside, _ in both) >= MIN_SHARE_OF_LINE * lines.shape[1]
-        and not any(_goes_on(image, side) for side in (lines, lines[::-1]))
+        and not any(_continues_beyond(image, side) for side in (lines, lines[::-1]))
         for both, lines in (((first, last), along_columns), ((top, bottom), lattice))
     )
     cut = any(outside > inside for inside, outside in (first, last, top, bottom))
-    return GridSeen((found.columns, found.rows), (ends[0], ends[1]), cut)
+    return GridExtent((found.columns, found.rows), (ends[0], ends[1]), cut)
 
 
-def _beyond(lines: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _extrapolated_lines(lines: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the extrapolated two lines before the first of a grid (lines, corners of each, 2); NaN where unknown."""
     first, second, third = (lines[k] if k < len(lines) else np.full_like(lines[0], np.nan) for k in range(3))
     # Quadratic, for distortion; linear where the third corner is missing.
@@ -112,10 +112,10 @@ def _beyond(lines: FloatArray) -> tuple[FloatArray, FloatArray]:
     return 2.0 * first - second + bend, 3.0 * first - 2.0 * second + 3.0 * bend
 
 
-def _goes_on(image: GreyImage, lines: FloatArray) -> bool:
+def _continues_beyond(image: GreyImage, lines: FloatArray) -> bool:
     """Return whether there are squares beyond the next line before the first of a grid (lines, corners of each, 2): at
     the rim of a lens, in poor light or blur corners of a board may be missed."""
-    first, (near, far) = lines[0], _beyond(lines)
+    first, (near, far) = lines[0], _extrapolated_lines(lines)
     places = np.stack([first + IN_SQUARE * (lines[1] - first), near + IN_SQUARE * (far - near)])
     places = 0.5 * (places[:, 1:] + places[:, :-1])
     last = np.array(image.shape[::-1]) - 1.0
@@ -137,18 +137,18 @@ def _goes_on(image: GreyImage, lines: FloatArray) -> bool:
 def _next_line(lines: FloatArray, borders: FloatArray) -> tuple[int, int]:
     """Return how many corners of the line before the first of a grid (lines, corners of each, 2; NaN where unknown)
     would be inside the image, and how many outside."""
-    beyond, _ = _beyond(lines)
+    beyond, _ = _extrapolated_lines(lines)
     # Corners that are missing are NaN, and not inside.
     inside = ((beyond >= UNSEEN_BORDER_PX) & (beyond <= borders - UNSEEN_BORDER_PX)).all(axis=1)
     return int(np.count_nonzero(inside)), int(np.count_nonzero(np.isfinite(beyond[:, 0]) & ~inside))
 
 
-def whole_sizes(seen: Sequence[GridSeen]) -> set[Size]:
+def whole_sizes(seen: Sequence[GridExtent]) -> set[Size]:
     """Return the sizes of an image's whole grids."""
     return {grid.size for grid in seen if grid.whole}
 
 
-def board_size_in(plain: Sequence[Sequence[GridSeen]]) -> tuple[tuple[Size, ...], tuple[int, ...]] | None:
+def board_size_in(plain: Sequence[Sequence[GridExtent]]) -> tuple[tuple[Size, ...], tuple[int, ...]] | None:
     """Return the size of the chessboard that images show, and the images that show it.
 
     Several sizes are returned if they are ambiguous, None if there is no evidence.
@@ -163,20 +163,20 @@ def board_size_in(plain: Sequence[Sequence[GridSeen]]) -> tuple[tuple[Size, ...]
     hidden = Counter(size for grids in plain for size in {g.size for g in grids if any(g.ends) and not g.cut})
     # Parts of a board cut by the image border, or of a tiled floor, have many sizes; the whole board has one.
     often = [size for seen in (wholes, hidden) for size in _by_count(seen) if seen[size] >= MIN_IMAGES_OF_GUESS]
-    options = [(size, _showing(plain, size)) for size in often]
+    options = [(size, _images_of_size(plain, size)) for size in often]
     parts = _size_of_parts(plain)
     options += [] if parts is None else [parts]
-    weighed = [(_weighed(plain, size, shown), shown) for size, shown in options]
+    weighed = [(_with_ambiguous_size(plain, size, shown), shown) for size, shown in options]
     if weighed:
         return min(weighed, key=lambda option: len(option[0]))
     full = Counter(size for grids in plain for size in {grid.size for grid in grids})
     once = _by_count(wholes) or [size for size in _by_count(full) if full[size] > MAX_SHARE_ALIKE_PARTS * len(plain)]
-    if not once or _more(plain, once[0]):
+    if not once or _larger_sizes(plain, once[0]):
         return None
-    return (once[0],), _showing(plain, once[0])
+    return (once[0],), _images_of_size(plain, once[0])
 
 
-def other_sizes(plain: Sequence[Sequence[GridSeen]], size: Size, shown: Sequence[int]) -> tuple[Size, ...]:
+def other_sizes(plain: Sequence[Sequence[GridExtent]], size: Size, shown: Sequence[int]) -> tuple[Size, ...]:
     """Return the (visible) sizes of other grids in at least MIN_SHARE_OF_OTHERS of the images `shown` of a board."""
     counts = Counter(other for k in shown for other in {grid.size for grid in plain[k]} - {size})
     return tuple(
@@ -186,13 +186,13 @@ def other_sizes(plain: Sequence[Sequence[GridSeen]], size: Size, shown: Sequence
     )
 
 
-def _weighed(plain: Sequence[Sequence[GridSeen]], size: Size, shown: Sequence[int]) -> tuple[Size, ...]:
+def _with_ambiguous_size(plain: Sequence[Sequence[GridExtent]], size: Size, shown: Sequence[int]) -> tuple[Size, ...]:
     """Return `size`, `shown` by these images, with another one if the two are ambiguous."""
-    more = _more(plain, size)
+    more = _larger_sizes(plain, size)
     if more and (more.total() > len(shown) or max(more.values()) > FEW * len(shown)):
         return size, _by_count(more)[0]
     less = Counter(other for k, grids in enumerate(plain) if k not in shown for other in whole_sizes(grids))
-    inside = [other for other in _by_count(less) if other != size and _within(other, size)]
+    inside = [other for other in _by_count(less) if other != size and _fits_into(other, size)]
     return (inside[0], size) if inside and MANY * less[inside[0]] > len(shown) else (size,)
 
 
@@ -201,24 +201,26 @@ def _by_count(counts: Counter[Size]) -> list[Size]:
     return sorted(counts, key=lambda size: (-counts[size], -size[0] * size[1]))
 
 
-def _within(size: Size, other: Size) -> bool:
+def _fits_into(size: Size, other: Size) -> bool:
     return size[0] <= other[0] and size[1] <= other[1]
 
 
-def _showing(plain: Sequence[Sequence[GridSeen]], size: Size) -> tuple[int, ...]:
+def _images_of_size(plain: Sequence[Sequence[GridExtent]], size: Size) -> tuple[int, ...]:
     """Return the images with a grid of this size."""
     return tuple(k for k, grids in enumerate(plain) if any(grid.size == size for grid in grids))
 
 
-def _more(plain: Sequence[Sequence[GridSeen]], size: Size) -> Counter[Size]:
+def _larger_sizes(plain: Sequence[Sequence[GridExtent]], size: Size) -> Counter[Size]:
     """Return the numbers of images without a grid of this size by the sizes of their larger grids, except those of
     other boards, which occur together with it."""
-    joint = {grid.size for k in _showing(plain, size) for grid in plain[k]}
+    joint = {grid.size for k in _images_of_size(plain, size) for grid in plain[k]}
     seen = ({grid.size for grid in grids} for grids in plain)
-    return Counter(other for sizes in seen if size not in sizes for other in sizes - joint if not _within(other, size))
+    return Counter(
+        other for sizes in seen if size not in sizes for other in sizes - joint if not _fits_into(other, size)
+    )
 
 
-def _size_of_parts(plain: Sequence[Sequence[GridSeen]]) -> tuple[Size, tuple[int, ...]] | None:
+def _size_of_parts(plain: Sequence[Sequence[GridExtent]]) -> tuple[Size, tuple[int, ...]] | None:
     """Return the size of a board from images of its parts, and the images that show one of its sides completely.
 
     plain : the grids of each image. None unless each side is complete in at least `MIN_IMAGES_OF_GUESS` images. The
@@ -227,7 +229,7 @@ def _size_of_parts(plain: Sequence[Sequence[GridSeen]]) -> tuple[Size, tuple[int
     lengths = sorted({n for grids in plain for g in grids for n, ends in zip(g.lengths, g.ends, strict=True) if ends})
     best: tuple[int, Size, tuple[int, ...]] | None = None
     for size in ((long, short) for long in lengths for short in lengths if long > short):
-        fit = [[g for g in grids if any(g.ends) and g.may_be_of(size)] for grids in plain]
+        fit = [[g for g in grids if any(g.ends) and g.may_be_part_of(size)] for grids in plain]
         shown = tuple(k for k, grids in enumerate(fit) if grids)
         sides_seen = Counter(side for grids in fit for side in _complete_sides(grids, size))
         enough = min(sides_seen[0], sides_seen[1]) >= MIN_IMAGES_OF_GUESS
@@ -236,7 +238,7 @@ def _size_of_parts(plain: Sequence[Sequence[GridSeen]]) -> tuple[Size, tuple[int
     return None if best is None else best[1:]
 
 
-def _complete_sides(grids: Sequence[GridSeen], size: Size) -> set[int]:
+def _complete_sides(grids: Sequence[GridExtent], size: Size) -> set[int]:
     """Return which sides (0: the longer, 1) of a board of this size are complete in an image's grids."""
     whole = {n for g in grids for n, ends in zip(g.lengths, g.ends, strict=True) if ends}
     return {k for k, side in enumerate(size) if side in whole}

@@ -284,7 +284,7 @@ def test_numbers_that_repeat_in_a_lattice_are_chance(monkeypatch: pytest.MonkeyP
         return TagCode(codes.numbers[4 * (np.arange(count) % 3)], np.zeros(count, np.int64), np.ones(count))
 
     monkeypatch.setattr(unknown_tags, "read_tags", repeated)
-    monkeypatch.setattr(TagObservations, "look_alone", lambda *_: False)
+    monkeypatch.setattr(TagObservations, "read_lone_tags", lambda *_: False)
     assert not TagObservations().look(0, shown(Board("b", 8, 6, 60.0, 60.0)))
 
 

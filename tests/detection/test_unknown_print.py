@@ -18,7 +18,7 @@ from rigkit.detection.tags import unknown_tags
 from rigkit.detection.tags.unknown_charuco import MarkerObservations
 from rigkit.detection.tags.unknown_tags import TagObservations
 from rigkit.detection.unknown import guess_board
-from rigkit.detection.whole_charuco import begins, next_row
+from rigkit.detection.whole_charuco import has_first_row, has_next_row
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
@@ -54,7 +54,7 @@ def test_tags_whose_edges_have_moved(pattern: AprilGrid, moved_px: int, rough: b
     found = guess.board.pattern
     assert (found.border, found.corner_squares) == (pattern.border, pattern.corner_squares)
     assert abs(found.spacing - pattern.spacing) <= (SPREAD_PLACES if rough else SURE_PLACES)
-    assert (guess.rough, guess.determined) == (rough, not rough)
+    assert (guess.edges_moved, guess.determined) == (rough, not rough)
 
 
 @pytest.mark.parametrize("sure", [False, True])
@@ -69,18 +69,18 @@ def test_edges_that_have_moved_too_far_for_the_border(sure: bool) -> None:
             numbers=np.arange(12),
             places=np.stack([column, row], axis=-1),
             steps=np.full(17, 1.45),
-            rough=either,
-            either=either,
+            edges_moved=either,
+            border_ambiguous=either,
         )
         seen.kinds[own.kind] += 1
         seen.seen.append(own)
     (grid,) = unknown_tags.guessed_grids(seen)
-    assert grid.board.size == (8, 6) and grid.rough is not sure
+    assert grid.board.size == (8, 6) and grid.edges_moved is not sure
     if sure:
-        assert grid.either is None
+        assert grid.other_border is None
     else:
-        assert grid.either is not None and isinstance(grid.either.pattern, AprilGrid)
-        assert (grid.either.pattern.border, grid.either.pattern.spacing) == (1, 0.81)
+        assert grid.other_border is not None and isinstance(grid.other_border.pattern, AprilGrid)
+        assert (grid.other_border.pattern.border, grid.other_border.pattern.spacing) == (1, 0.81)
 
 
 MARKED = Board("b", 10, 7, 60.0, 60.0, pattern=Charuco("DICT_4X4_50", 45.0))
@@ -99,10 +99,10 @@ def straight(board: Board) -> list[GreyImage]:
 @pytest.mark.parametrize("board", [MARKED, LEGACY], ids=["today", "legacy"])
 def test_whether_a_board_has_one_more_row_of_markers(board: Board) -> None:
     whole = straight(board)
-    assert next_row(board, whole) is False
-    assert next_row(replace(MARKED, rows=6), whole) is True
+    assert has_next_row(board, whole) is False
+    assert has_next_row(replace(MARKED, rows=6), whole) is True
     # Below the row of squares before the fifth row of corners the frame ends.
-    assert next_row(replace(MARKED, rows=4), [image[:330].copy() for image in whole]) is None
+    assert has_next_row(replace(MARKED, rows=4), [image[:330].copy() for image in whole]) is None
 
 
 @pytest.mark.parametrize(
@@ -114,19 +114,19 @@ def test_bare_paper_ends_a_board_and_what_is_black_does_not(level: float, determ
     for image in whole:
         # Seven rows of corners, and the squares beyond the last, end 460 px down.
         image[461:] = level + noise[461:] * (level > 0.0)
-    assert next_row(MARKED, whole) is determined
+    assert has_next_row(MARKED, whole) is determined
 
 
 def test_paper_that_covers_a_part_of_a_row_does_not_end_a_board() -> None:
     whole = straight(MARKED)
     for image in whole:
         image[311:, 200:] = 235.0
-    assert next_row(replace(MARKED, rows=4), whole) is not False
+    assert has_next_row(replace(MARKED, rows=4), whole) is not False
 
 
 @pytest.mark.parametrize(("below", "determined"), [(5.0, False), (1.0, None)])
 def test_the_frame_may_end_soon_after_a_board(below: float, determined: bool | None) -> None:
-    assert next_row(MARKED, [image[: int(461 + below)].copy() for image in straight(MARKED)]) is determined
+    assert has_next_row(MARKED, [image[: int(461 + below)].copy() for image in straight(MARKED)]) is determined
 
 
 @pytest.mark.parametrize("first", [295, 325])
@@ -136,14 +136,14 @@ def test_paper_laid_along_rows_does_not_end_a_board(board: Board, first: int) ->
     whole = straight(board)
     for image in whole:
         image[first:] = 235.0
-    assert next_row(replace(board, rows=4), whole) is not False
+    assert has_next_row(replace(board, rows=4), whole) is not False
 
 
 def test_a_textured_cover_does_not_end_a_board() -> None:
     whole = straight(MARKED)
     for image in whole:
         image[311:] = np.random.default_rng(0).uniform(20.0, 235.0, image[311:].shape)
-    assert next_row(replace(MARKED, rows=4), whole) is None
+    assert has_next_row(replace(MARKED, rows=4), whole) is None
 
 
 def test_a_board_cut_out_along_its_squares_ends_in_front_of_anything() -> None:
@@ -151,7 +151,7 @@ def test_a_board_cut_out_along_its_squares_ends_in_front_of_anything() -> None:
     whole = straight(MARKED)
     for image in whole:
         image[465:] = np.random.default_rng(0).uniform(20.0, 60.0, image[465:].shape)
-    assert next_row(MARKED, whole) is False
+    assert has_next_row(MARKED, whole) is False
 
 
 def test_paper_laid_aslant_over_a_board_does_not_end_it() -> None:
@@ -159,7 +159,7 @@ def test_paper_laid_aslant_over_a_board_does_not_end_it() -> None:
     whole = straight(MARKED)
     for image in whole:
         image[row > 300 + 0.05 * (column - 60)] = 235.0
-    assert next_row(replace(MARKED, rows=4), whole) is not False
+    assert has_next_row(replace(MARKED, rows=4), whole) is not False
 
 
 def test_a_marked_board_that_the_frame_cuts_has_more_rows() -> None:
@@ -171,9 +171,9 @@ def test_a_marked_board_that_the_frame_cuts_has_more_rows() -> None:
 def test_whether_a_board_begins_with_the_first_row_read() -> None:
     """Four rows of squares have 22 markers."""
     numbered = replace(MARKED, rows=4, pattern=Charuco("DICT_4X4_50", 45.0, first_marker=20))
-    assert begins(numbered, straight(numbered)) and begins(MARKED, [])
+    assert has_first_row(numbered, straight(numbered)) and has_first_row(MARKED, [])
     later = replace(MARKED, rows=3, pattern=Charuco("DICT_4X4_50", 45.0, first_marker=22))
-    assert not begins(later, straight(MARKED))
+    assert not has_first_row(later, straight(MARKED))
 
 
 def test_a_board_whose_first_rows_are_hidden_has_more() -> None:

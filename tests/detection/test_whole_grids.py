@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from rigkit.core.detections import BoardDetection
-from rigkit.detection.whole_grids import GridSeen, Size, board_size_in, grid_seen, other_sizes
+from rigkit.detection.whole_grids import GridExtent, Size, board_size_in, grid_extent, other_sizes
 
 WHOLE = (True, True)
 ONE_SIDE = (True, False)
 
 
-def seen(*sizes: Size, ends: tuple[bool, bool] = WHOLE) -> list[list[GridSeen]]:
+def seen(*sizes: Size, ends: tuple[bool, bool] = WHOLE) -> list[list[GridExtent]]:
     """Return images that show a grid each."""
-    return [[GridSeen(size, ends)] for size in sizes]
+    return [[GridExtent(size, ends)] for size in sizes]
 
 
 def test_corners_seen_outweigh_corners_missed() -> None:
@@ -41,19 +41,19 @@ def test_a_board_whose_last_line_blur_hides() -> None:
     """One side is seen to end, of the other a few corners of the last line are; no image shows more."""
     assert board_size_in([*seen((8, 8), (8, 8), ends=ONE_SIDE), *seen((8, 5), (8, 6))]) == (((8, 8),), (0, 1))
     # Where the frame cuts it there may be more.
-    cut = [[GridSeen((8, 8), ONE_SIDE, cut=True)]] * 2
+    cut = [[GridExtent((8, 8), ONE_SIDE, cut=True)]] * 2
     assert board_size_in([*cut, *seen((8, 5), (8, 6))]) is None
 
 
 def test_another_board_beside_the_stated_one_is_no_contradiction() -> None:
-    both = [[GridSeen((9, 6), WHOLE), GridSeen((12, 9), WHOLE)]] * 2
+    both = [[GridExtent((9, 6), WHOLE), GridExtent((12, 9), WHOLE)]] * 2
     assert board_size_in([*both, *seen(*[(9, 6)] * 3, (12, 9), (12, 9))]) == (((9, 6),), (0, 1, 2, 3, 4))
 
 
 def test_what_most_images_show_beside_the_board() -> None:
-    three = [GridSeen((8, 6), WHOLE), GridSeen((8, 6), WHOLE), GridSeen((7, 6), ONE_SIDE)]
-    assert other_sizes([three, three, [GridSeen((8, 6), WHOLE)]], (8, 6), (0, 1, 2)) == ((7, 6),)
-    assert other_sizes([three, [GridSeen((8, 6), WHOLE)]], (8, 6), (0, 1)) == ()
+    three = [GridExtent((8, 6), WHOLE), GridExtent((8, 6), WHOLE), GridExtent((7, 6), ONE_SIDE)]
+    assert other_sizes([three, three, [GridExtent((8, 6), WHOLE)]], (8, 6), (0, 1, 2)) == ((7, 6),)
+    assert other_sizes([three, [GridExtent((8, 6), WHOLE)]], (8, 6), (0, 1)) == ()
 
 
 @pytest.mark.parametrize(("missing", "ends"), [(0, WHOLE), (5, ONE_SIDE)])
@@ -63,8 +63,8 @@ def test_a_grid_ends_where_most_of_its_last_line_is_seen(missing: int, ends: tup
     pixels = np.asarray(60.0 + 40.0 * grid, np.float64)
     board = BoardDetection(None, 8, 6, grid, pixels, np.array([0.1] * len(grid), np.float64))
     image = np.full((500, 500), 128, np.uint8)
-    assert grid_seen(board, image) == GridSeen((8, 6), ends)
-    cut = grid_seen(board, image[:290])
+    assert grid_extent(board, image) == GridExtent((8, 6), ends)
+    cut = grid_extent(board, image[:290])
     assert cut is not None and cut.cut
 
 
@@ -80,4 +80,4 @@ def test_a_grid_goes_on_where_squares_are_seen_beyond_its_last_corners(rows: int
     grid = np.stack([column, row], axis=1)
     pixels = (60.0 + 40.0 * grid).astype(np.float64)
     board = BoardDetection(None, 8, 6, grid, pixels, np.full(len(grid), 0.1))
-    assert grid_seen(board, np.clip(image, 0, 255).astype(np.uint8)) == GridSeen((8, 6), (True, rows == 6))
+    assert grid_extent(board, np.clip(image, 0, 255).astype(np.uint8)) == GridExtent((8, 6), (True, rows == 6))

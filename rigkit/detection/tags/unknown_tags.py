@@ -65,8 +65,8 @@ class _SeenTags:
     numbers : (N,)
     places : (N, 2) in tags relative to any of them, with tags upright as in OpenCV.
     steps : (K,) all distances of adjacent tags, in sides of a tag.
-    rough : light or ink has moved the edges of tags, so that `steps` are accurate to some hundredths only.
-    either : the border may be another one.
+    edges_moved : light or ink has moved the edges of tags, so that `steps` are accurate to some hundredths only.
+    border_ambiguous : the border may be another one.
     """
 
     image: int
@@ -74,10 +74,10 @@ class _SeenTags:
     numbers: IntArray
     places: IntArray
     steps: FloatArray
-    rough: bool = False
-    either: bool = False
+    edges_moved: bool = False
+    border_ambiguous: bool = False
 
-    def counted(self) -> tuple[int, int, IntArray] | None:
+    def numbering(self) -> tuple[int, int, IntArray] | None:
         """Return the increments of numbers along a row and down a column, and the indices (N,) of the tags with these;
         None if adjacent tags do not determine them."""
         across, down = Counter[int](), Counter[int]()
@@ -97,8 +97,8 @@ class _SeenTags:
         return step, line, np.flatnonzero(first == values[votes_of.argmax()])
 
 
-Counted: TypeAlias = tuple[_SeenTags, int, int, IntArray]
-"""Tags with the result of `_SeenTags.counted`."""
+NumberedTags: TypeAlias = tuple[_SeenTags, int, int, IntArray]
+"""Tags with the result of `_SeenTags.numbering`."""
 
 
 @dataclass(eq=False, slots=True)
@@ -113,27 +113,27 @@ class TagObservations:
 
     def look(self, index: int, image: GreyImage) -> bool:
         """Read the tags of an image; return whether there are any."""
-        image = 255 - image if self.inverted else image
-        seen = SearchedImage.of(image)
+        grey = 255 - image if self.inverted else image
+        seen = SearchedImage.of(grey)
         # Where light or ink spreads, tags and the squares between them touch on coarser levels only.
         for k in range(len(seen.levels)):
             at = seen.coarser(k) if k else seen
             if at is None:
                 break
             lattices = build_lattices(at.corners, find_links(at.corners, at.levels[0], LENGTH_RATIO * WIDEST_RATIO))
-            found = [self._read(index, image, lattice) for lattice in lattices if lattice.count >= 4 * MIN_CODES_READ]
+            found = [self._read(index, grey, lattice) for lattice in lattices if lattice.count >= 4 * MIN_CODES_READ]
             if any(found):
                 return True
-        return self._look_alone(index, image)
+        return self.read_lone_tags(index, image)
 
     def _read(self, index: int, image: GreyImage, lattice: Lattice) -> bool:
         quads, squares = squares_of(lattice, dark=True)
         return any(
-            self._counts(index, lattice.size, quads, squares, *read)
+            self._keep_numbered(index, lattice.size, quads, squares, *read)
             for read in _read_kinds(image, quads, self.families)
         )
 
-    def _counts(
+    def _keep_numbered(
         self, index: int, size: tuple[int, int], quads: FloatArray, squares: IntArray, family: Family, codes: TagCode
     ) -> bool:
         """Return whether the tags of one family in a lattice have numbers of a board; if so, keep them."""
@@ -148,22 +148,20 @@ class TagObservations:
         seen = _SeenTags(
             image=index, kind=(*family, False), numbers=codes.number[own], places=places, steps=_steps(upright, places)
         )
-        counted = seen.counted()
+        numbering = seen.numbering()
         # With small families random codes are read in most squares, but not with consecutive numbers.
-        if counted is None or len(counted[2]) < max(MIN_CODES_READ, MIN_SHARE_FITTING * len(seen.numbers)):
+        if numbering is None or len(numbering[2]) < max(MIN_CODES_READ, MIN_SHARE_FITTING * len(seen.numbers)):
             return False
         self._keep(seen, codes)
         return True
 
-    def look_alone(self, index: int, image: GreyImage) -> bool:
+    def read_lone_tags(self, index: int, image: GreyImage) -> bool:
         """Read the lone tags of an image, without squares between their corners; return whether there are any."""
-        return self._look_alone(index, 255 - image if self.inverted else image)
+        grey = 255 - image if self.inverted else image
+        quads = quadrilaterals(grey)
+        return any(self._keep_lone_tags(index, grey, quads, *read) for read in _read_kinds(grey, quads, self.families))
 
-    def _look_alone(self, index: int, image: GreyImage) -> bool:
-        quads = quadrilaterals(image)
-        return any(self._count_alone(index, image, quads, *read) for read in _read_kinds(image, quads, self.families))
-
-    def _count_alone(self, index: int, image: GreyImage, quads: FloatArray, family: Family, codes: TagCode) -> bool:
+    def _keep_lone_tags(self, index: int, image: GreyImage, quads: FloatArray, family: Family, codes: TagCode) -> bool:
         """Return whether adjacent lone tags of one family have numbers of a board; if so, keep them."""
         # The same tag is found several times: at the outer and at the inner border.
         order = np.flatnonzero(codes.read)[np.argsort(-codes.likeness[codes.read], kind="stable")]
@@ -178,9 +176,9 @@ class TagObservations:
                 places=places,
                 steps=_steps(upright[members], places),
             )
-            counted = seen.counted()
+            numbering = seen.numbering()
             # Random codes do not have consecutive numbers.
-            if counted is not None and len(counted[2]) >= MIN_CODES_READ:
+            if numbering is not None and len(numbering[2]) >= MIN_CODES_READ:
                 self._keep(self._as_printed(image, seen, upright[members]), codes)
                 shown = True
         return shown
@@ -194,13 +192,13 @@ class TagObservations:
             return seen
         sides = {border: bits.shape[1] + 2.0 * border for name, border in self.families if name == family}
         border = min(sides, key=lambda one: abs(sides[one] - size.side))
-        rough = abs(size.outline - sides[border]) > OFF_EDGE
+        edges_moved = abs(size.outline - sides[border]) > OFF_EDGE
         return replace(
             seen,
             kind=(family, border, not size.squares),
-            steps=seen.steps * size.outline / sides[border] if rough else seen.steps,
-            rough=rough,
-            either=len(sides) > 1 and abs(size.side - sides[border]) > OFF_BORDER,
+            steps=seen.steps * size.outline / sides[border] if edges_moved else seen.steps,
+            edges_moved=edges_moved,
+            border_ambiguous=len(sides) > 1 and abs(size.side - sides[border]) > OFF_BORDER,
         )
 
     def _keep(self, seen: _SeenTags, codes: TagCode) -> None:
@@ -270,14 +268,14 @@ class GuessedGrid:
     ----------
     board : with tags of 1 mm.
     images : indices of the images with it.
-    rough : light or ink has moved the edges of its tags in all of them: its spacing is known to some hundredths.
-    either : this board with another border, if it fits as well.
+    edges_moved : light or ink has moved the edges of its tags in all of them: its spacing is known to some hundredths.
+    other_border : this board with another border, if it fits as well.
     """
 
     board: Board
     images: tuple[int, ...]
-    rough: bool = False
-    either: Board | None = None
+    edges_moved: bool = False
+    other_border: Board | None = None
 
 
 def guessed_grids(seen: TagObservations) -> list[GuessedGrid]:
@@ -285,25 +283,25 @@ def guessed_grids(seen: TagObservations) -> list[GuessedGrid]:
     if not seen.seen:
         return []
     kind = seen.kinds.most_common(1)[0][0]
-    groups: list[Counted] = []
+    groups: list[NumberedTags] = []
     for item in seen.seen:
-        counted = item.counted() if item.kind == kind else None
-        if counted is not None and len(counted[2]) >= MIN_CODES_READ:
-            groups.append((item, *counted))
+        numbering = item.numbering() if item.kind == kind else None
+        if numbering is not None and len(numbering[2]) >= MIN_CODES_READ:
+            groups.append((item, *numbering))
     out = []
     for cluster in _of_one_board(groups):
         # Light and ink do not move corners between squares.
-        sure = [group for group in cluster if not group[0].rough]
+        sure = [group for group in cluster if not group[0].edges_moved]
         board = _board_of(cluster, kind, _steps_of(sure or cluster), seen.inverted)
         if board is not None:
             tags = sum(len(own) for *_, own in cluster)
             images = tuple(sorted({item.image for item, *_ in cluster}))
-            either = None if any(not item.either for item, *_ in cluster) else _of_other_border(board)
-            out.append((tags, GuessedGrid(board, images, not sure, either)))
+            other_border = None if any(not item.border_ambiguous for item, *_ in cluster) else _of_other_border(board)
+            out.append((tags, GuessedGrid(board, images, not sure, other_border)))
     return [grid for _, grid in sorted(out, key=lambda found: -found[0])]
 
 
-def _steps_of(groups: Sequence[Counted]) -> FloatArray:
+def _steps_of(groups: Sequence[NumberedTags]) -> FloatArray:
     return np.concatenate([item.steps for item, *_ in groups])
 
 
@@ -317,10 +315,10 @@ def _of_other_border(board: Board) -> Board:
     return replace(board, pattern=replace(pattern, border=border, spacing=round(spacing, 2)))
 
 
-def _of_one_board(groups: Sequence[Counted]) -> list[list[Counted]]:
+def _of_one_board(groups: Sequence[NumberedTags]) -> list[list[NumberedTags]]:
     """Return the groups of tags by boards: groups that count alike and whose ranges of numbers overlap are of one
     board."""
-    clusters: list[tuple[int, list[Counted]]] = []
+    clusters: list[tuple[int, list[NumberedTags]]] = []
     for group in sorted(groups, key=lambda group: (*group[1:3], int(group[0].numbers[group[3]].min()))):
         numbers = group[0].numbers[group[3]]
         if clusters and clusters[-1][1][0][1:3] == group[1:3] and int(numbers.min()) <= clusters[-1][0]:
@@ -331,7 +329,7 @@ def _of_one_board(groups: Sequence[Counted]) -> list[list[Counted]]:
     return [members for _, members in clusters]
 
 
-def _board_of(cluster: Sequence[Counted], kind: Kind, steps: FloatArray, inverted: bool) -> Board | None:
+def _board_of(cluster: Sequence[NumberedTags], kind: Kind, steps: FloatArray, inverted: bool) -> Board | None:
     """Return the board, with tags of 1 mm, of a cluster of groups with `steps` (K,) from tag to tag; None if there is
     no valid one."""
     family, border, alone = kind

@@ -275,10 +275,10 @@ def _partial_board_words(guess: BoardGuess) -> str:
     an AprilGrid whose printed or exposed edges are displaced.
     """
     if not guess.sizes:
-        either = [guess.board, *filter(None, [guess.either])]
+        boards = [guess.board, *filter(None, [guess.other_border])]
         return (
             "an AprilGrid whose tags look smaller or larger than they are (overexposure, or ink that spreads): "
-            f"{' or '.join(words_of_board(board) for board in either)}, with a spacing that may be off by some "
+            f"{' or '.join(words_of_board(board) for board in boards)}, with a spacing that may be off by some "
             "hundredths; take images with less light, or measure a tag and the gap beside it"
         )
     words = " or ".join(f"{columns} x {rows}" for columns, rows in guess.sizes)

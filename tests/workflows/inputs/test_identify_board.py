@@ -132,7 +132,7 @@ def test_tags_whose_edges_have_moved(
         Board("b", 8, 6, 1.0, 1.0, pattern=AprilGrid(spacing, border=border))
         for spacing, border in ((0.3, 2), (0.625, 1))
     )
-    seen = BoardGuess(board=board, images=(0,), rough=True, either=either)
+    seen = BoardGuess(board=board, images=(0,), edges_moved=True, other_border=either)
     monkeypatch.setattr(identify_board, "guess_board", lambda *_: seen)
     assert main(["board", "identify", str(tmp_path)]) == 1
     err = capsys.readouterr().err
