@@ -273,7 +273,7 @@ def calibrated_rig(views: Sequence[FreshView], camera: Camera) -> Monitored:
     """Return a rig of two as `views` calibrate it."""
     names = ("left", "right")
     own = {name: [(v.frame, v.view) for v in views if v.camera == c] for c, name in enumerate(names)}
-    return monitored_rig(calibrate_rig(own, dict.fromkeys(names, camera.size_px), model=camera.model))
+    return monitored_rig(calibrate_rig(own, dict.fromkeys(names, camera.size_px), model=camera.model).mounted)
 
 
 def rendered_view(camera: Camera, pose: Rigid3, name: str, rng: np.random.Generator) -> BoardView | None:

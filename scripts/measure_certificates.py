@@ -153,7 +153,7 @@ def rig_trial(lenses: Sequence[Camera], session: Session, rng: np.random.Generat
     sizes = dict.fromkeys(views, SIZE_PX)
     named = {name: [(view.image, view) for view in own] for name, own in views.items()}
     rig = calibrate_rig(named, sizes, model=session.model, degree=session.degree, folds=session.folds)
-    found = instrument_of(monitored_rig(rig))
+    found = instrument_of(monitored_rig(rig.mounted))
     for quantity, task in TASKS.items():
         certificate = certify(found, task, cells=CELLS)
         use = certificate.in_view & ~certificate.coarse

@@ -60,8 +60,7 @@ def remaining_errors_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple
 
     Raises DegenerateError where that is outside all fields of view.
     """
-    cameras, covariance = rig.quoted
-    mounts = [own.cam_from_rig for own in rig.cameras]
+    cameras, mounts = rig.quoted.cameras, rig.quoted.cam_from_rig
     layout, field_deg = Layout.of_cameras(cameras), options.reach.field_deg
     requirements = []
     for own, camera, at in zip(rig.cameras, cameras, layout.cameras, strict=True):
@@ -71,7 +70,7 @@ def remaining_errors_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple
     away_mm = float(np.median(np.linalg.norm(boards, axis=-1)))
     requirements.append(Requirement(rig_goal(cameras, mounts, away_mm, field_deg), options.goal_px, "together"))
     requirements += options.lengths(cameras, mounts)
-    return tuple(requirement.remaining(covariance) for requirement in requirements)
+    return tuple(requirement.remaining(rig.quoted.covariance) for requirement in requirements)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +84,7 @@ class RigKnown:
     @classmethod
     def of(cls, rig: RigCalibration, options: GuideOptions) -> Self:
         """Raises DegenerateError where what is measured is outside all fields of view."""
-        return cls(monitored_rig(rig), remaining_errors_of_rig(rig, options), options)
+        return cls(monitored_rig(rig.mounted), remaining_errors_of_rig(rig, options), options)
 
     @cached_property
     def plan(self) -> Plan:

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.compare import Mounted, compare_mounts
+from rigkit.calibration.rig.compare import compare_mounts
+from rigkit.calibration.rig.mounted import MountedCameras
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
@@ -88,7 +90,7 @@ def split_rig(name: str, data: Path, cache: Path, splits: int, model: str) -> No
             (first, sigma_a), (second, sigma_b) = _own(a, pair), _own(b, pair)
             off["in time" if how == "in time" else "mixed"].append((first - second) / float(np.hypot(sigma_a, sigma_b)))
             words.append(f"{'-'.join(pair)} {first:.2f} ± {sigma_a:.2f} and {second:.2f} ± {sigma_b:.2f} mm")
-        chance = compare_mounts(_mounted(a), _mounted(b)).chance
+        chance = compare_mounts(_without_departures(a), _without_departures(b)).chance
         print(f"{name}, {how}: {'; '.join(words)}; chance of such mounts {chance:.4f}", flush=True)
     rms = [f"{how} {np.sqrt(np.mean(np.square(own))):.2f} ({len(own)})" for how, own in off.items() if own]
     print(f"{name}: baselines, observed over stated (rms): {', '.join(rms)}", flush=True)
@@ -105,5 +107,5 @@ def _own(rig: RigCalibration, pair: tuple[str, str]) -> tuple[float, float]:
     return length, float(np.sqrt(max(sigma**2 - (length * rig.scale_sigma) ** 2, 0.0)))
 
 
-def _mounted(rig: RigCalibration) -> Mounted:
-    return Mounted({c.name: (c.camera, c.cam_from_rig) for c in rig.cameras}, rig.covariance, rig.freedom)
+def _without_departures(rig: RigCalibration) -> MountedCameras:
+    return replace(rig.mounted, departures=())

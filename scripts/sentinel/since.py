@@ -59,7 +59,7 @@ def since_rigs(name: str, data: Path, cache: Path, splits: int) -> None:
         order = rng.permutation(shared).tolist()
         half = len(order) // 2
         views = {side: [(k, v) for k in order[half:] for v in own[k]] for side, own in by_frame.items()}
-        rig = monitored_rig(calibrate_rig(views, {side: size for side, (_, size) in loaded.items()}))
+        rig = monitored_rig(calibrate_rig(views, {side: size for side, (_, size) in loaded.items()}).mounted)
         frames = [_seen(rig, k, [own[k] for own in by_frame.values()]) for k in order[:half]]
         for degrees, checks in found.items():
             _draws(f"{name}, {degrees:g} deg", rig, frames, checks, np.random.default_rng(len(checks)), degrees)

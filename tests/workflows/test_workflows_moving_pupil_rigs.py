@@ -174,7 +174,7 @@ def test_a_certificate_is_of_cameras_with_their_pupils(rig: RigCalibration, save
 
 def test_fresh_boards_are_checked_with_the_pupils(rig: RigCalibration, saved: Path) -> None:
     fresh = [(c, frame, view) for c, own in enumerate(frames(4, 1).values()) for frame, view in own]
-    for monitored in (load_monitored(saved)[0], monitored_rig(rig)):
+    for monitored in (load_monitored(saved)[0], monitored_rig(rig.mounted)):
         seen = [FreshView(f, c, view) for c, f, view in fresh]
         assert check_views(monitored, seen).rms_px < 0.06
         for k, own in enumerate(monitored.layout.cameras):

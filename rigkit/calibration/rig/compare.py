@@ -19,9 +19,8 @@ import numpy as np
 from rigkit.calibration.certainty.uncertainty import projection_design
 from rigkit.calibration.compare import SAME_CHANCE
 from rigkit.calibration.rig.board_rig import BoardRig
-from rigkit.calibration.rig.solving.layout import Layout
+from rigkit.calibration.rig.mounted import MountedCameras
 from rigkit.calibration.solving.clustered import drawn_errors
-from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.core.arrays import FloatArray, scaled_pinv
 from rigkit.core.errors import InputError
@@ -36,28 +35,6 @@ MAX_SCALE = 100.0
 """Largest ratio of the lengths of two rigs: metres for centimetres."""
 WEIGHT_FLOOR_PX = 1e-6
 """Smallest standard deviation of a projection: weights stay finite without noise."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Mounted:
-    """A rig to be compared.
-
-    Attributes
-    ----------
-    cameras : by name, camera and cam_from_rig; that of the first is the identity.
-    covariance : of all intrinsics, then of the mounts of all but the first (left perturbations, rad and mm); None if
-        unknown. The error of the squares' size is not included: two rigs with the same boards have it in common.
-    freedom : its degrees of freedom.
-    """
-
-    cameras: dict[str, tuple[Camera, Rigid3]]
-    covariance: FloatArray | None
-    freedom: float = float("inf")
-
-    @property
-    def layout(self) -> Layout:
-        """Slices of lenses and mounts in the covariance."""
-        return Layout.of_cameras(camera for camera, _ in self.cameras.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +62,11 @@ class RigDifference:
         return None if self.chance is None else self.chance >= SAME_CHANCE
 
 
-def compare_mounts(a: Mounted, b: Mounted) -> RigDifference:
+def compare_mounts(a: MountedCameras, b: MountedCameras) -> RigDifference:
     """Compare the mounts of two rigs after the rotations between their lenses; a single camera has no mount.
+
+    The error of the squares' size is not included: two rigs with the same boards have it in common. Mounts are
+    correlated with the departures of the lenses from their models.
 
     Raises InputError where the rigs have different cameras or image sizes; DegenerateError where the fields of view of
     two cameras do not overlap.
@@ -96,6 +76,7 @@ def compare_mounts(a: Mounted, b: Mounted) -> RigDifference:
             f"rigs of other cameras: {', '.join(a.cameras)} and {', '.join(b.cameras)}; "
             "compare rigs of the same cameras"
         )
+    a, b = a.with_departures, b.with_departures
     turns = []
     weights = [_weights(a, k) * _weights(b, k) for k in range(len(a.cameras))]
     for (first, _), (second, _), weight in zip(a.cameras.values(), b.cameras.values(), weights, strict=True):
@@ -166,7 +147,7 @@ def _difference(names: Sequence[str], steps: FloatArray, known: Known | None) ->
     return RigDifference(tuple(mounts), None if known is None else _chance(steps, *known))
 
 
-def _weights(rig: Mounted, k: int) -> FloatArray:
+def _weights(rig: MountedCameras, k: int) -> FloatArray:
     """Return weights (rows, columns) of pixels of camera `k`, inverse to the projection's standard deviation there."""
     camera = list(rig.cameras.values())[k][0]
     pixels = grid_pixels(camera.size_px, LENS_GRID)
@@ -182,13 +163,13 @@ def _weights(rig: Mounted, k: int) -> FloatArray:
     return np.asarray(out / out.max())
 
 
-def _moved(rig: Mounted, covariance: FloatArray, weights: Sequence[FloatArray]) -> FloatArray:
+def _moved(rig: MountedCameras, covariance: FloatArray, weights: Sequence[FloatArray]) -> FloatArray:
     """Return the covariance (6 (n - 1), 6 (n - 1)) of the mounts with respect to the axes of the lenses."""
     design = _design(rig, weights)
     return design @ covariance @ design.T
 
 
-def _design(rig: Mounted, weights: Sequence[FloatArray]) -> FloatArray:
+def _design(rig: MountedCameras, weights: Sequence[FloatArray]) -> FloatArray:
     """Return d (w', dt') of all mounts / d (intrinsics, mounts), (6 (n - 1), K)."""
     turns = []
     for (camera, _), weight in zip(rig.cameras.values(), weights, strict=True):

@@ -8,16 +8,18 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.certainty.displaced import LensModes, with_modes
+from rigkit.calibration.certainty.displaced import LensModes
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_rig import BoardRig
+from rigkit.calibration.rig.mounted import MountedCameras
 from rigkit.calibration.rig.solving.exposure_times import Lag
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.calibration.rig.solving.shutters import Readout
 from rigkit.calibration.solving.clustered import effective_freedom, widening
 from rigkit.calibration.solving.solver import Convergence
 from rigkit.cameras.base import Camera
+from rigkit.cameras.uncertain import UncertainRig
 from rigkit.core.arrays import FloatArray, keep_arrays
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
@@ -162,18 +164,25 @@ class RigCalibration:
         return np.sqrt(variance)
 
     @cached_property
-    def quoted(self) -> tuple[tuple[Camera, ...], FloatArray]:
-        """As `with_departures`, with the covariance widened."""
-        return self._with_departures(self.widening**2 * self.covariance)
+    def mounted(self) -> MountedCameras:
+        """The cameras and their uncertainty, without the record of their calibration."""
+        return MountedCameras(
+            cameras={c.name: (c.camera, c.cam_from_rig) for c in self.cameras},
+            covariance=self.covariance,
+            sigma_px=self.sigma_px,
+            scale_sigma=self.scale_sigma,
+            freedom=self.freedom,
+            overdispersion=self.overdispersion,
+            departures=self.departures,
+            pupils=self.pupils,
+        )
 
     @cached_property
-    def with_departures(self) -> tuple[tuple[Camera, ...], FloatArray]:
-        """The cameras with their model inadequacy as further parameters, and the covariance of all parameters, camera
-        by camera, and of the mounts, not widened."""
-        return self._with_departures(self.covariance)
-
-    def _with_departures(self, covariance: FloatArray) -> tuple[tuple[Camera, ...], FloatArray]:
-        return with_modes([c.camera for c in self.cameras], covariance, self.departures)
+    def quoted(self) -> UncertainRig:
+        """The rig with departures, and its covariance widened (`widening`)."""
+        quoted = self.mounted.quoted
+        assert quoted is not None
+        return quoted
 
     def mount(self, k: int) -> slice:
         """Return the slice of the mount of camera `k` > 0 in the covariance."""

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations, zip_longest
@@ -13,16 +12,14 @@ from typing import Any
 import numpy as np
 
 from rigkit.calibration.certainty.coverage import outline_of_corners
-from rigkit.calibration.certainty.displaced import LensModes, with_modes
+from rigkit.calibration.certainty.displaced import LensModes
 from rigkit.calibration.pupil import SolvedPupil, require_of_frame
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
+from rigkit.calibration.rig.mounted import MountedCameras
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.layout import Layout
-from rigkit.calibration.solving.clustered import effective_freedom, widening
 from rigkit.cameras.base import Camera
-from rigkit.cameras.moving_pupil import NearCamera
-from rigkit.cameras.uncertain import UncertainRig
-from rigkit.core.arrays import FloatArray, Pixels, as_array, as_covariance, without_nan
+from rigkit.core.arrays import Pixels, as_array, as_covariance, without_nan
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
@@ -52,76 +49,19 @@ PLACED_KEYS = keys_of(BOARD_RIG_FILE, "rigs", "boards")
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class SavedRig:
+class SavedRig(MountedCameras):
     """The content of a rig file; fields that another tool's file lacks have their defaults.
 
     Attributes
     ----------
-    cameras : central camera and cam_from_rig by name.
-    covariance : of all intrinsics, and of the poses of all cameras but the first.
-    sigma_px : standard deviation of a corner's coordinate.
-    scale_sigma : relative standard deviation of all lengths, from that of the boards' squares; 0 if not stated.
-    freedom : degrees of freedom of the covariance.
-    overdispersion : ratio of the scatter of frames to that of independent corners.
     boards : boards of the calibration.
     outlines : convex hull (N, 2) of all corners that a camera saw, px, by name.
-    departures : modes of each lens beyond its model.
-    pupils : moving entrance pupils by name.
     verdicts : verdicts on the calibration.
     """
 
-    cameras: dict[str, tuple[Camera, Rigid3]]
-    covariance: FloatArray | None
-    sigma_px: float | None = None
-    scale_sigma: float = 0.0
-    freedom: float = math.inf
-    overdispersion: float = 1.0
     boards: tuple[Board, ...] = ()
     outlines: Mapping[str, Pixels] = field(default_factory=dict)
-    departures: tuple[LensModes, ...] = ()
-    pupils: Mapping[str, SolvedPupil] = field(default_factory=dict)
     verdicts: tuple[Finding, ...] = ()
-
-    def stated(self, path: str | Path) -> tuple[tuple[Camera, ...], FloatArray, float]:
-        """Return `with_departures` and `sigma_px`; raises InputError if the file at `path` lacks them."""
-        cameras, covariance = self.with_departures
-        if covariance is None or self.sigma_px is None:
-            raise InputError(f"'{path}': the rig has no covariance; calibrate it with rigkit")
-        return cameras, covariance, self.sigma_px
-
-    @property
-    def near_cameras(self) -> dict[str, tuple[Camera, Rigid3]]:
-        """The cameras for points in mm: a `NearCamera` if the pupil moves."""
-        return {
-            name: (NearCamera.of(camera, self.pupils[name].terms) if name in self.pupils else camera, pose)
-            for name, (camera, pose) in self.cameras.items()
-        }
-
-    @property
-    def with_departures(self) -> tuple[tuple[Camera, ...], FloatArray | None]:
-        """The cameras with the modes of their lenses as further parameters, and the covariance of all parameters, by
-        camera, and of the poses; None if the file has none."""
-        return self._with_departures(self.covariance)
-
-    @property
-    def quoted(self) -> UncertainRig | None:
-        """The rig with its covariance widened for the degrees of freedom, so that two standard deviations contain 95 %
-        of errors; None if the file has no covariance."""
-        if self.covariance is None:
-            return None
-        wider = widening(effective_freedom(self.freedom, self.overdispersion, len(self.covariance)))
-        cameras, covariance = self._with_departures(wider**2 * self.covariance)
-        assert covariance is not None
-        return UncertainRig(
-            cameras=cameras,
-            cam_from_rig=tuple(pose for _, pose in self.cameras.values()),
-            covariance=covariance,
-            scale_sigma=self.scale_sigma,
-        )
-
-    def _with_departures(self, covariance: FloatArray | None) -> tuple[tuple[Camera, ...], FloatArray | None]:
-        cameras = tuple(camera for camera, _ in self.cameras.values())
-        return (cameras, None) if covariance is None else with_modes(cameras, covariance, self.departures)
 
 
 def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
@@ -166,7 +106,7 @@ def _boards_of(rig: RigCalibration) -> tuple[Board, ...]:
 
 def load_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
     """Return camera and cam_from_rig by name; raises InputError as `load_saved_rig`."""
-    return load_saved_rig(path).cameras
+    return dict(load_saved_rig(path).cameras)
 
 
 def load_saved_rig(path: str | Path) -> SavedRig:

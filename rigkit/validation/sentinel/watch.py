@@ -10,10 +10,11 @@ import numpy as np
 from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.mounted import MountedCameras
 from rigkit.cameras.moving_pupil import PUPIL_TERMS, NearCamera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.information import Knowledge
 from rigkit.validation.sentinel.evidence import Monitored
@@ -58,23 +59,25 @@ def _with_warps(camera: Monitored, known: Knowledge) -> Monitored:
     return replace(camera, covariance=covariance, warped=known.warped)
 
 
-def monitored_rig(rig: RigCalibration) -> Monitored:
-    """Return a calibrated rig, with the inadequacies of its models among the parameters."""
-    cameras, covariance = rig.with_departures
+def monitored_rig(rig: MountedCameras) -> Monitored:
+    """Return a rig, with the inadequacies of its models among the parameters; raises InputError without covariance."""
+    whole = rig.with_departures
+    if whole.covariance is None or rig.sigma_px is None:
+        raise InputError("the rig has no covariance; calibrate it with rigkit")
     central = Monitored(
-        names=tuple(c.name for c in rig.cameras),
-        cameras=cameras,
-        cam_from_rig=tuple(c.cam_from_rig for c in rig.cameras),
-        covariance=covariance,
+        names=tuple(rig.cameras),
+        cameras=whole.lenses,
+        cam_from_rig=rig.poses,
+        covariance=whole.covariance,
         sigma_px=rig.sigma_px,
         overdispersion=rig.overdispersion,
         freedom=rig.freedom,
         scale_sigma=rig.scale_sigma,
     )
-    return with_moving_pupils(central, rig.pupils)
+    return _with_moving_pupils(central, rig.pupils)
 
 
-def with_moving_pupils(central: Monitored, pupils: Mapping[str, SolvedPupil]) -> Monitored:
+def _with_moving_pupils(central: Monitored, pupils: Mapping[str, SolvedPupil]) -> Monitored:
     """Return cameras with their moving pupils, by name, and the covariance of all parameters.
 
     A pupil e depends on the lenses and mounts x by their joint covariance, e = W x + rest; the rests of two pupils are

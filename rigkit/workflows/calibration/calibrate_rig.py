@@ -98,9 +98,8 @@ def calibrate_rig_session(
         origin = provenance_of(session.path, {name: own.images for name, own in session.cameras.items()})
         if len(session.cameras) > 1:
             files[options.output] = rig_text(rig, origin)
-            mounted = {c.name: (c.camera, c.cam_from_rig) for c in rig.cameras}
             outlines = {c.name: outline_of_corners(c.calibration) for c in rig.cameras}
-            files |= foreign_rig_files(mounted, options.output, options.exports, outlines)
+            files |= foreign_rig_files(rig.mounted.cameras, options.output, options.exports, outlines)
         for camera in rig.cameras:
             own = _camera_file(names, options.output, camera.name)
             files[own] = calibration_text(with_new_verdicts(camera.calibration, session.cameras[camera.name]), origin)

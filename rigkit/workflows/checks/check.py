@@ -34,7 +34,7 @@ from rigkit.io.calibrations.calibration_file import (
     pupil_to_json,
 )
 from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, ensure_register, path_from_register
-from rigkit.io.calibrations.rig_file import SavedRig, is_rig_file, load_saved_rig
+from rigkit.io.calibrations.rig_file import is_rig_file, load_saved_rig
 from rigkit.io.disk.json_reader import json_text
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_together
@@ -46,7 +46,7 @@ from rigkit.validation.sentinel.epipolar import evidence_of_matches, matches_of_
 from rigkit.validation.sentinel.evidence import SAME_BOARD, FreshView, Monitored, evidence_of
 from rigkit.validation.sentinel.flipped import consistently_numbered, flipped_pictures
 from rigkit.validation.sentinel.judge import Look, SentinelCheck, check_views, evaluate_evidence
-from rigkit.validation.sentinel.watch import monitored_camera, with_moving_pupils
+from rigkit.validation.sentinel.watch import monitored_camera, monitored_rig
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad
 from rigkit.workflows.inputs.identify_board import why_not_detected
@@ -158,23 +158,8 @@ def load_monitored(source: Path) -> tuple[Monitored, tuple[Board, ...]]:
             boards = without_parts(shape.board for shape in known.boards)
         return monitored_camera(known, source.stem), boards
     rig = load_saved_rig(source)
-    return _monitored_rig(rig, source), without_parts(rig.boards)
-
-
-def _monitored_rig(known: SavedRig, source: Path) -> Monitored:
-    """Return the rig in a file; raises InputError for one without a covariance."""
-    lenses, covariance, sigma_px = known.stated(source)
-    central = Monitored(
-        names=tuple(known.cameras),
-        cameras=lenses,
-        cam_from_rig=tuple(pose for _, pose in known.cameras.values()),
-        covariance=covariance,
-        sigma_px=sigma_px,
-        overdispersion=known.overdispersion,
-        freedom=known.freedom,
-        scale_sigma=known.scale_sigma,
-    )
-    return with_moving_pupils(central, known.pupils)
+    with about(source):
+        return monitored_rig(rig), without_parts(rig.boards)
 
 
 def _replaced_by_known(boards: Sequence[Board], known: Sequence[Board]) -> tuple[Board, ...]:

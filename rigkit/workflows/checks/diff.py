@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rigkit.calibration.compare import CalibrationComparison, compare_calibrations
-from rigkit.calibration.rig.compare import Mounted, RigDifference, compare_board_rigs, compare_mounts
+from rigkit.calibration.rig.compare import RigDifference, compare_board_rigs, compare_mounts
 from rigkit.cameras.compare import CameraDifference, compare_cameras
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
@@ -154,7 +154,7 @@ def _rigs(a: Path, b: Path) -> RigPair:
             f"diff: '{a}' has the cameras {', '.join(names)}, '{b}' {', '.join(second.cameras)}; give rigs of the same "
             "cameras"
         )
-    mounts = compare_mounts(_mounted(first), _mounted(second))
+    mounts = compare_mounts(first, second)
     cameras = {}
     for name in names:
         paths = [path.with_name(f"{path.stem}-{name}.json") for path in (a, b)]
@@ -163,13 +163,6 @@ def _rigs(a: Path, b: Path) -> RigPair:
         else:
             cameras[name] = CameraPair(compare_cameras(first.cameras[name][0], second.cameras[name][0]), None)
     return RigPair(mounts, cameras)
-
-
-def _mounted(rig: SavedRig) -> Mounted:
-    """Return the cameras of a rig; the mounts are correlated with the inadequacies of the models."""
-    lenses, covariance = rig.with_departures
-    cameras = {name: (lens, pose) for lens, (name, (_, pose)) in zip(lenses, rig.cameras.items(), strict=True)}
-    return Mounted(cameras, covariance, rig.freedom)
 
 
 def _named_like(rig: SavedRig, other: SavedRig, path: Path) -> SavedRig:

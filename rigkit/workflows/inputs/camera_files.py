@@ -179,7 +179,7 @@ def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
     if is_rig_file(path):
         rig = load_saved_rig(path)
         warn_of_pupils(path, rig)
-        return rig.cameras
+        return dict(rig.cameras)
     text, name = camera_text(path), str(path)
     kind = camera_format(text)
     if kind == "kalibr":

@@ -265,7 +265,7 @@ def test_transfer_follows_the_covariance(rng: np.random.Generator) -> None:
     assert seen.all()
     pixel = rig.cameras[1].camera.project(first)[0]
     length = np.linalg.norm(first, axis=1, keepdims=True)
-    lenses, known = rig.quoted
+    lenses, known = rig.quoted.cameras, rig.quoted.covariance
     assert len(known) > len(rig.covariance)
     ends = np.cumsum([0, *(camera.parameters.size for camera in lenses)])
 

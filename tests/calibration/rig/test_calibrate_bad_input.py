@@ -11,7 +11,8 @@ from helpers.board_rig_scenes import ALIKE, corner_of_a_room, target_views
 from helpers.calibration_scenes import BOARD, lens
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.compare import Mounted, compare_mounts
+from rigkit.calibration.rig.compare import compare_mounts
+from rigkit.calibration.rig.mounted import MountedCameras
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
@@ -133,6 +134,7 @@ def test_a_mount_that_one_fold_alone_tells_has_no_held_out_error(rng: np.random.
 
 
 def test_one_camera_has_no_mount_to_compare() -> None:
-    only = Mounted({"only": (lens("reg"), Rigid3.identity())}, np.zeros((lens("reg").parameters.size,) * 2))
+    covariance = np.zeros((lens("reg").parameters.size,) * 2)
+    only = MountedCameras(cameras={"only": (lens("reg"), Rigid3.identity())}, covariance=covariance)
     found = compare_mounts(only, only)
     assert found.mounts == () and found.same

@@ -11,7 +11,8 @@ import pytest
 from helpers.rig_scenes import MODELS, Views, rig_views, sizes
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.compare import Mounted, compare_mounts
+from rigkit.calibration.rig.compare import compare_mounts
+from rigkit.calibration.rig.mounted import MountedCameras
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
@@ -25,13 +26,13 @@ MOVED_MM = 1.0
 RIGS = 12
 
 
-def mounted(rig: RigCalibration) -> Mounted:
-    cameras = {c.name: (c.camera, c.cam_from_rig) for c in rig.cameras}
-    return Mounted(cameras, rig.covariance, rig.freedom)
+def mounted(rig: RigCalibration) -> MountedCameras:
+    """Without departures, which are the same in all these rigs."""
+    return replace(rig.mounted, departures=())
 
 
 @pytest.fixture(scope="module")
-def rigs() -> list[Mounted]:
+def rigs() -> list[MountedCameras]:
     found = []
     for seed in range(RIGS):
         views = {n: own for n, own in rig_views(np.random.default_rng(seed), 12).items() if n != "fish"}
@@ -39,16 +40,16 @@ def rigs() -> list[Mounted]:
     return found
 
 
-def moved(rig: Mounted, name: str, by: Rigid3) -> Mounted:
+def moved(rig: MountedCameras, name: str, by: Rigid3) -> MountedCameras:
     cameras = {n: (c, by @ m if n == name else m) for n, (c, m) in rig.cameras.items()}
-    return Mounted(cameras, rig.covariance, rig.freedom)
+    return replace(rig, cameras=cameras)
 
 
-def test_another_board_size_is_reported_as_scale_and_not_as_motion(rigs: list[Mounted]) -> None:
+def test_another_board_size_is_reported_as_scale_and_not_as_motion(rigs: list[MountedCameras]) -> None:
     """All lengths are longer by one factor; a camera that moved otherwise leaves no such factor."""
     first, second = rigs[:2]
     scaled = {n: (c, Rigid3(m.rotation, 1.2 * m.translation_mm)) for n, (c, m) in second.cameras.items()}
-    found = compare_mounts(first, Mounted(scaled, second.covariance, second.freedom))
+    found = compare_mounts(first, replace(second, cameras=scaled))
     assert found.same is False and found.scale == pytest.approx(1.2, rel=0.01)
     turned = Rigid3(exp_so3(np.array([0.0, 0.02, 0.0])), [5.0, 3.0, 0.0])
     other = compare_mounts(first, moved(second, "wide", turned))
@@ -56,7 +57,7 @@ def test_another_board_size_is_reported_as_scale_and_not_as_motion(rigs: list[Mo
     assert compare_mounts(first, second).scale is None
 
 
-def test_rigs_that_did_not_change_are_the_same(rigs: list[Mounted]) -> None:
+def test_rigs_that_did_not_change_are_the_same(rigs: list[MountedCameras]) -> None:
     """Chances of one and the same rig are uniform, and what was moved is found."""
     found = [compare_mounts(a, b).chance for a, b in zip(rigs[::2], rigs[1::2], strict=True)]
     chances = [chance for chance in found if chance is not None]
@@ -67,7 +68,7 @@ def test_rigs_that_did_not_change_are_the_same(rigs: list[Mounted]) -> None:
     assert other.same is False and other.mounts[0].rotation_deg > 0.15
 
 
-def test_a_turn_of_the_lens_that_the_mount_takes_up_is_no_motion(rigs: list[Mounted]) -> None:
+def test_a_turn_of_the_lens_that_the_mount_takes_up_is_no_motion(rigs: list[MountedCameras]) -> None:
     """A moved principal point and a mount turned back by what it looks like: the same rig. The mount alone, turned by
     as much: another one."""
     rig = rigs[0]
@@ -78,7 +79,7 @@ def test_a_turn_of_the_lens_that_the_mount_takes_up_is_no_motion(rigs: list[Moun
     other = camera.with_parameters(shifted)
     turn = Rigid3(exp_so3(np.array([0.0, -2.0 / shifted[0], 0.0])), np.zeros(3))
     both = dict(rig.cameras) | {"wide": (other, turn @ mount)}
-    hidden = compare_mounts(rig, Mounted(both, rig.covariance, rig.freedom))
+    hidden = compare_mounts(rig, replace(rig, cameras=both))
     plain = compare_mounts(rig, moved(rig, "wide", turn))
     assert hidden.mounts[0].rotation_deg < 0.3 * plain.mounts[0].rotation_deg
     assert hidden.chance is not None
@@ -86,8 +87,8 @@ def test_a_turn_of_the_lens_that_the_mount_takes_up_is_no_motion(rigs: list[Moun
     assert hidden.chance > plain.chance
 
 
-def test_a_rig_without_covariance_has_no_p_values(rigs: list[Mounted]) -> None:
-    found = compare_mounts(rigs[0], Mounted(rigs[1].cameras, None))
+def test_a_rig_without_covariance_has_no_p_values(rigs: list[MountedCameras]) -> None:
+    found = compare_mounts(rigs[0], replace(rigs[1], covariance=None))
     assert found.chance is None and found.same is None and found.mounts[0].shift_mm > 0.0
 
 
@@ -137,7 +138,7 @@ def test_a_rig_file_says_what_lenses_may_do_beyond_their_models(rng: np.random.G
     saved = load_saved_rig(path)
     for own, back in zip(rig.departures, saved.departures, strict=True):
         assert (own.modes == back.modes).all() and (own.moves == back.moves).all()
-    lenses, _ = rig.with_departures
+    lenses = rig.mounted.with_departures.lenses
     instrument = load_instrument(path, ("reg", "fish"))
     assert [c.parameters.size for c in instrument.cameras] == [lenses[k].parameters.size for k in (0, 2)]
     assert instrument.layout.cameras[-1].stop > sum(rig.cameras[k].camera.parameters.size for k in (0, 2))

@@ -59,7 +59,7 @@ def transfer_covariance(rig: RigCalibration, a: str, b: str, points: Points) -> 
     """Return the covariance (N, 2, 2), px^2, of the pixels in camera `b` of `points` (N, 3) mm in camera `a`, given
     their pixels in `a` and their distances, and which points (N,) project into `a` and are in the image of `b`."""
     i, j = rig.index(a), rig.index(b)
-    cameras, known = rig.quoted
+    cameras, known = rig.quoted.cameras, rig.quoted.covariance
     layout, rays = Layout.of_cameras(cameras), points / np.linalg.norm(points, axis=-1, keepdims=True)
     mounts = [rig.cameras[k].cam_from_rig for k in (i, j)]
     in_rig = mounts[0].inverse().apply(points)
