@@ -7,7 +7,7 @@
   cluster-robust covariance (`clustered`)
 - `choosing`: model selection by held-out error (`choice`, `models_tried`, `lens_choice`, `one_model`), the
   uncertainty that it leaves (`between_models`), boards numbered from the other end (`board_orientation`), and what a
-  rig takes over from its cameras (`begun`)
+  rig takes over from its cameras (`candidate_fits`)
 - `certainty`: uncertainty of parameters and projection (`covariance`, `uncertainty`), model inadequacy (`departures`,
   `series`, `displaced`), and which part of the image the boards covered (`coverage`)
 - `judging`: diagnosis of images, residuals and result (`captured`, `moved`, `changing`, `mixed`, `turned`, `two_kinds`,
@@ -18,11 +18,11 @@
 Classes, in the order in which a calibration makes them::
 
     options of `calibrate`                                  Request            choosing/models_tried
-    camera model of one size, to be fitted                  ModelInQuestion    choosing/models_tried
+    camera model of one size, to be fitted                  CandidateModel     choosing/models_tried
     least-squares solution                                  Fit                solving/fit
     fitted model with its held-out error                    FittedModel        choosing/choice
     best size and board shape of one camera model           ModelOutcome       choosing/one_model
-    camera with all its models fitted, none chosen yet      BegunCalibration   choosing/begun
+    camera with all its models fitted, none chosen yet      CandidateFits      choosing/candidate_fits
     model chosen, alone or together with like cameras       ModelChoice        choosing/lens_choice
     other model that the images support about as well       RivalFit           choosing/between_models
     result                                                  Calibration        result

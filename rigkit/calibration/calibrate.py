@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.certainty.uncertainty import FarProjection
-from rigkit.calibration.choosing.begun import BegunCalibration, begin, camera_named_in_errors
 from rigkit.calibration.choosing.between_models import (
     rival_fits,
     rival_shapes,
@@ -21,6 +20,7 @@ from rigkit.calibration.choosing.between_models import (
     with_other_lens,
     with_rivals,
 )
+from rigkit.calibration.choosing.candidate_fits import CandidateFits, camera_named_in_errors, fit_candidates
 from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut, choose, described, models_of
 from rigkit.calibration.choosing.lens_choice import ModelChoice, best_sizes, choose_lenses, like_cameras
 from rigkit.calibration.choosing.models_tried import Request
@@ -94,7 +94,7 @@ def calibrate(
 def calibrate_together(
     cameras: Sequence[tuple[str, Sequence[BoardView], Request]],
     *,
-    known: Sequence[BegunCalibration] = (),
+    known: Sequence[CandidateFits] = (),
     progress: Progress = silent,
 ) -> list[Calibration]:
     """Return the calibration of each camera of a rig, given as (name, views, options).
@@ -103,32 +103,95 @@ def calibrate_together(
     calibrations; one of the same views and options is not repeated. Raises as `calibrate`, with the camera's name in
     the message unless it is "".
     """
-    begun = []
+    fits = []
     for k, (name, views, request) in enumerate(cameras):
         progress("cameras", k, len(cameras))
-        done = (one.asked(name, views, request) for one in known)
-        begun.append(next((one for one in done if one is not None), None) or begin(name, views, request))
+        done = (one.for_request(name, views, request) for one in known)
+        fits.append(next((one for one in done if one is not None), None) or fit_candidates(name, views, request))
     out: dict[int, Calibration] = {}
-    for group in like_cameras([choose(one.tried, MIN_SIGMAS).fit.state.camera for one in begun]):
-        out |= dict(zip(group, _finish([begun[k] for k in group]), strict=True))
+    for group in like_cameras([choose(one.tried, MIN_SIGMAS).fit.state.camera for one in fits]):
+        out |= dict(zip(group, _finish([fits[k] for k in group]), strict=True))
     progress("cameras", len(cameras), len(cameras))
-    return [out[k] for k in range(len(begun))]
+    return [out[k] for k in range(len(fits))]
 
 
-def _finish(group: Sequence[BegunCalibration]) -> list[Calibration]:
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class _Solution:
+    """The solution of one camera, and what it was chosen from.
+
+    Attributes
+    ----------
+    fits : all candidate models of the camera.
+    outcome : of the chosen model.
+    tried : the candidates, one size of each model or all of one model, compared on the same boards.
+    rivals, likely : options of which some may be as good as the chosen one, and the probability of each by name.
+    """
+
+    fits: CandidateFits
+    outcome: ModelOutcome
+    tried: Sequence[FittedModel]
+    rivals: Sequence[FittedModel]
+    likely: Mapping[str, float]
+
+    def assembled(self) -> tuple[Calibration, FarProjection]:
+        """Return the result without verdicts, and the uncertainty of its projection of far points; raises
+        DegenerateError if the views do not determine it."""
+        outcome, fit = self.outcome, self.outcome.chosen.fit
+        others = _others(self.tried, far_camera(fit.state.camera).model) if len(models_of(self.tried)) > 1 else []
+        close = rival_fits(outcome.observations, fit, self.rivals, self.likely)
+        if not self.fits.name:
+            # In a rig all cameras together choose the boards' shapes.
+            close += rival_shapes(outcome.chosen, outcome.shapes)
+        result = assemble(
+            outcome.observations,
+            fit,
+            outcome.chosen.heldout_px,
+            (*self.fits.dropped, *outcome.reasons),
+            with_rivals([*others, *outcome.candidates], [one.rival for one in close]),
+            close,
+        )
+        far = FarProjection.of(result, from_boards=True)
+        require_determined(result, far.of_parameters_px)
+        return result, far
+
+    def with_verdicts(self, result: Calibration, far: FarProjection) -> Calibration:
+        """Return what `assembled` returned, with its verdicts."""
+        request, outcome = self.fits.request, self.outcome
+        automatic = (("model", request.model), ("board_shape", request.board))
+        in_force = [name for name, value in automatic if value == "auto"]
+        moved = _moved(outcome.observations, outcome.chosen.fit, self.tried) if request.folds else ()
+        verdicts = judge(
+            result,
+            [*moved, *_largest_size_chosen(outcome.beyond, result, in_force)],
+            far=far,
+            clusters=outcome.observations.clusters(),
+            in_force=in_force,
+            solved=(outcome.observations, outcome.chosen.fit),
+            order=self.fits.observations.images,
+        )
+        return replace(result, verdicts=verdicts)
+
+    def with_pupil(self, moving: ModelOutcome) -> _Solution:
+        """Return the solution with the outcome for a moving pupil."""
+        if len(models_of(self.tried)) > 1:
+            return replace(self, outcome=moving)
+        return replace(self, outcome=moving, rivals=moving.sizes, likely=HeldOut.of([moving.sizes]).likely())
+
+
+def _finish(group: Sequence[CandidateFits]) -> list[Calibration]:
     """Return the calibrations of a group of like cameras."""
     tried = [one.tried for one in group]
     choices = choose_lenses(tried)
-    found = [one.solved(choice.model) for one, choice in zip(group, choices, strict=True)]
+    found = [one.outcome_of(choice.model) for one, choice in zip(group, choices, strict=True)]
     several = any(len(models_of(options)) > 1 for options in tried)
     if several and any(one.chosen.fit.state.shape.kind != "flat" for one in found):
         # A board that is not flat biases the lens: with the shapes found, another model may be the best one.
         names = best_sizes(tried)
-        on_boards = [begun.on_boards(choice.model, names) for begun, choice in zip(group, choices, strict=True)]
+        on_boards = [one.on_boards_of(choice.model, names) for one, choice in zip(group, choices, strict=True)]
         others = choose_lenses(on_boards)
         for model in dict.fromkeys(other.model for other in others):
             changed = [k for k, c in enumerate(choices) if others[k].model == model != c.model]
-            again = [group[k].solved(model) for k in changed]
+            again = [group[k].outcome_of(model) for k in changed]
             if changed and _better([found[k] for k in changed], again):
                 for k, one in zip(changed, again, strict=True):
                     found[k], tried[k] = one, on_boards[k]
@@ -139,9 +202,11 @@ def _finish(group: Sequence[BegunCalibration]) -> list[Calibration]:
         rivals = [one.sizes for one in found]
         choices = [ModelChoice(c.model, HeldOut.of([r]).likely()) for c, r in zip(choices, rivals, strict=True)]
     out = []
-    for begun, one, options, choice, compared in zip(group, found, tried, choices, rivals, strict=True):
-        with camera_named_in_errors(begun.name, begun.observations.views):
-            out.append(_result(begun, one, options, compared, choice.likely))
+    for fits, outcome, options, choice, compared in zip(group, found, tried, choices, rivals, strict=True):
+        with camera_named_in_errors(fits.name, fits.observations.views):
+            out.append(
+                _result(_Solution(fits=fits, outcome=outcome, tried=options, rivals=compared, likely=choice.likely))
+            )
     return out
 
 
@@ -156,87 +221,30 @@ def _better(found: Sequence[ModelOutcome], again: Sequence[ModelOutcome]) -> boo
     return bool(evidence.names) and evidence.chosen() == "again"
 
 
-def _result(
-    begun: BegunCalibration,
-    found: ModelOutcome,
-    tried: Sequence[FittedModel],
-    rivals: Sequence[FittedModel],
-    likely: Mapping[str, float],
-) -> Calibration:
-    """Return the result of a camera with its verdicts, with a moving pupil where that is asked for or confirmed."""
-    (central, far), request = _assembled(begun, found, tried, rivals, likely), begun.request
+def _result(solution: _Solution) -> Calibration:
+    """Return the result of a camera with its verdicts, with a moving pupil if requested or confirmed."""
+    central, far = solution.assembled()
+    request = solution.fits.request
     if request.pupil == "central" or (request.pupil == "auto" and not may_move(central)):
-        return _with_verdicts(begun, found, tried, central, far)
-    moving = solved_with_pupil(found, begun.observations, request)
+        return solution.with_verdicts(central, far)
+    moving = solved_with_pupil(solution.outcome, solution.fits.observations, request)
     compared: list[Candidate] = []
     if moving is not None:
-        if len(models_of(tried)) == 1:
-            rivals, likely = moving.sizes, HeldOut.of([moving.sizes]).likely()
-        better, candidates = against_central(found, moving, request)
-        moving, compared = replace(moving, candidates=[*candidates, *moving.candidates]), kept_central(candidates)
+        better, candidates = against_central(solution.outcome, moving, request)
+        compared = kept_central(candidates)
+        other = solution.with_pupil(replace(moving, candidates=[*candidates, *moving.candidates]))
         with suppress(DegenerateError):
-            result, far_of_moving = _assembled(begun, moving, tried, rivals, likely)
+            result, far_of_moving = other.assembled()
             if result.pupil is not None and (request.pupil == "moving" or (better and pupil_is_significant(result))):
-                return _with_verdicts(begun, moving, tried, result, far_of_moving)
+                return other.with_verdicts(result, far_of_moving)
     if request.pupil == "moving":
         raise DegenerateError(
             "calibration: the images do not determine how the entrance pupil moves; take boards near and far, up to "
             "the "
             'rim of the image, or pupil = "auto"'
         )
-    central = _with_verdicts(begun, found, tried, central, far)
+    central = solution.with_verdicts(central, far)
     return replace(central, candidates=(*central.candidates, *compared))
-
-
-def _assembled(
-    begun: BegunCalibration,
-    found: ModelOutcome,
-    tried: Sequence[FittedModel],
-    rivals: Sequence[FittedModel],
-    likely: Mapping[str, float],
-) -> tuple[Calibration, FarProjection]:
-    """Return the result of one solution, without verdicts, and how sure it is of far points; raises DegenerateError
-    where the views do not determine it."""
-    fit = found.chosen.fit
-    others = _others(tried, far_camera(fit.state.camera).model) if len(models_of(tried)) > 1 else []
-    close = rival_fits(found.observations, fit, rivals, likely)
-    if not begun.name:
-        # In a rig all cameras together choose the boards' shapes.
-        close += rival_shapes(found.chosen, found.shapes)
-    result = assemble(
-        found.observations,
-        fit,
-        found.chosen.heldout_px,
-        (*begun.dropped, *found.reasons),
-        with_rivals([*others, *found.candidates], [one.rival for one in close]),
-        close,
-    )
-    far = FarProjection.of(result, from_boards=True)
-    require_determined(result, far.of_parameters_px)
-    return result, far
-
-
-def _with_verdicts(
-    begun: BegunCalibration,
-    found: ModelOutcome,
-    tried: Sequence[FittedModel],
-    result: Calibration,
-    far: FarProjection,
-) -> Calibration:
-    """Return what `_assembled` returns of a solution with its verdicts."""
-    request, fit = begun.request, found.chosen.fit
-    in_force = [name for name, value in (("model", request.model), ("board_shape", request.board)) if value == "auto"]
-    moved = _moved(found.observations, fit, tried) if request.folds else ()
-    verdicts = judge(
-        result,
-        [*moved, *_largest_size_chosen(found.beyond, result, in_force)],
-        far=far,
-        clusters=found.observations.clusters(),
-        in_force=in_force,
-        solved=(found.observations, fit),
-        order=begun.observations.images,
-    )
-    return replace(result, verdicts=verdicts)
 
 
 def _moved(observations: Observations, fit: Fit, tried: Sequence[FittedModel]) -> tuple[Finding, ...]:

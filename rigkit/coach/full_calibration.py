@@ -15,7 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
 from rigkit.calibration.certainty.displaced import lens_modes, uncertain_camera
-from rigkit.calibration.choosing.begun import BegunCalibration, begin
+from rigkit.calibration.choosing.candidate_fits import CandidateFits, fit_candidates
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.uncertain import UncertainCamera
@@ -48,7 +48,7 @@ class FullCalibration:
     calibration: Calibration
     knowledge: Knowledge
     stated: UncertainCamera
-    begun: BegunCalibration | None = None
+    candidate_fits: CandidateFits | None = None
 
     @property
     def heldout_rms_px(self) -> float | None:
@@ -62,11 +62,11 @@ def full_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> Fu
         size_px=size_px, model="auto", degree=None, board="auto", folds=FOLDS, progress=silent, pupil="auto"
     )
     try:
-        begun = begin("", named, request)
-        (found,) = calibrate_together([("", named, request)], known=[begun])
+        candidate_fits = fit_candidates("", named, request)
+        (found,) = calibrate_together([("", named, request)], known=[candidate_fits])
         modes = lens_modes(found)
         known = Knowledge.of(found).with_model_inadequacy(modes)
-        return FullCalibration(found, known, uncertain_camera(found, modes=modes), begun)
+        return FullCalibration(found, known, uncertain_camera(found, modes=modes), candidate_fits)
     except (InputError, DegenerateError):
         return None
 

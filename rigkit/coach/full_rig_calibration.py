@@ -13,7 +13,7 @@ from typing import Self
 
 import numpy as np
 
-from rigkit.calibration.choosing.begun import BegunCalibration
+from rigkit.calibration.choosing.candidate_fits import CandidateFits
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.layout import Layout
@@ -38,10 +38,12 @@ def full_rig_calibration(
     frames: Sequence[Views],
     names: Sequence[str],
     sizes_px: Sequence[tuple[int, int]],
-    begun: Sequence[BegunCalibration] = (),
+    candidate_fits: Sequence[CandidateFits] = (),
 ) -> RigCalibration | None:
-    """Return the full calibration from frames of the cameras `names`; None where they do not determine the rig. `begun`
-    are intermediate results of `full_calibration` for single cameras, which save most of the time."""
+    """Return the full calibration from frames of the cameras `names`; None where they do not determine the rig.
+
+    `candidate_fits` are intermediate results of `full_calibration` for single cameras, which save most of the time.
+    """
     views: dict[str, list[tuple[str, BoardView]]] = {name: [] for name in names}
     for k, frame in enumerate(frames):
         for name, view in zip(names, frame, strict=True):
@@ -49,7 +51,7 @@ def full_rig_calibration(
                 views[name].append((f"{k:04d}", replace(view, image=f"{len(views[name]):04d}")))
     sizes = dict(zip(names, sizes_px, strict=True))
     try:
-        return calibrate_rig(views, sizes, model="auto", board="auto", begun=begun)
+        return calibrate_rig(views, sizes, model="auto", board="auto", candidate_fits=candidate_fits)
     except (InputError, DegenerateError):
         return None
 

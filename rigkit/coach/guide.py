@@ -10,7 +10,7 @@ import numpy as np
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.displaced import uncertain_camera
-from rigkit.calibration.choosing.begun import BegunCalibration
+from rigkit.calibration.choosing.candidate_fits import CandidateFits
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.cameras.base import Camera
@@ -164,9 +164,9 @@ class CaptureGuide:
         return not self._whole.is_new(self.views)
 
     @property
-    def begun(self) -> BegunCalibration | None:
+    def candidate_fits(self) -> CandidateFits | None:
         """The intermediate results of the latest full calibration, for that of a rig."""
-        return None if self._whole.latest is None else self._whole.latest.begun
+        return None if self._whole.latest is None else self._whole.latest.candidate_fits
 
     def _go_on(self) -> None:
         """Use finished calibrations, and start one of new frames."""

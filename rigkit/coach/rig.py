@@ -203,8 +203,8 @@ class RigGuide:
         if not all(lens.is_calibrated for lens in self.lenses):
             return
         frames = [[observation.view for observation in frame] for frame in self.frames]
-        begun = [lens.begun for lens in self.lenses if lens.begun is not None]
-        if self._whole.go_on(frames, self.names, [lens.size_px for lens in self.lenses], begun):
+        candidate_fits = [lens.candidate_fits for lens in self.lenses if lens.candidate_fits is not None]
+        if self._whole.go_on(frames, self.names, [lens.size_px for lens in self.lenses], candidate_fits):
             self._known = None
 
     def _known_by(self, rig: RigCalibration) -> RigKnown:

@@ -65,7 +65,7 @@ class Later(Executor):
 
     rig: RigCalibration
     asked: list[tuple[int, Future[RigCalibration | None]]] = field(default_factory=list)
-    begun: list[Any] = field(default_factory=list)
+    candidate_fits: list[Any] = field(default_factory=list)
     lenses: list[Callable[[], None]] = field(default_factory=list)
     """Calibrations of lenses that are not done: those of so many as are `slow`."""
     slow: int = 0
@@ -74,7 +74,7 @@ class Later(Executor):
         future: Future[Any] = Future()
         if fn is full_rig_calibration:
             self.asked.append((len(args[0]), future))
-            self.begun.append(args[3])
+            self.candidate_fits.append(args[3])
         else:
             own = self.rig.single[NAMES.index(OTHER if args[0][0].image.startswith(OTHER) else NAMES[0])]
             known = f"begun {len(args[0])}"
@@ -138,7 +138,7 @@ def test_the_rig_reuses_the_calibrations_of_its_lenses(
     later.slow = 0
     later.lenses.pop()()
     guide.advise(EMPTY)
-    assert later.begun == [[f"begun {FRAMES}"] * 2]
+    assert later.candidate_fits == [[f"begun {FRAMES}"] * 2]
 
 
 def test_what_the_rig_is_less_sure_of_is_asked_for(
@@ -223,7 +223,9 @@ def test_frames_of_a_rig_are_calibrated_by_their_moments(
 ) -> None:
     monkeypatch.setattr(
         "rigkit.coach.full_rig_calibration.calibrate_rig",
-        lambda views, sizes, model, board, begun: calibrate_rig(views, sizes, model="brown", degree=5, folds=0),
+        lambda views, sizes, model, board, candidate_fits: calibrate_rig(
+            views, sizes, model="brown", degree=5, folds=0
+        ),
     )
     views = [[frame_observation.view for frame_observation in seen] for seen in frames]
     found = full_rig_calibration([*views[:-1], [views[-1][0], None]], NAMES, [SIZE, SIZE])

@@ -79,7 +79,7 @@ def test_a_rig_is_enough_when_lenses_and_mounts_are(rng: np.random.Generator, mo
     )
     monkeypatch.setattr(
         "rigkit.coach.full_rig_calibration.calibrate_rig",
-        lambda views, sizes, model, board, begun: calibrate_rig(views, sizes, model="brown", degree=5),
+        lambda views, sizes, model, board, candidate_fits: calibrate_rig(views, sizes, model="brown", degree=5),
     )
     guide = RigGuide(("left", "right"), GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=0.3, reach=REACH))
     empty = [FrameObservation(size_px=SIZE, view=None)] * 2

@@ -31,7 +31,7 @@ DEGREES_BEYOND: dict[str, tuple[int, ...]] = {"scaramuzza": (9, 10)}
 """and those tried if the largest of them is the best: for precise corners, or lenses of more than 200 degrees."""
 
 
-class ModelInQuestion(NamedTuple):
+class CandidateModel(NamedTuple):
     """A camera model of one size (`order`, None if it has only one) to be fitted, and its name."""
 
     name: str
@@ -53,7 +53,7 @@ class Request:
     """Or "auto", "moving": see `calibrate`."""
 
 
-def wanted_models(request: Request) -> list[ModelInQuestion]:
+def wanted_models(request: Request) -> list[CandidateModel]:
     """Return the camera models to fit. Raises InputError for invalid options."""
     if request.board not in (*SHAPES, "auto"):
         raise InputError(f"board shape '{request.board}' is unknown; known: auto, {', '.join(SHAPES)}")
@@ -61,25 +61,25 @@ def wanted_models(request: Request) -> list[ModelInQuestion]:
         raise InputError(f"cross-validation in {request.folds} folds: give 2 or more, or 0 for none")
     if request.degree is not None:
         check_order(request.model, request.degree)
-    out: list[ModelInQuestion] = []
+    out: list[CandidateModel] = []
     for name in list(MODELS) if request.model == "auto" else [request.model]:
         cls = camera_model(name)
         orders = (request.degree,) if request.degree is not None else DEGREES_TRIED.get(name, (None,))
-        out += [ModelInQuestion(name if order is None else f"{name} {order}", cls, order) for order in orders]
+        out += [CandidateModel(name if order is None else f"{name} {order}", cls, order) for order in orders]
     return out
 
 
-def larger_sizes(chosen: FittedModel) -> list[ModelInQuestion]:
+def larger_sizes(chosen: FittedModel) -> list[CandidateModel]:
     """Return the larger sizes to try of the chosen model, if it is of the largest size tried so far."""
     camera = chosen.fit.state.camera
     tried, more = DEGREES_TRIED.get(camera.model, (None,)), DEGREES_BEYOND.get(camera.model, ())
     if chosen.name != f"{camera.model} {tried[-1]}":
         return []
-    return [ModelInQuestion(f"{camera.model} {order}", type(camera), order) for order in more]
+    return [CandidateModel(f"{camera.model} {order}", type(camera), order) for order in more]
 
 
 def fit_all(
-    observations: Observations, request: Request, wanted: Sequence[ModelInQuestion], known: Sequence[FittedModel] = ()
+    observations: Observations, request: Request, wanted: Sequence[CandidateModel], known: Sequence[FittedModel] = ()
 ) -> tuple[list[FittedModel], list[Candidate]]:
     """Return the options `known` and those `wanted`, fitted, and the failed ones; raises the last error if there is no
     option at all."""

@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.calibration.choosing.board_orientation import misnumbered_views, with_boards_renumbered
 from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, choose, described
 from rigkit.calibration.choosing.models_tried import (
-    ModelInQuestion,
+    CandidateModel,
     Request,
     agreeing_views,
     cross_validated,
@@ -45,7 +45,7 @@ class ModelOutcome:
     reasons: tuple[tuple[str, str], ...]
     chosen: FittedModel
     candidates: list[Candidate]
-    beyond: Sequence[ModelInQuestion]
+    beyond: Sequence[CandidateModel]
     sizes: list[FittedModel]
     shapes: list[FittedModel]
 
@@ -53,7 +53,7 @@ class ModelOutcome:
 def solved(
     observations: Observations,
     options: list[FittedModel],
-    wanted: Sequence[ModelInQuestion],
+    wanted: Sequence[CandidateModel],
     failed: list[Candidate],
     request: Request,
 ) -> ModelOutcome:
@@ -80,7 +80,7 @@ def chosen_of_sizes(
     used: BoolArray,
     reasons: tuple[tuple[str, str], ...],
     failed: Sequence[Candidate] = (),
-    beyond: Sequence[ModelInQuestion] = (),
+    beyond: Sequence[CandidateModel] = (),
 ) -> ModelOutcome:
     """Return the outcome with the best of the `sizes`, compared with flat boards, and then the best board shape."""
     chosen = choose(sizes, MIN_SIGMAS)

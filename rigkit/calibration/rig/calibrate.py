@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import partial
 
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
-from rigkit.calibration.choosing.begun import BegunCalibration, camera_named_in_errors
+from rigkit.calibration.choosing.candidate_fits import CandidateFits, camera_named_in_errors
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
@@ -49,7 +49,7 @@ def calibrate_rig(
     known: KnownCameras | None = None,
     folds: int = FOLDS,
     pupil: str = "auto",
-    begun: Sequence[BegunCalibration] = (),
+    candidate_fits: Sequence[CandidateFits] = (),
     progress: Progress = silent,
 ) -> RigCalibration:
     """Return the calibration of a rig.
@@ -65,7 +65,7 @@ def calibrate_rig(
     known : lenses, or lenses and mounts, that are held; their covariance is part of all covariances.
     folds : number of folds of the cross-validations, of each camera alone and of the rig; 0 for none.
     pupil : whether entrance pupils may move, as for `calibrate`: decided for each camera alone, solved jointly.
-    begun : earlier calibrations of single cameras, whose results are reused for the same views.
+    candidate_fits : earlier fits of single cameras, reused for the same views.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def calibrate_rig(
         n: Request(size_px=sizes_px[n], model=models[n], degree=degrees[n], board=board, folds=folds, pupil=pupil)
         for n in views
     }
-    each_alone = partial(_each_alone, requests=requests, known=known, begun=begun, progress=progress)
+    each_alone = partial(_each_alone, requests=requests, known=known, candidate_fits=candidate_fits, progress=progress)
     same = duplicate_images(views)
     every, notes = each_alone(views), tuple[Finding, ...]()
     if rigid_boards:
@@ -203,7 +203,7 @@ def _each_alone(
     views: Views,
     requests: Mapping[str, Request],
     known: KnownCameras | None,
-    begun: Sequence[BegunCalibration],
+    candidate_fits: Sequence[CandidateFits],
     progress: Progress,
 ) -> RigViews:
     """Return the views with the calibration of each camera alone; errors contain the camera's name."""
@@ -218,7 +218,7 @@ def _each_alone(
         with camera_named_in_errors(name, ()):
             found[name] = posed_calibration(alone, lens, known.of_lens(name), board=request.board, folds=request.folds)
     names = [name for name, _, _ in asked]
-    found |= dict(zip(names, calibrate_together(asked, known=begun, progress=progress), strict=True))
+    found |= dict(zip(names, calibrate_together(asked, known=candidate_fits, progress=progress), strict=True))
     if any(found[name].pupil is not None for name in names):
         found |= _with_pupils_too([one for one in asked if one[2].pupil == "auto" and found[one[0]].pupil is None])
     seen = [frame_observations(own, found[name]) for name, own in views.items()]

@@ -10,7 +10,7 @@ import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate_together
-from rigkit.calibration.choosing.begun import begin
+from rigkit.calibration.choosing.candidate_fits import fit_candidates
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.core.detections import BoardView
 from rigkit.core.progress import silent
@@ -29,18 +29,23 @@ def views() -> list[BoardView]:
 def test_a_rig_reuses_the_calibration_of_a_camera_alone(
     views: list[BoardView], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begun = begin("", views, HOW)
-    (alone,) = calibrate_together([("", views, HOW)], known=[begun])
+    candidate_fits = fit_candidates("", views, HOW)
+    (alone,) = calibrate_together([("", views, HOW)], known=[candidate_fits])
     in_rig = [("left", views, replace(HOW, pupil="central"))]
     (expected,) = calibrate_together(in_rig)
     assert alone.boards[0].kind != "flat", "lenses are compared on boards as they were found, too"
     # As it comes from the process in which the camera was calibrated.
-    known = pickle.loads(pickle.dumps(begun))
+    known = pickle.loads(pickle.dumps(candidate_fits))
 
     def again(*_: object) -> None:
         raise AssertionError("done again")
 
-    for step in ("begun.fit_all", "begun.solved", "lens_choice.fit_other_lens", "lens_choice.heldout_squares"):
+    for step in (
+        "candidate_fits.fit_all",
+        "candidate_fits.solved",
+        "lens_choice.fit_other_lens",
+        "lens_choice.heldout_squares",
+    ):
         monkeypatch.setattr(f"rigkit.calibration.choosing.{step}", again)
     (found,) = calibrate_together(in_rig, known=[known])
     np.testing.assert_array_equal(found.camera.parameters, expected.camera.parameters)
@@ -49,10 +54,10 @@ def test_a_rig_reuses_the_calibration_of_a_camera_alone(
 
 
 def test_other_views_or_options_reuse_nothing(views: list[BoardView]) -> None:
-    known = begin("", views, replace(HOW, model="brown", degree=5, board="flat", folds=0))
-    assert known.asked("left", views, known.request) is not None
+    known = fit_candidates("", views, replace(HOW, model="brown", degree=5, board="flat", folds=0))
+    assert known.for_request("left", views, known.request) is not None
     moved = [*views[:-1], replace(views[-1], pixels=views[-1].pixels + 0.1)]
     for other in (moved, views[:-1], [*views[:-1], replace(views[-1], image="other")]):
-        assert known.asked("left", other, known.request) is None
+        assert known.for_request("left", other, known.request) is None
     for request in (replace(known.request, folds=2), replace(known.request, board="auto"), HOW):
-        assert known.asked("left", views, request) is None
+        assert known.for_request("left", views, request) is None

@@ -14,7 +14,7 @@ import numpy as np
 
 from rigkit.calibration.choosing.choice import FittedModel, models_of
 from rigkit.calibration.choosing.lens_choice import lenses_on_boards, lenses_on_flat_boards
-from rigkit.calibration.choosing.models_tried import ModelInQuestion, Request, fit_all, wanted_models
+from rigkit.calibration.choosing.models_tried import CandidateModel, Request, fit_all, wanted_models
 from rigkit.calibration.choosing.one_model import ModelOutcome, solved
 from rigkit.calibration.result import Candidate
 from rigkit.calibration.views.observations import Observations
@@ -45,7 +45,7 @@ def camera_named_in_errors(name: str, views: Sequence[BoardView]) -> Iterator[No
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class BegunCalibration:
+class CandidateFits:
     """A camera with all candidate models fitted to its views.
 
     Attributes
@@ -62,28 +62,28 @@ class BegunCalibration:
     views: Sequence[BoardView]
     dropped: tuple[tuple[str, str], ...]
     observations: Observations
-    wanted: list[ModelInQuestion]
+    wanted: list[CandidateModel]
     options: list[FittedModel]
     failed: list[Candidate]
     tried: list[FittedModel]
-    _solved: dict[str, ModelOutcome] = field(default_factory=dict)
+    _outcomes: dict[str, ModelOutcome] = field(default_factory=dict)
     _on_boards: dict[str, dict[str, FittedModel]] = field(default_factory=dict)
 
-    def solved(self, model: str) -> ModelOutcome:
+    def outcome_of(self, model: str) -> ModelOutcome:
         """Return the outcome of a camera model."""
-        if model not in self._solved:
+        if model not in self._outcomes:
             with camera_named_in_errors(self.name, self.observations.views):
                 own = [option for option in self.options if option.model == model]
                 wanted = [one for one in self.wanted if one.camera.model == model]
-                self._solved[model] = solved(self.observations, own, wanted, self.failed, self.request)
-        return self._solved[model]
+                self._outcomes[model] = solved(self.observations, own, wanted, self.failed, self.request)
+        return self._outcomes[model]
 
-    def on_boards(self, model: str, names: Sequence[str]) -> list[FittedModel]:
+    def on_boards_of(self, model: str, names: Sequence[str]) -> list[FittedModel]:
         """Return the options of the given `names`, compared on the board shapes that a camera model found."""
         done = self._on_boards.setdefault(model, {})
-        return lenses_on_boards(self.solved(model), self.tried, names, self.request, done)
+        return lenses_on_boards(self.outcome_of(model), self.tried, names, self.request, done)
 
-    def asked(self, name: str, views: Sequence[BoardView], request: Request) -> Self | None:
+    def for_request(self, name: str, views: Sequence[BoardView], request: Request) -> Self | None:
         """Return this camera under another name and pupil option, sharing the cached results; None where the views or
         the other options differ."""
         then, now = ((h.size_px, h.model, h.degree, h.board, h.folds) for h in (self.request, request))
@@ -99,7 +99,7 @@ def _same(a: BoardView, b: BoardView) -> bool:
     return named and all(np.array_equal(x, y) for x, y in arrays)
 
 
-def begin(name: str, views: Sequence[BoardView], request: Request) -> BegunCalibration:
+def fit_candidates(name: str, views: Sequence[BoardView], request: Request) -> CandidateFits:
     """Return a camera with all models of `request` fitted; raises as `calibrate`, with the camera's name."""
     with camera_named_in_errors(name, views):
         wanted = wanted_models(request)
@@ -108,7 +108,7 @@ def begin(name: str, views: Sequence[BoardView], request: Request) -> BegunCalib
         options, failed = fit_all(observations, request, wanted)
         several = len(models_of(options)) > 1
         tried = lenses_on_flat_boards(observations, options, request) if several else options
-    return BegunCalibration(
+    return CandidateFits(
         name=name,
         request=request,
         views=views,
