@@ -80,17 +80,17 @@ def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCali
 
 def _summary(done: SessionCalibration | RigSessionCalibration, *, json: bool) -> tuple[dict[str, Any], str, bool]:
     """Return the figures for `json` programs, the words for a person, and whether everything measured agrees."""
-    from rigkit.cli import calibration_words, rig_words
+    from rigkit.cli import calibration_output, rig_output
     from rigkit.workflows.calibration.calibrate import SessionCalibration
 
     if isinstance(done, SessionCalibration):
-        words = calibration_words.describe(done.calibration)
+        words = calibration_output.describe(done.calibration)
         if not json:
             return {}, words, True
-        page = calibration_words.page(done.calibration, done.session.boards)
-        return calibration_words.summary(done.calibration) | {"page": page.to_dict()}, words, True
-    words = rig_words.describe(done.rig, done.checks)
+        page = calibration_output.page(done.calibration, done.session.boards)
+        return calibration_output.summary(done.calibration) | {"page": page.to_dict()}, words, True
+    words = rig_output.describe(done.rig, done.checks)
     if not json:
         return {}, words, done.passed
-    page = rig_words.page(done.rig, done.checks, done.session)
-    return rig_words.summary(done.rig, done.checks) | {"page": page.to_dict()}, words, done.passed
+    page = rig_output.page(done.rig, done.checks, done.session)
+    return rig_output.summary(done.rig, done.checks) | {"page": page.to_dict()}, words, done.passed

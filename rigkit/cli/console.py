@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_or
 
 from rigkit.core.errors import InputError, printable
 from rigkit.core.progress import Progress
-from rigkit.io.disk.schema_words import attributes_of
+from rigkit.io.disk.schema_builders import attributes_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

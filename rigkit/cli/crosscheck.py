@@ -9,7 +9,7 @@ import argparse
 
 from rigkit.cli.console import options_of, print_json, progress_on_stderr
 from rigkit.cli.dataset_arguments import add_dataset_arguments, exit_code_of, failed_pairs, results_folder
-from rigkit.cli.validation_words import note_skipped
+from rigkit.cli.validation_output import note_skipped
 from rigkit.core.errors import ExitCode
 from rigkit.workflows.options.clouds import DatasetOptions
 

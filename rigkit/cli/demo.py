@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.validation_words import show
+    from rigkit.cli.validation_output import show
     from rigkit.workflows.demo import run_demo
 
     options = options_of(DemoOptions, args)

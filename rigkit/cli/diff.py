@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.checks.diff import diff
-    from rigkit.workflows.checks.diff_words import facts_of, figures_of, words_of, write_diff_page
+    from rigkit.workflows.checks.diff_output import facts_of, figures_of, words_of, write_diff_page
 
     options = options_of(DiffOptions, args)
     done = diff(args.a, args.b, options)

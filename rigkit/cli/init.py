@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rigkit.cli.aim_arguments import add_board_argument
-from rigkit.cli.manifest_words import POSE_TYPES
+from rigkit.cli.manifest_answers import POSE_TYPES
 from rigkit.core.errors import ExitCode, InputError
 
 
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _session(args: argparse.Namespace) -> int:
     from rigkit.cli.console import progress_on_stderr
-    from rigkit.cli.manifest_words import parse_length
+    from rigkit.cli.manifest_answers import parse_length
     from rigkit.io.boards.board_words import board_files
     from rigkit.io.disk.writing import ensure_writable, write_together
     from rigkit.io.media.images import images_below, require_folder

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from rigkit.cli.console import note, progress_on_stderr
-from rigkit.cli.manifest_words import (
+from rigkit.cli.manifest_answers import (
     POSE_TYPES,
     ask,
     cameras_of,

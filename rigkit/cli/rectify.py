@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr, size_of_words
-from rigkit.cli.rectification_words import grouped_by_description, image_to_dict
+from rigkit.cli.rectification_output import grouped_by_description, image_to_dict
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.workflows.options.cameras import RectifyOptions
 

@@ -16,7 +16,7 @@ from rigkit.cli.dataset_arguments import (
     has_directions,
     results_folder,
 )
-from rigkit.cli.validation_words import show, show_paper
+from rigkit.cli.validation_output import show, show_paper
 from rigkit.core.errors import InputError
 from rigkit.workflows.options.clouds import PaperOptions, ValidateOptions
 

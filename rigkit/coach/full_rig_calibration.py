@@ -23,9 +23,9 @@ from rigkit.core.arrays import Pixels
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.planning.goal import RemainingError, Requirement, projection_goal
+from rigkit.planning.instructions import placement
 from rigkit.planning.plan import Plan, covariance_of
 from rigkit.planning.rig_goal import rig_goal
-from rigkit.planning.words import placement
 from rigkit.validation.sentinel.evidence import Monitored, board_information
 from rigkit.validation.sentinel.frames import Frames
 from rigkit.validation.sentinel.watch import monitored_rig

@@ -28,8 +28,8 @@ from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Goal, RemainingError, Requirement, projection_goal, px_words, rotation_free_jacobian
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import BoardPoses, CornerError, Knowledge
+from rigkit.planning.instructions import placement
 from rigkit.planning.plan import Plan, Proposal, covariance_of, plan_views
-from rigkit.planning.words import placement
 
 FIRST_FRAMES = 4
 """Frames needed for a first calibration; before it, plans use a guessed lens."""

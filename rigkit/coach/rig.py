@@ -35,8 +35,8 @@ from rigkit.core.processes import SerialExecutor
 from rigkit.planning.candidates import board_poses_in_view, outline_mm
 from rigkit.planning.goal import RemainingError
 from rigkit.planning.information import BoardPoses
+from rigkit.planning.instructions import placement
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
-from rigkit.planning.words import placement
 
 SHARED_FRAMES = 5
 """With fewer boards seen by two cameras at once, their disagreement cannot be estimated."""

@@ -9,7 +9,7 @@ from rigkit.core.errors import InputError
 from rigkit.io import schema_results
 from rigkit.io.boards.board_file import BOARD_FILE
 from rigkit.io.calibrations import schema_calibration
-from rigkit.io.disk.schema_words import ANY_OF, Schema
+from rigkit.io.disk.schema_builders import ANY_OF, Schema
 from rigkit.io.manifests.manifest import DATASET_FILE
 from rigkit.io.manifests.public_set import PUBLIC_FILE
 from rigkit.io.manifests.session import SESSION_FILE

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rigkit.core.claims import Verdict
 from rigkit.io.calibrations.history_file import HistoryEntry
-from rigkit.io.disk.schema_words import (
+from rigkit.io.disk.schema_builders import (
     ANY_OF,
     BOOLEAN,
     INTEGER,

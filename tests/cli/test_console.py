@@ -11,7 +11,7 @@ import pytest
 
 from rigkit.cli.console import add_options, options_of
 from rigkit.cli.main import VERBS
-from rigkit.io.disk.schema_words import attributes_of
+from rigkit.io.disk.schema_builders import attributes_of
 from rigkit.workflows.options import cameras, clouds
 from rigkit.workflows.options.base import WrittenFiles
 

@@ -14,7 +14,7 @@ from rigkit.cameras import registry
 from rigkit.cli import reconstruct
 from rigkit.cli.examples import EXAMPLES, FIRST_STEPS
 from rigkit.cli.main import VERBS, build_parser
-from rigkit.io.disk.schema_words import attributes_of
+from rigkit.io.disk.schema_builders import attributes_of
 from rigkit.workflows.options.cameras import FolderOptions
 
 MAX_WIDTH = 120

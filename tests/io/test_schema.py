@@ -16,7 +16,7 @@ from rigkit.cli.main import main
 from rigkit.core.errors import InputError
 from rigkit.core.truth import MeasuredAngle, PairTruth
 from rigkit.io.boards.board_file import load_board
-from rigkit.io.disk.schema_words import ANY_OF
+from rigkit.io.disk.schema_builders import ANY_OF
 from rigkit.io.manifests.manifest import load_dataset
 from rigkit.io.manifests.public_set import load_public_set
 from rigkit.io.manifests.rig_session import is_rig_session, load_rig_session

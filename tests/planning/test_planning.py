@@ -22,8 +22,8 @@ from rigkit.planning.candidates import MAX_SLANT_DEG, TILT_DEG, Reach, board_pos
 from rigkit.planning.goal import Goal, projection_goal, px_words, rays_within
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import BoardPoses, CornerError, Knowledge
+from rigkit.planning.instructions import placement
 from rigkit.planning.plan import choose_views, covariance_of, plan_views
-from rigkit.planning.words import placement
 
 NOISE_PX = 0.2
 MONTE_CARLO = 40

@@ -25,7 +25,7 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.registry import PATTERNS
 from rigkit.io.boards.foreign_boards import foreign_board
-from rigkit.io.disk.schema_words import (
+from rigkit.io.disk.schema_builders import (
     COUNT,
     NAME,
     PLAIN_KINDS,

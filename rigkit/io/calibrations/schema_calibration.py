@@ -8,7 +8,7 @@ from rigkit.calibration.solving.solver import Convergence
 from rigkit.cameras.registry import MODELS
 from rigkit.core.findings import Severity
 from rigkit.io.boards.board_file import DECLARED_BOARD
-from rigkit.io.disk.schema_words import (
+from rigkit.io.disk.schema_builders import (
     ANY_OF,
     BOOLEAN,
     INTEGER,

@@ -19,7 +19,7 @@ from typing import Any
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.io.disk.reading import fault_of_number, on_one_line, read_text, usable_path
-from rigkit.io.disk.schema_words import ANY_OF, Schema
+from rigkit.io.disk.schema_builders import ANY_OF, Schema
 
 MAX_TOML_BYTES = 4_000_000
 """People write these files; the reader takes a second for each million."""

@@ -16,7 +16,7 @@ from rigkit.core.truth import PairTruth
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.boards.board_file import BOARD_KEYS, load_board, measured_board
 from rigkit.io.disk.reading import usable_path
-from rigkit.io.disk.schema_words import (
+from rigkit.io.disk.schema_builders import (
     NAME,
     NUMBER,
     TEXT,

@@ -33,7 +33,7 @@ from pathlib import Path, PurePosixPath
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.io.boards.board_file import BOARD_KEYS, measured_board
-from rigkit.io.disk.schema_words import BOOLEAN, NAME, NUMBER, POSITIVE, TEXT, choice, described, file, rows, table
+from rigkit.io.disk.schema_builders import BOOLEAN, NAME, NUMBER, POSITIVE, TEXT, choice, described, file, rows, table
 from rigkit.io.disk.toml_reader import TomlTable, read_toml
 
 _HASH = "a SHA-256; write the 64 characters of 0-9 and a-f that `sha256sum` prints"

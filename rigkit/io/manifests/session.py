@@ -28,7 +28,7 @@ from rigkit.core.printing import brief
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.boards.board_file import load_board
 from rigkit.io.disk.reading import is_file_or_broken_link
-from rigkit.io.disk.schema_words import (
+from rigkit.io.disk.schema_builders import (
     ANY_OF,
     COUNT,
     NAME,

@@ -10,7 +10,7 @@ from typing import Any
 from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
-from rigkit.io.disk.schema_words import (
+from rigkit.io.disk.schema_builders import (
     ANY_OF,
     COUNT,
     INTEGER,

@@ -8,7 +8,7 @@ from typing import Any
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
-from rigkit.io.disk.schema_words import POSITIVE, TEXT, Schema, array, described, obj
+from rigkit.io.disk.schema_builders import POSITIVE, TEXT, Schema, array, described, obj
 from rigkit.io.disk.toml_reader import TomlTable
 
 

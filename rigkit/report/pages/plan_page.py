@@ -12,8 +12,8 @@ from rigkit.core.arrays import Pixels, without_nan
 from rigkit.core.boards import Board
 from rigkit.core.tables import Column, Table, cells
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.planning.instructions import placement
 from rigkit.planning.plan import Plan
-from rigkit.planning.words import placement
 from rigkit.report import svg
 from rigkit.report.pages.page_facts import PageFacts
 from rigkit.report.pictures.board_sheet import black_squares

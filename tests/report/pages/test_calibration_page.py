@@ -17,7 +17,7 @@ from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.with_pupil import CENTRAL, MOVING, kept_central
 from rigkit.cameras.eucm import EUCM
-from rigkit.cli.calibration_words import describe
+from rigkit.cli.calibration_output import describe
 from rigkit.core.findings import Finding
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import Knowledge

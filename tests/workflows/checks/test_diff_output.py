@@ -8,7 +8,7 @@ from helpers.calibration_scenes import lens
 from rigkit.calibration.compare import CalibrationComparison
 from rigkit.cameras.compare import compare_cameras
 from rigkit.workflows.checks.diff import CameraPair
-from rigkit.workflows.checks.diff_words import words_of
+from rigkit.workflows.checks.diff_output import words_of
 
 
 @pytest.mark.parametrize(("typical_times", "surer"), [((0.5, 5.0), True), ((0.1, 0.5), False)])

@@ -8,7 +8,7 @@ import numpy as np
 from helpers.calibration_scenes import SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.cli.calibration_words import left_out
+from rigkit.cli.calibration_output import left_out
 
 
 def test_a_reason_is_said_once_with_its_first_images() -> None:

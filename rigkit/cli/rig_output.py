@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
-from rigkit.cli import calibration_words
+from rigkit.cli import calibration_output
 from rigkit.core.findings import most_severe_first
 from rigkit.core.printing import length_words
 
@@ -23,7 +23,7 @@ def page(rig: RigCalibration, checks: Sequence[Check], session: RigSession) -> P
     from rigkit.workflows.calibration.calibrate_rig import cameras_on_page
 
     shown = cameras_on_page(rig, session)
-    cameras = {name: calibration_words.page(c, session.cameras[name].boards) for name, c in shown.items()}
+    cameras = {name: calibration_output.page(c, session.cameras[name].boards) for name, c in shown.items()}
     return rig_facts(rig, checks, cameras)
 
 
@@ -45,7 +45,7 @@ def summary(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
                 "cam_from_rig": camera.cam_from_rig.matrix()[:3].tolist(),
                 "parameters": camera.camera.named(camera.camera.parameters),
                 "sigmas": camera.camera.named(camera.calibration.parameter_sigmas),
-                "alone": calibration_words.summary(alone),
+                "alone": calibration_output.summary(alone),
             }
             for camera, alone in zip(rig.cameras, rig.single, strict=True)
         ],
@@ -115,6 +115,6 @@ def describe(rig: RigCalibration, checks: Sequence[Check]) -> str:
     lines += map(str, most_severe_first(rig.verdicts))
     lines += [f"frame {frame}, board '{board}' left out: {reason}" for frame, board, reason in rig.left_out]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
-        lines += [f"{camera.name}: {line}" for line in calibration_words.left_out(alone)]
+        lines += [f"{camera.name}: {line}" for line in calibration_output.left_out(alone)]
         lines += [f"{camera.name} alone: {verdict}" for verdict in most_severe_first(alone.verdicts)]
     return "\n".join(lines)
