@@ -104,7 +104,7 @@ def ended(
     found = calibrate(guide.views, guide.size_px, model="auto")
     known = uncertain_camera(found)
     stated = float(projection_goal(known.camera, field_deg).error(known.covariance))
-    said = advice.left[0].error if advice.left else float("nan")
+    said = advice.remaining[0].error if advice.remaining else float("nan")
     return found, {
         "frames": len(guide.views),
         "words": advice.words,
@@ -149,7 +149,7 @@ def followed(name: str, frames: int, rng: np.random.Generator) -> tuple[FloatArr
     lens, errors = LENSES[name], list[tuple[float, float]]()
     for guide, advice, _ in guided(name, min(GOALS_PX), rng):
         if guide.has_many and guide.calibration is not None:
-            errors.append((advice.left[0].error, true_error(lens, guide.calibration.camera)))
+            errors.append((advice.remaining[0].error, true_error(lens, guide.calibration.camera)))
         if len(guide.views) >= frames:
             break
     first = [next((true / said for said, true in errors if said <= goal), np.nan) for goal in GOALS_PX]
@@ -187,7 +187,7 @@ def simulated_rig(name: str, goal_px: float, rng: np.random.Generator) -> Sessio
     return Session(
         frames=len(guide.frames),
         words=advice.words,
-        said=max(own.error for own in advice.left) if advice.left else float("nan"),
+        said=max(own.error for own in advice.remaining) if advice.remaining else float("nan"),
         stated=max(own.error for own in left),
         true=max(true_error_of_rig(lens, whole), *(true_error(lens, own.camera) for own in whole.cameras)),
         model="/".join(own.camera.model for own in whole.cameras),

@@ -30,14 +30,14 @@ STEADY = 0.15
 by 15 % when predicted, its residuals must be twice as large as theirs."""
 
 
-class WithHeldOut(Protocol):
+class CrossValidated(Protocol):
     """A calibration with a cross-validation error."""
 
     @property
     def heldout_rms_px(self) -> float | None: ...
 
 
-Found = TypeVar("Found", bound=WithHeldOut)
+Found = TypeVar("Found", bound=CrossValidated)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -80,38 +80,38 @@ class FullCalibrations(Generic[Found]):
         self.count = 0
         self._executor, self._calibrated = executor, calibrated
         self._heldout_rms_px: dict[int, float | None] = {}
-        self._asked: tuple[int, Future[Found | None]] | None = None
+        self._running: tuple[int, Future[Found | None]] | None = None
 
-    def go_on(self, frames: Sequence[Any], *given: object) -> bool:
+    def update(self, frames: Sequence[Any], *given: object) -> bool:
         """Use finished calibrations, and start one of new frames; say whether any has finished."""
         news = False
         while True:
             # A resumed session has no error of fewer frames to compare with: these are calibrated too.
-            self.ask(frames if self.is_new(frames) else frames[:-1], *given)
-            if not self.arrived():
+            self.start(frames if self.is_unfinished(frames) else frames[:-1], *given)
+            if not self.collect():
                 return news
             news = True
 
-    def is_new(self, frames: Sequence[Any]) -> bool:
+    def is_unfinished(self, frames: Sequence[Any]) -> bool:
         """Say whether the calibration of this number of frames has not finished."""
         return len(frames) not in self._heldout_rms_px
 
-    def ask(self, frames: Sequence[Any], *given: object) -> None:
+    def start(self, frames: Sequence[Any], *given: object) -> None:
         """Start a calibration of frames, unless it has finished or another is running."""
-        if self._asked is not None or not self.is_new(frames):
+        if self._running is not None or not self.is_unfinished(frames):
             return
         try:
             future = self._executor.submit(self._calibrated, frames, *given)
         except BrokenProcessPool:
             self._executor = SerialExecutor()
             future = self._executor.submit(self._calibrated, frames, *given)
-        self._asked = len(frames), future
+        self._running = len(frames), future
 
-    def arrived(self) -> bool:
+    def collect(self) -> bool:
         """Say whether a new one has finished."""
-        if self._asked is None or not self._asked[1].done():
+        if self._running is None or not self._running[1].done():
             return False
-        (count, future), self._asked = self._asked, None
+        (count, future), self._running = self._running, None
         try:
             found = future.result()
         except (BrokenProcessPool, CancelledError):
@@ -124,7 +124,7 @@ class FullCalibrations(Generic[Found]):
         self.latest, self.count = found, count
         return True
 
-    def steady(self, count: int) -> bool | None:
+    def is_steady(self, count: int) -> bool | None:
         """Say whether the error of this number of frames agrees with that of fewer; None where one is missing."""
         before = max((n for n in self._heldout_rms_px if n < count), default=None)
         if before is None or count not in self._heldout_rms_px:

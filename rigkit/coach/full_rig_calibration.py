@@ -76,11 +76,11 @@ def remaining_errors_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple
 
 
 @dataclass(frozen=True, eq=False)
-class RigKnown:
+class RigKnowledge:
     """A calibrated rig, and its errors with their requirements."""
 
     monitored: Monitored
-    left: tuple[RemainingError, ...]
+    remaining: tuple[RemainingError, ...]
     options: GuideOptions
 
     @classmethod
@@ -91,14 +91,14 @@ class RigKnown:
     @cached_property
     def plan(self) -> Plan:
         """The next two frames for the error farthest from its requirement."""
-        farthest, boards = max(self.left, key=lambda own: own.share), self.options.boards
+        farthest, boards = max(self.remaining, key=lambda own: own.share), self.options.boards
         return Frames.of(self.monitored, boards, self.options.reach).plan(
             self.monitored, boards, farthest.requirement.goal, 2
         )
 
     @property
     def reached(self) -> bool:
-        return all(own.reached for own in self.left)
+        return all(own.reached for own in self.remaining)
 
     def target(self) -> tuple[str, list[Pixels | None]]:
         """Return where to hold the board next, in words and as outlines."""

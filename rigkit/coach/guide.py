@@ -102,7 +102,8 @@ class Advice:
     take : whether to take this frame.
     enough : there are enough frames.
     waits : no instruction, until a calibration shows whether there are enough.
-    left : errors after the frames so far with their requirements, the projection first; empty before a calibration.
+    remaining : errors after the frames so far with their requirements, the projection first; empty before a
+        calibration.
     more_percent : reduction of the error by two more frames.
     """
 
@@ -112,13 +113,13 @@ class Advice:
     take: bool
     enough: bool
     waits: bool
-    left: tuple[RemainingError, ...]
+    remaining: tuple[RemainingError, ...]
     more_percent: float | None
 
     @property
     def share(self) -> float:
         """The largest error relative to its requirement; infinite before a calibration."""
-        return max((own.share for own in self.left), default=np.inf)
+        return max((own.share for own in self.remaining), default=np.inf)
 
 
 class CaptureGuide:
@@ -131,9 +132,9 @@ class CaptureGuide:
         self.size_px: tuple[int, int] | None = None
         self._quick: Calibration | None = None
         self._stale = False
-        self._whole = FullCalibrations(executor or SerialExecutor(), full_calibration)
+        self._full = FullCalibrations(executor or SerialExecutor(), full_calibration)
         self._plan: Plan | None = None
-        self._left_now: tuple[RemainingError, ...] = ()
+        self._remaining: tuple[RemainingError, ...] = ()
         self._map: list[list[float | None]] | None = None
 
     def add(self, view: BoardView, size_px: tuple[int, int]) -> None:
@@ -145,8 +146,8 @@ class CaptureGuide:
     @property
     def calibration(self) -> Calibration | None:
         """The calibration from the frames so far; None before there is one."""
-        if self._whole.latest is not None:
-            return self._whole.latest.calibration
+        if self._full.latest is not None:
+            return self._full.latest.calibration
         # A resumed session adds many frames at once: it is calibrated only on demand.
         if self._stale and self.size_px is not None and len(self.views) >= FIRST_FRAMES:
             self._quick = _calibrated(self.views, self.size_px) or self._quick
@@ -161,36 +162,36 @@ class CaptureGuide:
     @property
     def is_calibrated(self) -> bool:
         """Whether the full `calibrate` has finished for all frames."""
-        return not self._whole.is_new(self.views)
+        return not self._full.is_unfinished(self.views)
 
     @property
     def candidate_fits(self) -> CandidateFits | None:
         """The intermediate results of the latest full calibration, for that of a rig."""
-        return None if self._whole.latest is None else self._whole.latest.candidate_fits
+        return None if self._full.latest is None else self._full.latest.candidate_fits
 
-    def _go_on(self) -> None:
+    def _update_calibration(self) -> None:
         """Use finished calibrations, and start one of new frames."""
         if self.size_px is None or not self.has_many:
             return
-        if self._whole.go_on(self.views, self.size_px):
+        if self._full.update(self.views, self.size_px):
             self._plan = self._map = None
 
     def advise(self, observation: FrameObservation, *, photo: bool = False) -> Advice:
         """Return what to do, and whether to take this frame, or `photo`."""
-        self._go_on()
+        self._update_calibration()
         plan = self._planned(observation.size_px)
         target = self.requested_view(observation.size_px)
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
-        frame_gain, min_gain = self._gain(observation.view, plan, photo=photo), min_gain_of(photo=photo)
-        left = () if self.calibration is None else self._left_now
-        would_do = bool(left) and self.has_many
-        would_do = would_do and (all(own.reached for own in left) or plan.gain < MIN_GAIN_TO_CONTINUE)
-        steady = self._whole.steady(len(self.views)) if would_do else False
+        frame_gain, min_gain = self._frame_gain(observation.view, plan, photo=photo), min_gain_of(photo=photo)
+        remaining = () if self.calibration is None else self._remaining
+        would_do = bool(remaining) and self.has_many
+        would_do = would_do and (all(own.reached for own in remaining) or plan.gain < MIN_GAIN_TO_CONTINUE)
+        steady = self._full.is_steady(len(self.views)) if would_do else False
         words = f"Hold the board: {where}"
         if steady is None:
             words = CHECKING
         elif steady:
-            words = enough_words(left, plan.gain, plan.knowledge.camera)
+            words = enough_words(remaining, plan.gain, plan.knowledge.camera)
         elif observation.view is not None and frame_gain >= min_gain and observation.complaint:
             words = observation.complaint.capitalize()
         elif would_do:
@@ -202,8 +203,8 @@ class CaptureGuide:
             take=not observation.complaint and frame_gain >= min_gain and steady is False,
             enough=steady is True,
             waits=steady is None,
-            left=left,
-            more_percent=100.0 * plan.gain if left else None,
+            remaining=remaining,
+            more_percent=100.0 * plan.gain if remaining else None,
         )
 
     def requested_view(self, size_px: tuple[int, int]) -> Proposal:
@@ -222,19 +223,19 @@ class CaptureGuide:
         """Return the pose of a board; None where the field of view has too little of it."""
         return _pose(self.camera(size_px), view)
 
-    def _left(self, knowledge: Knowledge) -> tuple[RemainingError, ...]:
+    def _remaining_errors(self, knowledge: Knowledge) -> tuple[RemainingError, ...]:
         """Return the errors after the frames so far with their requirements, scaled to those that the latest full
         calibration states for its frames."""
-        left = [
+        remaining = [
             requirement.remaining(covariance_of(knowledge.information))
             for requirement in self.options.requirements(knowledge.camera)
         ]
-        whole = self._whole.latest
+        whole = self._full.latest
         if whole is None:
-            return tuple(left)
+            return tuple(remaining)
         then, stated = covariance_of(whole.knowledge.information), whole.stated.covariance
-        factors = [float(own.requirement.goal.error(stated) / own.requirement.goal.error(then)) for own in left]
-        return tuple(replace(own, error=own.error * factor) for own, factor in zip(left, factors, strict=True))
+        factors = [float(own.requirement.goal.error(stated) / own.requirement.goal.error(then)) for own in remaining]
+        return tuple(replace(own, error=own.error * factor) for own, factor in zip(remaining, factors, strict=True))
 
     def sigma_map(self) -> list[list[float | None]] | None:
         """Return the rms error of the projection over the image, as rows of LIVE_GRID px, None outside the field of
@@ -258,16 +259,16 @@ class CaptureGuide:
     def _planned(self, size_px: tuple[int, int]) -> Plan:
         if self._plan is None:
             knowledge, o = self._known(size_px), self.options
-            self._left_now = self._left(knowledge)
-            goal = max(self._left_now, key=lambda own: own.share).requirement.goal
+            self._remaining = self._remaining_errors(knowledge)
+            goal = max(self._remaining, key=lambda own: own.share).requirement.goal
             last = _pose(knowledge.camera, self.views[-1]) if self.views else None
             self._plan = plan_views(knowledge, o.boards, goal, 2, reach=o.reach, last=last)
         return self._plan
 
     def _known(self, size_px: tuple[int, int]) -> Knowledge:
         later: Sequence[BoardView] = ()
-        if self._whole.latest is not None:
-            knowledge, later = self._whole.latest.knowledge, self.views[self._whole.count :]
+        if self._full.latest is not None:
+            knowledge, later = self._full.latest.knowledge, self.views[self._full.count :]
         elif self.calibration is not None:
             knowledge = Knowledge.of(self.calibration)
         else:
@@ -285,7 +286,7 @@ class CaptureGuide:
         """Say whether the board has not moved since a frame already taken: the two count as one."""
         return _distinct([*self.views, view]) == _distinct(self.views)
 
-    def _gain(self, view: BoardView | None, plan: Plan, *, photo: bool) -> float:
+    def _frame_gain(self, view: BoardView | None, plan: Plan, *, photo: bool) -> float:
         """Return the gain of this frame, relative to that of a board in the outline: 0 where the board has not moved
         since a frame already taken. A new photo is always good enough among the first frames, and later where it lowers
         the error enough."""
@@ -308,16 +309,18 @@ def relative_gain(plan: Plan, after: float, *, photo: bool) -> float:
     return max(brings, MIN_GAIN_OF_PHOTO / MIN_GAIN_TO_CONTINUE * (1.0 - after / plan.error)) if photo else brings
 
 
-def errors_in_words(left: Sequence[RemainingError]) -> str:
+def errors_in_words(remaining: Sequence[RemainingError]) -> str:
     """Return errors in words, and whether they meet their requirements."""
-    each = (f"{own} ({'as wanted' if own.reached else f'wanted {own.requirement.wanted:g}'})" for own in left)
+    each = (f"{own} ({'as wanted' if own.reached else f'wanted {own.requirement.wanted:g}'})" for own in remaining)
     return f"error {', '.join(each)}"
 
 
-def enough_words(left: Sequence[RemainingError], gain: float, camera: Camera | None = None) -> str:
+def enough_words(remaining: Sequence[RemainingError], gain: float, camera: Camera | None = None) -> str:
     """Return in words that there are enough frames; for one `camera` also the effect of the error at 1 m."""
-    message = ", ".join(map(str, left)) if camera is None or len(left) > 1 else px_words(camera, left[0].error)
-    missed = [f"{own.requirement.wanted:g} {own.requirement.goal.unit}" for own in left if not own.reached]
+    message = (
+        ", ".join(map(str, remaining)) if camera is None or len(remaining) > 1 else px_words(camera, remaining[0].error)
+    )
+    missed = [f"{own.requirement.wanted:g} {own.requirement.goal.unit}" for own in remaining if not own.reached]
     if not missed:
         return f"Enough: {message}; two more pictures would bring {100.0 * gain:.0f} %"
     return f"Enough: {message}, not {' and '.join(missed)}, but two more pictures would bring only {100.0 * gain:.0f} %"

@@ -16,7 +16,7 @@ import numpy as np
 
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.coach.full_calibration import FullCalibrations
-from rigkit.coach.full_rig_calibration import RigKnown, full_rig_calibration
+from rigkit.coach.full_rig_calibration import RigKnowledge, full_rig_calibration
 from rigkit.coach.guide import (
     CHECKING,
     ENOUGH_FRAMES,
@@ -60,8 +60,8 @@ class RigAdvice:
     enough, waits : whether there are enough frames; whether there is no instruction until that is known.
     advised_camera : index of the camera that the words are about.
     targets : for each camera the outline (K, 2) to hold the board into, or None.
-    left, gain : after a calibration of the rig, its errors with their requirements, and the relative reduction of the
-        worst of them by two more frames.
+    remaining, gain : after a calibration of the rig, its errors with their requirements, and the relative reduction of
+        the worst of them by two more frames.
     """
 
     lenses: tuple[Advice, ...]
@@ -73,7 +73,7 @@ class RigAdvice:
     waits: bool = False
     advised_camera: int = 0
     targets: tuple[Pixels | None, ...] = ()
-    left: tuple[RemainingError, ...] = ()
+    remaining: tuple[RemainingError, ...] = ()
     gain: float | None = None
 
     @property
@@ -90,8 +90,8 @@ class RigGuide:
         # A requirement on what is measured is one on the rig, not on single cameras.
         alone = options if len(names) == 1 else replace(options, goal_mm=None)
         self.lenses = tuple(CaptureGuide(alone, executor) for _ in names)
-        self._whole = FullCalibrations(executor or SerialExecutor(), full_rig_calibration)
-        self._known: RigKnown | None = None
+        self._full = FullCalibrations(executor or SerialExecutor(), full_rig_calibration)
+        self._known: RigKnowledge | None = None
         self.frames: list[tuple[FrameObservation, ...]] = []
         self._shared: dict[int, SharedViews | None] = {}
         self._asked: dict[int, tuple[str, list[Pixels | None]]] = {}
@@ -162,20 +162,20 @@ class RigGuide:
 
     def _of_rig(self, advice: RigAdvice, observations: Sequence[FrameObservation], *, photo: bool) -> RigAdvice:
         """Return the advice by the rig's calibration, once lenses and mounts seem good enough."""
-        self._go_on()
-        steady = self._whole.steady(len(self.frames))
+        self._update_calibration()
+        steady = self._full.is_steady(len(self.frames))
         if steady is None:
             return replace(advice, words=CHECKING, waits=True)
-        if self._whole.latest is None:
+        if self._full.latest is None:
             return self._of_mount(replace(advice, advised_camera=1), observations)
         try:
-            known = self._known_by(self._whole.latest)
+            known = self._knowledge_of(self._full.latest)
         except DegenerateError as error:
             return replace(advice, words=str(error))
-        advice = replace(advice, left=known.left, gain=known.plan.gain)
+        advice = replace(advice, remaining=known.remaining, gain=known.plan.gain)
         would_do = known.reached or known.plan.gain < MIN_GAIN_TO_CONTINUE
         if steady and would_do:
-            return replace(advice, words=enough_words(known.left, known.plan.gain), enough=True)
+            return replace(advice, words=enough_words(known.remaining, known.plan.gain), enough=True)
         words, targets = known.target()
         if would_do:
             words = f"One more as confirmation: {words[0].lower()}{words[1:]}"
@@ -190,25 +190,25 @@ class RigGuide:
             return False
         if not all(own.enough or own.share <= MAX_HELP for own in lenses):
             return False
-        self._go_on()
-        if not self._whole.steady(len(self.frames)) or self._whole.latest is None:
+        self._update_calibration()
+        if not self._full.is_steady(len(self.frames)) or self._full.latest is None:
             return False
         try:
-            return self._known_by(self._whole.latest).reached
+            return self._knowledge_of(self._full.latest).reached
         except DegenerateError:
             return False
 
-    def _go_on(self) -> None:
+    def _update_calibration(self) -> None:
         """Use finished calibrations, and start one of new frames once each lens has its own: the rig reuses them."""
         if not all(lens.is_calibrated for lens in self.lenses):
             return
         frames = [[observation.view for observation in frame] for frame in self.frames]
         candidate_fits = [lens.candidate_fits for lens in self.lenses if lens.candidate_fits is not None]
-        if self._whole.go_on(frames, self.names, [lens.size_px for lens in self.lenses], candidate_fits):
+        if self._full.update(frames, self.names, [lens.size_px for lens in self.lenses], candidate_fits):
             self._known = None
 
-    def _known_by(self, rig: RigCalibration) -> RigKnown:
-        self._known = self._known or RigKnown.of(rig, self.options)
+    def _knowledge_of(self, rig: RigCalibration) -> RigKnowledge:
+        self._known = self._known or RigKnowledge.of(rig, self.options)
         return self._known
 
     def _partner(self, c: int) -> int:
@@ -291,15 +291,15 @@ class RigGuide:
         """Return the state for the page."""
         out: dict[str, Any] = {"frames": len(self.frames), "least_frames": ENOUGH_FRAMES}
         if advice is not None:
-            left = advice.left or advice.lenses[advice.advised_camera].left
+            remaining = advice.remaining or advice.lenses[advice.advised_camera].remaining
             out |= {
                 "words": advice.words,
                 "take": advice.take,
                 "enough": advice.enough,
                 "waits": advice.waits,
-                "error": ", ".join(map(str, left)),
-                "share": max((own.share for own in left), default=None),
-                "mount_px": None if advice.left else advice.mount_px,
+                "error": ", ".join(map(str, remaining)),
+                "share": max((own.share for own in remaining), default=None),
+                "mount_px": None if advice.remaining else advice.mount_px,
                 "more_percent": advice.more_percent,
             }
         cameras = []

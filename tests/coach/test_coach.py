@@ -119,7 +119,7 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     first = np.asarray(cv2.imread(str(kept[0])))
     assert any(np.array_equal(first, image) for image in pictures), "kept without loss"
     (lens,) = coach.guide.lenses
-    said_px = lens.advise(FrameObservation(size_px=SIZE, view=None)).left[0].error
+    said_px = lens.advise(FrameObservation(size_px=SIZE, view=None)).remaining[0].error
     assert said_px is not None and re.match(r"Done: \w+, error [0-9.]+ px \(", coach.finish())
     assert "00.png: taken as frame-0001.png" in reported and any(
         line.startswith("002.png: not taken, as it adds little: 0 % of") for line in reported

@@ -82,12 +82,12 @@ def test_a_capture_ends_only_after_a_whole_calibration(views: list[BoardView], w
     now = guide.advise(EMPTY)
     stated = float(projection_goal(whole.stated.camera).error(whole.stated.covariance))
     assert now.enough and not now.waits and now.words.startswith("Enough: ")
-    assert [own.error for own in now.left] == pytest.approx([stated])
+    assert [own.error for own in now.remaining] == pytest.approx([stated])
     # Another frame makes it better, but nobody has calibrated it.
     pose = board_poses_in_view(CAMERA, BOARD, Reach(nearest_mm=250.0)).pose(7)
     guide.add(noisy_view(CAMERA, pose, "more", np.random.default_rng(9), NOISE_PX, board=BOARD), SIZE)
     after = guide.advise(EMPTY)
-    assert after.waits and not after.enough and after.left[0].error < now.left[0].error
+    assert after.waits and not after.enough and after.remaining[0].error < now.remaining[0].error
 
 
 def test_a_larger_uncertainty_of_the_whole_calibration_asks_for_more(
@@ -103,7 +103,7 @@ def test_a_larger_uncertainty_of_the_whole_calibration_asks_for_more(
     guide.advise(EMPTY)
     later.tell(unsure)
     now = guide.advise(EMPTY)
-    assert now.left[0].error == pytest.approx(3.0 * stated)
+    assert now.remaining[0].error == pytest.approx(3.0 * stated)
     # What it is less sure of is said, and that more pictures would not bring it where that is so.
     assert not now.enough or f"not {2.0 * stated:g} px" in now.words
 
@@ -132,12 +132,12 @@ def test_without_its_process_the_capture_goes_on(views: list[BoardView], whole: 
 
     later = Later()
     at_once, meanwhile = (FullCalibrations(executor, calibrated) for executor in (Ended(), later))
-    at_once.ask(views, SIZE)
-    meanwhile.ask(views, SIZE)
+    at_once.start(views, SIZE)
+    meanwhile.start(views, SIZE)
     later.asked[0][1].set_exception(BrokenProcessPool())
-    assert not meanwhile.arrived()
-    meanwhile.ask(views, SIZE)
-    assert at_once.arrived() and meanwhile.arrived() and at_once.latest is meanwhile.latest is whole
+    assert not meanwhile.collect()
+    meanwhile.start(views, SIZE)
+    assert at_once.collect() and meanwhile.collect() and at_once.latest is meanwhile.latest is whole
 
 
 def test_asking_for_the_state_takes_in_a_finished_calibration(
@@ -174,7 +174,7 @@ def test_there_are_enough_only_where_the_projection_and_the_length_are_as_wanted
         guide.advise(EMPTY)
         later.tell(whole)
     now = guide.advise(EMPTY)
-    assert [own.reached for own in now.left] == [px > 1.0, mm > 1.0]
+    assert [own.reached for own in now.remaining] == [px > 1.0, mm > 1.0]
     assert now.more_percent is not None and now.more_percent > 100.0 * MIN_GAIN_TO_CONTINUE, "more pictures would help"
     assert now.enough is (min(px, mm) > 1.0) and not now.waits
     assert wanted.stated(whole.calibration).count("as wanted") == (px > 1.0) + (mm > 1.0)

@@ -18,7 +18,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.coach.full_calibration import STEADY, FullCalibration
-from rigkit.coach.full_rig_calibration import RigKnown, full_rig_calibration, remaining_errors_of_rig
+from rigkit.coach.full_rig_calibration import RigKnowledge, full_rig_calibration, remaining_errors_of_rig
 from rigkit.coach.guide import CHECKING, GuideOptions
 from rigkit.coach.look import FrameObservation
 from rigkit.coach.rig import MAX_HELP, RigGuide
@@ -117,9 +117,9 @@ def test_a_capture_ends_only_after_the_rig_is_calibrated(
     reported(guide, later, rig)
     now = guide.advise(EMPTY)
     assert now.enough and now.words.startswith("Enough: left ") and "together" in now.words
-    assert [own.requirement.whose for own in now.left] == ["left", "right", "together"]
+    assert [own.requirement.whose for own in now.remaining] == ["left", "right", "together"]
     # The rig's own statements: of each lens as its calibration has it, and of all projections together.
-    for own, camera in zip(now.left, rig.cameras, strict=False):
+    for own, camera in zip(now.remaining, rig.cameras, strict=False):
         known = uncertain_camera(camera.calibration)
         stated = float(projection_goal(known.camera).error(known.covariance))
         assert own.error == pytest.approx(stated, rel=0.1)
@@ -153,7 +153,7 @@ def test_what_the_rig_is_less_sure_of_is_asked_for(
     guide = guide_of(frames, later)
     reported(guide, later, doubtful)
     now = guide.advise(EMPTY)
-    *lenses, together = now.left
+    *lenses, together = now.remaining
     assert all(own.reached for own in lenses) and not together.reached
     assert not now.enough and not now.waits and now.words.startswith("Hold the board where ")
     assert all(target is not None for target in now.targets), "outlines in both images"
@@ -185,7 +185,7 @@ def test_a_length_that_both_measure_is_required(frames: list[list[FrameObservati
         guide = guide_of(frames, later, goal_mm=part * in_mm.error, measured=measured)
         reported(guide, later, rig)
         now = guide.advise(EMPTY)
-        assert all(own.reached for own in now.left[:-1]) and now.left[-1].reached is enough
+        assert all(own.reached for own in now.remaining[:-1]) and now.remaining[-1].reached is enough
         assert now.enough is enough or f"not {0.5 * in_mm.error:g} mm" in now.words
 
 
@@ -233,7 +233,7 @@ def test_frames_of_a_rig_are_calibrated_by_their_moments(
     assert found.baseline_mm(*NAMES)[0] == pytest.approx(rig.baseline_mm(*NAMES)[0], rel=0.02)
     never_both = [[left, None] if k % 2 else [None, right] for k, (left, right) in enumerate(views)]
     assert full_rig_calibration(never_both, NAMES, [SIZE, SIZE]) is None
-    known = RigKnown.of(found, GuideOptions(boards=(BOARD,), reach=REACH))
+    known = RigKnowledge.of(found, GuideOptions(boards=(BOARD,), reach=REACH))
     assert known.plan.views[-1].error < known.plan.error
 
 

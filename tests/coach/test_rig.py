@@ -222,7 +222,7 @@ def test_the_goal_may_be_a_length_in_mm(tmp_path: Path, rng: np.random.Generator
         coach.guide.add([frame_observation(held.pose(k), rng, f"{k}")])
     advice = coach.guide.advise([frame_observation(held.pose(7), rng, "x")])
     (lens,) = advice.lenses
-    in_px, in_mm = lens.left
+    in_px, in_mm = lens.remaining
     assert in_px.reached and in_mm.requirement.goal.unit == "mm"
     calibration = coach.guide.lenses[0].calibration
     assert calibration is not None
