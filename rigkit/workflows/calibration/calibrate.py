@@ -26,7 +26,8 @@ from rigkit.workflows.inputs.identify_board import why_misplaced
 from rigkit.workflows.inputs.interlaced import interlaced
 from rigkit.workflows.inputs.wrong_print import wrong_print
 from rigkit.workflows.options.cameras import CalibrateOptions
-from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths
+from rigkit.workflows.outputs.calibration_paths import calibration_paths
+from rigkit.workflows.outputs.export_camera import foreign_files
 from rigkit.workflows.outputs.provenance import provenance_of
 
 
@@ -64,7 +65,7 @@ def calibrate_session(
     options = options or CalibrateOptions()
     if not isinstance(session, Session):
         session = load_session(session)
-    ensure_writable(results_of_camera(options), force=options.force, inputs=session_inputs(session, options))
+    ensure_writable(calibration_paths([""], options), force=options.force, inputs=session_inputs(session, options))
     with about(session.path):
         corners = corners_of(session, options, progress=progress)
     calibration = calibration_from(session, corners, pupil=options.pupil, progress=progress)
@@ -78,12 +79,6 @@ def calibrate_session(
     return SessionCalibration(
         session=session, calibration=calibration, unreadable=corners.unreadable, written=tuple(files)
     )
-
-
-def results_of_camera(options: CalibrateOptions) -> list[Path]:
-    """Return the files that the calibration of one camera writes."""
-    foreign = [] if options.output is None else foreign_paths(options.output, options.exports)
-    return [path for path in (options.output, options.report, *foreign) if path is not None]
 
 
 def corners_of(session: Session, options: CalibrateOptions, *, progress: Progress = silent) -> SessionCorners:

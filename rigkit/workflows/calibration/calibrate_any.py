@@ -22,10 +22,9 @@ from rigkit.io.media.video import is_video, videos_inside
 from rigkit.workflows.calibration.calibrate import (
     SessionCalibration,
     calibrate_session,
-    results_of_camera,
     session_inputs,
 )
-from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration, calibrate_rig_session, results_of_rig
+from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration, calibrate_rig_session
 from rigkit.workflows.inputs.corners import keep_corners
 from rigkit.workflows.inputs.folder_session import (
     FolderSession,
@@ -42,6 +41,7 @@ from rigkit.workflows.inputs.frames import (
 )
 from rigkit.workflows.inputs.layout_evidence import cameras_by_name, cameras_seen
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions, FolderOptions
+from rigkit.workflows.outputs.calibration_paths import calibration_paths
 
 _log = logging.getLogger(__name__)
 
@@ -229,8 +229,7 @@ def _session_path(places: Sequence[Path], output: Path | None) -> Path:
 def _results(cameras: Sequence[str], session: Path, options: CalibrateOptions) -> list[Path]:
     """Return the files that the calibration of a session's cameras writes."""
     output = options.output or beside_session(session, "rig.json" if len(cameras) > 1 else "calibration.json")
-    resolved = replace(options, output=output, report=_report_path(options, output))
-    return results_of_rig(cameras, resolved) if len(cameras) > 1 else results_of_camera(resolved)
+    return calibration_paths(cameras, replace(options, output=output, report=_report_path(options, output)))
 
 
 def _report_path(options: CalibrateOptions, output: Path) -> Path | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,13 +27,13 @@ from rigkit.validation.checks import COVERAGE
 from rigkit.workflows.calibration.calibrate import calibration_from, corners_of, session_inputs
 from rigkit.workflows.calibration.rigid_boards import named_as_listed, named_by_rule, require_distinct
 from rigkit.workflows.calibration.session_page import rig_page
-from rigkit.workflows.inputs.camera_files import file_of_camera
 from rigkit.workflows.inputs.corners import SessionCorners, named_images, session_corners, session_views
 from rigkit.workflows.inputs.identify_board import why_misplaced
 from rigkit.workflows.inputs.known_cameras import known_cameras, known_cameras_first, with_known
 from rigkit.workflows.inputs.wrong_print import wrong_print
 from rigkit.workflows.options.cameras import CalibrateOptions
-from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
+from rigkit.workflows.outputs.calibration_paths import boards_path, calibration_paths, camera_exports, camera_path
+from rigkit.workflows.outputs.export_camera import foreign_files, foreign_rig_files
 from rigkit.workflows.outputs.provenance import provenance_of
 
 
@@ -87,7 +87,7 @@ def calibrate_rig_session(
             frames_of_images(images, session.frames)
         require_distinct(session)
     names = list(session.cameras)
-    targets = results_of_rig(names, options, rigid_boards=bool(session.rigid_boards))
+    targets = calibration_paths(names, options, rigid_boards=bool(session.rigid_boards))
     ensure_writable(targets, force=options.force, inputs=session_inputs(session, options))
     with about(session.path):
         corners = {name: corners_of(own, options, progress=progress) for name, own in session.cameras.items()}
@@ -101,11 +101,11 @@ def calibrate_rig_session(
             outlines = {c.name: outline_of_corners(c.calibration) for c in rig.cameras}
             files |= foreign_rig_files(rig.mounted.cameras, options.output, options.exports, outlines)
         for camera in rig.cameras:
-            own = _camera_file(names, options.output, camera.name)
+            own = camera_path(names, options.output, camera.name)
             files[own] = calibration_text(with_new_verdicts(camera.calibration, session.cameras[camera.name]), origin)
-            files |= foreign_files(camera.calibration, own, _camera_exports(names, options))
+            files |= foreign_files(camera.calibration, own, camera_exports(names, options))
         if session.rigid_boards:
-            files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)
+            files[boards_path(options.output)] = board_rigs_text(rig.board_rigs)
     if options.report is not None:
         files[options.report] = rig_page(session, rig, cameras_on_page(rig, session), checks, corners, files)
     write_together(files, force=options.force)
@@ -113,40 +113,6 @@ def calibrate_rig_session(
     return RigSessionCalibration(
         session=session, rig=rig, checks=tuple(checks), unreadable=unreadable, written=tuple(files)
     )
-
-
-def results_of_rig(names: Sequence[str], options: CalibrateOptions, *, rigid_boards: bool = False) -> list[Path]:
-    """Return the files that the calibration of cameras of these names writes, perhaps with boards on one mount."""
-    out = []
-    if options.output is not None:
-        out += [options.output] if len(names) > 1 else []
-        own = [_camera_file(names, options.output, name) for name in names]
-        out += [*own, *(path for one in own for path in foreign_paths(one, _camera_exports(names, options)))]
-        out += [path for places in _rig_exports(names, options).values() for path in places]
-        out += [_boards_file(options.output)] if rigid_boards else []
-    return out if options.report is None else [*out, options.report]
-
-
-def _rig_exports(names: Sequence[str], options: CalibrateOptions) -> dict[str, list[Path]]:
-    """Return, by requested format that holds a whole rig, its files."""
-    if options.output is None or len(names) < 2:
-        return {}
-    return foreign_rig_paths(names, options.output, options.exports)
-
-
-def _camera_exports(names: Sequence[str], options: CalibrateOptions) -> list[str]:
-    """Return the requested formats that hold one camera a file; a rig's file has the lenses already."""
-    whole = _rig_exports(names, options)
-    return [kind for kind in options.exports if kind not in whole]
-
-
-def _camera_file(names: Sequence[str], target: Path, name: str) -> Path:
-    """Return the path of one camera's calibration."""
-    return file_of_camera(target, name) if len(names) > 1 else target
-
-
-def _boards_file(target: Path) -> Path:
-    return target.with_name(f"{target.stem}-boards.json")
 
 
 def calibrate_camera(path: Path, *, progress: Progress = silent) -> Calibration:
