@@ -15,7 +15,7 @@ import numpy as np
 
 from rigkit.calibration.assemble import with_solution
 from rigkit.calibration.judging.drift import drifting
-from rigkit.calibration.judging.turned import flipped_images
+from rigkit.calibration.judging.flipped import flipped_images
 from rigkit.calibration.judging.two_kinds import two_kinds
 from rigkit.calibration.judging.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration

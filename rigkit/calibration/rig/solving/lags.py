@@ -101,9 +101,9 @@ def with_lags(
             lagging = _solved_again(observations, lagging, sigma_px, times, own_times=own_times)
             if abs(before - lagging.normal.cost) < SETTLED * before:
                 break
-        if not own_times and _chance(observations, lagging, sigma_px, frames) > CHANCE:
+        if not own_times and _p_value_of_lags(observations, lagging, sigma_px, frames) > CHANCE:
             sigma = residual_sigma(observations, solution, sigma_px)
-            if _chance_of_scatter(solution.state, observations, start, sigma) > CHANCE:
+            if _p_value_of_scatter(solution.state, observations, start, sigma) > CHANCE:
                 return observations, solution
     if timing == "lags":
         return observations, lagging
@@ -187,7 +187,9 @@ def _lags_lower_cost(observations: RigObservations, state: RigState, start: Expo
     return step is not None and step.predicted > limit
 
 
-def _chance(observations: RigObservations, solution: Solution[RigState], sigma_px: float, frames: IntArray) -> float:
+def _p_value_of_lags(
+    observations: RigObservations, solution: Solution[RigState], sigma_px: float, frames: IntArray
+) -> float:
     """Return the p-value of the lags: Wald's test, with the scatter between frames."""
     # Imported here: scipy is slow to import, and few rigs need it.
     from scipy.special import fdtrc
@@ -204,12 +206,12 @@ def _with_own_times(
 ) -> ExposureTimes:
     """Return the exposure times with the estimated time of every image and the standard deviation of a camera's times.
     All but the poses is held; `sigma_px` is the standard deviation of a corner."""
-    by_target = _by_target(state, observations)
-    free = _free(by_target)
-    products = _with_times(by_target, exposures.all_speeds())
+    by_target = _information_by_target(state, observations)
+    free = _free_times(by_target)
+    products = _products_with_times(by_target, exposures.all_speeds())
     spread, own = np.where(free.any(axis=0), FIRST_SPREAD, 0.0), exposures.own.T
     for _ in range(SPREAD_ROUNDS):
-        system, information = _regularised(products, free, (sigma_px / np.maximum(spread, MIN_SPREAD)) ** 2)
+        system, information = _with_time_prior(products, free, (sigma_px / np.maximum(spread, MIN_SPREAD)) ** 2)
         right = products[..., -1].copy()
         right[:, 6:] -= information * own
         inverse = np.linalg.inv(system)
@@ -226,15 +228,15 @@ def cost_of_own_times(observations: RigObservations, state: RigState, sigma_px: 
     are predicted (twice the negative logarithm of the marginal likelihood, times `sigma_px` squared)."""
     if state.exposures is None:
         return 0.0
-    by_target = _by_target(state, observations)
+    by_target = _information_by_target(state, observations)
     own, information = state.exposures.own.T, state.exposures.information.T
-    free = _free(by_target) & np.isfinite(information)
-    system, prior = _regularised(_with_times(by_target, state.exposures.all_speeds()), free, information)
+    free = _free_times(by_target) & np.isfinite(information)
+    system, prior = _with_time_prior(_products_with_times(by_target, state.exposures.all_speeds()), free, information)
     chance = np.linalg.slogdet(system)[1] - np.linalg.slogdet(system[:, :6, :6])[1] - np.log(prior).sum(axis=1)
     return float((own[free] ** 2 * prior[free]).sum() + sigma_px**2 * chance.sum())
 
 
-def _by_target(state: RigState, observations: RigObservations) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _information_by_target(state: RigState, observations: RigObservations) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the information (n, F, 6, 6) and score (n, F, 6) of the views of n cameras about the targets at the time
     of the view, and the derivatives (n, F, 6, 6) of these target poses by the poses of the keys."""
     shape = len(state.cameras), len(observations.keys)
@@ -252,7 +254,7 @@ def _by_target(state: RigState, observations: RigObservations) -> tuple[FloatArr
     return information, score, follow
 
 
-def _with_times(by_target: tuple[FloatArray, FloatArray, FloatArray], speeds: FloatArray) -> FloatArray:
+def _products_with_times(by_target: tuple[FloatArray, FloatArray, FloatArray], speeds: FloatArray) -> FloatArray:
     """Return the products (F, 6 + n, 7 + n) for every pose: of the derivatives by it and by the image times of n
     cameras with each other and with the residual. Targets have `speeds` (n, F, 6)."""
     information, score, by_pose = by_target
@@ -266,7 +268,7 @@ def _with_times(by_target: tuple[FloatArray, FloatArray, FloatArray], speeds: Fl
     return summed
 
 
-def _regularised(products: FloatArray, free: BoolArray, known: FloatArray | float) -> tuple[FloatArray, FloatArray]:
+def _with_time_prior(products: FloatArray, free: BoolArray, known: FloatArray | float) -> tuple[FloatArray, FloatArray]:
     """Return the normal matrices (F, 6 + n, 6 + n) of the `products`, with a ridge on the poses and the prior
     information (F, n) of the image times, also returned: `known` where `free` (F, n), else so much that they are
     fixed."""
@@ -279,25 +281,25 @@ def _regularised(products: FloatArray, free: BoolArray, known: FloatArray | floa
     return system, information
 
 
-def _free(by_target: tuple[FloatArray, FloatArray, FloatArray]) -> BoolArray:
+def _free_times(by_target: tuple[FloatArray, FloatArray, FloatArray]) -> BoolArray:
     """Return the mask (F, n) of the free image times: the pose of a frame is at the time of the first camera that sees
     it, which is fixed."""
     shown = np.einsum("nfii->nf", by_target[0]) > 0.0
     return np.asarray((shown & (np.cumsum(shown, axis=0) > 1)).T)
 
 
-def _chance_of_scatter(state: RigState, observations: RigObservations, start: ExposureTimes, sigma_px: float) -> float:
+def _p_value_of_scatter(state: RigState, observations: RigObservations, start: ExposureTimes, sigma_px: float) -> float:
     """Return the p-value of the agreement gained by image times of their own: permuted trajectories, which have nothing
     to do with the views, gain as much by chance."""
-    by_target, rng = _by_target(state, observations), np.random.default_rng(0)
-    free, known = _free(by_target), (sigma_px / FIRST_SPREAD) ** 2
+    by_target, rng = _information_by_target(state, observations), np.random.default_rng(0)
+    free, known = _free_times(by_target), (sigma_px / FIRST_SPREAD) ** 2
     trajectories = start.trajectories[:, 0]
     moving = np.flatnonzero(trajectories.any(axis=1))
 
     def gain(own: FloatArray) -> float:
-        products = _with_times(by_target, np.broadcast_to(own, (free.shape[1], *own.shape)))
+        products = _products_with_times(by_target, np.broadcast_to(own, (free.shape[1], *own.shape)))
         right = products[..., -1:]
-        return float((right * np.linalg.solve(_regularised(products, free, known)[0], right)).sum())
+        return float((right * np.linalg.solve(_with_time_prior(products, free, known)[0], right)).sum())
 
     found, better = gain(trajectories), 0
     for _ in range(ORDERS_DRAWN):

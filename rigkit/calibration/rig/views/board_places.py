@@ -32,7 +32,7 @@ FLOOR = 1e-6
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Label:
+class _LabelledBoard:
     """A possible id and orientation of an observed board, with its outer corners in the camera, (4, 3) mm."""
 
     seen: Observation
@@ -40,12 +40,12 @@ class _Label:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _BoardSeen:
+class _BoardInScene:
     """A board of a scene: its camera, its key there, its possible labels, and its distance."""
 
     camera: int
     key: tuple[str, str]
-    labels: tuple[_Label, ...]
+    labels: tuple[_LabelledBoard, ...]
     distance_mm: float
 
 
@@ -97,7 +97,7 @@ def board_places(
     return replace(views, seen=out, places=places), tuple(notes)
 
 
-def _rename(own: FrameObservations, scene: Sequence[_BoardSeen], labelling: Labelling | None, target: str) -> None:
+def _rename(own: FrameObservations, scene: Sequence[_BoardInScene], labelling: Labelling | None, target: str) -> None:
     """Set the ids of the boards of one scene, in the observations of their camera, and the key of their target."""
     old = [own.pop(entry.key) for entry in scene]
     for k, (entry, before) in enumerate(zip(scene, old, strict=True)):
@@ -114,7 +114,7 @@ def _rename(own: FrameObservations, scene: Sequence[_BoardSeen], labelling: Labe
 def _unidentified_board(
     group: Sequence[str],
     known: Mapping[str, Rigid3],
-    scenes: Sequence[list[_BoardSeen]],
+    scenes: Sequence[list[_BoardInScene]],
     labellings: Sequence[Labelling | None],
 ) -> str | None:
     """Return a board that was seen, but in no scene that determines its pose on the target; None if there is none."""
@@ -126,20 +126,20 @@ def _unidentified_board(
     return next((name for name in group if name not in known and not read.get(name, True)), None)
 
 
-def _scenes(seen: Sequence[FrameObservations], members: Sequence[Board]) -> list[list[_BoardSeen]]:
+def _scenes(seen: Sequence[FrameObservations], members: Sequence[Board]) -> list[list[_BoardInScene]]:
     """Return the boards of the group in every image of every camera."""
     names = {b.board_id for b in members}
-    scenes: dict[tuple[int, str], list[_BoardSeen]] = {}
+    scenes: dict[tuple[int, str], list[_BoardInScene]] = {}
     for c, own in enumerate(seen):
         for key, entry in own.items():
             if entry.board_id in names:
-                labels = tuple(_labels(entry, members))
+                labels = tuple(_possible_labels(entry, members))
                 distance = float(np.linalg.norm(labels[0].corners.mean(axis=0)))
-                scenes.setdefault((c, entry.frame), []).append(_BoardSeen(c, key, labels, distance))
+                scenes.setdefault((c, entry.frame), []).append(_BoardInScene(c, key, labels, distance))
     return list(scenes.values())
 
 
-def _labels(entry: Observation, members: Sequence[Board]) -> list[_Label]:
+def _possible_labels(entry: Observation, members: Sequence[Board]) -> list[_LabelledBoard]:
     """Return all possible labels of a board, the given one first."""
     own = entry.view.board
     found = []
@@ -152,7 +152,7 @@ def _labels(entry: Observation, members: Sequence[Board]) -> list[_Label]:
         turns = [*(symmetry_turns(own) if straight else ()), *((1, 3) if across and own.columns != own.rows else ())]
         for count in turns:
             seen = entry.turned(count, board)
-            found.append(_Label(seen, seen.cam_from_board.apply(outer_corners(board))))
+            found.append(_LabelledBoard(seen, seen.cam_from_board.apply(outer_corners(board))))
     return found
 
 
@@ -161,7 +161,7 @@ Labelling = dict[int, Observation]
 
 
 def _best_reference(
-    scenes: Sequence[list[_BoardSeen]], members: Sequence[Board]
+    scenes: Sequence[list[_BoardInScene]], members: Sequence[Board]
 ) -> tuple[dict[str, Rigid3], list[Labelling | None]] | None:
     """Return target_from_board of every board found, in the frame of the reference, and the reading of every scene;
     None if no scene has two boards."""
@@ -175,7 +175,7 @@ def _best_reference(
 
 
 def _labelled_from(
-    reference: list[_BoardSeen], scenes: Sequence[list[_BoardSeen]], members: Sequence[Board]
+    reference: list[_BoardInScene], scenes: Sequence[list[_BoardInScene]], members: Sequence[Board]
 ) -> tuple[dict[str, Rigid3], list[Labelling | None], float]:
     """Return the boards' poses on the target, the readings of all scenes with one of them as the reference, and the
     median misfit, as a part of the distance."""
@@ -205,7 +205,7 @@ def _labelled_from(
 
 
 def _labelled(
-    scene: list[_BoardSeen], known: dict[str, Rigid3], far: Mapping[str, FloatArray]
+    scene: list[_BoardInScene], known: dict[str, Rigid3], far: Mapping[str, FloatArray]
 ) -> tuple[Labelling | None, float]:
     """Return the reading of a scene, None if it is ambiguous, and its misfit. Boards that are not in `known` are added
     to it if the others determine the target's pose."""

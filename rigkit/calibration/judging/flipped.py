@@ -46,7 +46,7 @@ MIN_FIRST_GAIN = 0.1
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Back:
+class _FlippedBack:
     """Observations with the images of the views `at` (V,) flipped back in one `way`, their solution, and its sum of
     squares."""
 
@@ -104,27 +104,29 @@ def _initial_flips(
         yield at, turns
 
 
-def _alternated(way: str, at: BoolArray, turns: IntArray, observations: Observations, fit: Fit, before: float) -> _Back:
+def _alternated(
+    way: str, at: BoolArray, turns: IntArray, observations: Observations, fit: Fit, before: float
+) -> _FlippedBack:
     """Return the solution from a first guess of which views are flipped, by alternating solution and test. A guess that
     explains nothing of the sum of squares `before` is not improved: as many views are wrong in it as right."""
-    begun, state = _flipped(way, at, turns, observations, fit.state)
-    state, _ = refine_poses(begun, state, fit.weight(observations), tolerance=START_TOLERANCE)
+    start, state = _flipped(way, at, turns, observations, fit.state)
+    state, _ = refine_poses(start, state, fit.weight(observations), tolerance=START_TOLERANCE)
     for _ in range(ROUNDS):
-        found = _solved(way, at, begun, state, fit)
+        found = _solved(way, at, start, state, fit)
         if found.squares >= before:
             break
         wrong, _, turns = _fitting_better_flipped(way, found.observations, found.state, fit)
         at = at ^ wrong
         if not wrong.any() or at.all() or not at.any():
             break
-        begun, state = _flipped(way, wrong, turns, found.observations, found.state)
+        start, state = _flipped(way, wrong, turns, found.observations, found.state)
     return found
 
 
-def _solved(way: str, at: BoolArray, observations: Observations, state: State, fit: Fit) -> _Back:
+def _solved(way: str, at: BoolArray, observations: Observations, state: State, fit: Fit) -> _FlippedBack:
     weight = fit.weight(observations)
     state = solve(observations, state, weight=weight, prior_sigma_px=fit.sigma_px, cost_tolerance=TOLERANCE).state
-    return _Back(way, at, observations, state, float(weighted_squares(state, observations, weight).sum()))
+    return _FlippedBack(way, at, observations, state, float(weighted_squares(state, observations, weight).sum()))
 
 
 def _fitting_better_flipped(
@@ -161,7 +163,7 @@ def _flipped(
     return with_boards_renumbered(out, state, at & (turns == 2), 2)
 
 
-def _finding_of(back: _Back, before: float, evidence: ViewEvidence) -> Finding | None:
+def _finding_of(back: _FlippedBack, before: float, evidence: ViewEvidence) -> Finding | None:
     """Return the finding, if flipping images back explains the residuals and no shift between images is left."""
     at, changes = back.at, evidence.changes()
     left, part = max(back.squares / before, np.finfo(float).eps), float(at.mean())
