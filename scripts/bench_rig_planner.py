@@ -24,7 +24,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.planning.candidates import Reach
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.validation.sentinel.evidence import Monitored
+from rigkit.validation.monitoring.evidence import Monitored
 from rigkit.workflows.calibration.next_pictures import next_frames
 
 NAMES = ("left", "right")

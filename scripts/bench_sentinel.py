@@ -1,4 +1,4 @@
-"""Measure the power and the false alarms of the sentinel, and whether it names the right change.
+"""Measure the power and the false alarms of `rigkit check`, and whether it names the right change.
 
 lens, rig: simulated corners. Cameras are calibrated from planned views and checked with three new ones, held by hand
 where `rigkit plan --check` asks ("advised"); lenses also with three as people take them ("free"). Changes are 0.15 px
@@ -62,12 +62,12 @@ from rigkit.planning.plan import plan_views
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.validation.sentinel.change_aim import informative_views
-from rigkit.validation.sentinel.epipolar import check_matches, matches_of_scenes
-from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_of
-from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck, check_views
-from rigkit.validation.sentinel.watch import monitored_camera, monitored_rig
-from rigkit.validation.sentinel.whitened import Whitened
+from rigkit.validation.monitoring.change_aim import informative_views
+from rigkit.validation.monitoring.epipolar import check_matches, matches_of_scenes
+from rigkit.validation.monitoring.evidence import FreshView, Monitored, evidence_of
+from rigkit.validation.monitoring.judge import ALARM_CHANCE, CalibrationCheck, check_views
+from rigkit.validation.monitoring.watch import monitored_camera, monitored_rig
+from rigkit.validation.monitoring.whitened import Whitened
 
 BOARD = bench_planner.BOARD
 """Another by `--board`."""
@@ -163,7 +163,7 @@ def known_of(lens: Lens, views: Sequence[BoardView]) -> Calibration:
 def one_camera(name: str, seeds: int, noise_px: float) -> None:
     lens = LENSES[name]
     for how in ("advised", "free"):
-        found: dict[str, list[SentinelCheck]] = {what: [] for what in ("nothing", *KINDS)}
+        found: dict[str, list[CalibrationCheck]] = {what: [] for what in ("nothing", *KINDS)}
         most: dict[str, list[float]] = {what: [] for what in KINDS}
         for seed in range(seeds):
             rng = np.random.default_rng([seed, 11])
@@ -194,7 +194,7 @@ def with_model_inadequacy(name: str, seeds: int, noise_px: float) -> None:
     from helpers.calibration_scenes import REACH_DEG, random_views
     from helpers.calibration_scenes import lens as scene_lens
 
-    found: dict[tuple[str, bool], list[SentinelCheck]] = {}
+    found: dict[tuple[str, bool], list[CalibrationCheck]] = {}
     for seed in range(seeds):
         rng = np.random.default_rng([seed, 5])
         amounts = DEPARTS_PX * rng.normal(size=DISPLACEMENTS)
@@ -241,7 +241,7 @@ def stereo(seeds: int, noise_px: float, name: str) -> None:
     """A rig of two: mounts that turn or stretch, and one camera that changes."""
     lens = LENSES[name]
     camera = lens.camera
-    found: dict[str, list[SentinelCheck]] = {what: [] for what in ("nothing", "rotation", "scale", "focus")}
+    found: dict[str, list[CalibrationCheck]] = {what: [] for what in ("nothing", "rotation", "scale", "focus")}
     for seed in range(seeds):
         rng = np.random.default_rng([seed, 13])
 
@@ -326,7 +326,7 @@ def scene(seeds: int, noise_px: float, name: str) -> None:
 
     lens = LENSES[name]
     camera = lens.camera
-    found: dict[str, list[SentinelCheck]] = {"nothing": [], "rotation": []}
+    found: dict[str, list[CalibrationCheck]] = {"nothing": [], "rotation": []}
     for seed in range(seeds):
         rng = np.random.default_rng([seed, 19])
         views = []

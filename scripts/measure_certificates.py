@@ -48,8 +48,8 @@ from rigkit.synthetic.scene import place_board
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.propagation import gradients, measured_points, variances
 from rigkit.validation.certificate.result import instrument_of
-from rigkit.validation.sentinel.evidence import Monitored
-from rigkit.validation.sentinel.watch import monitored_camera, monitored_rig
+from rigkit.validation.monitoring.evidence import Monitored
+from rigkit.validation.monitoring.watch import monitored_camera, monitored_rig
 
 SIZE_PX = (1280, 960)
 BOARD = Board("board", 9, 6, 40.0, 40.0)

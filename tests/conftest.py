@@ -87,7 +87,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def calibration() -> Calibration:
     """The calibration of the lens "reg" from 14 views of boards (SIMULATED)."""
-    from helpers.sentinel_scenes import calibrated_lens
+    from helpers.monitoring_scenes import calibrated_lens
 
     return calibrated_lens()
 
@@ -108,4 +108,4 @@ def fewer_poses(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
     if request.path.is_relative_to(ROOT) and request.path.relative_to(ROOT).parts[1] in PLANNED_BESIDES:
         monkeypatch.setattr("rigkit.planning.candidates.CANDIDATES_DRAWN", 800)
         monkeypatch.setattr("rigkit.planning.candidates.CANDIDATES_KEPT", 300)
-        monkeypatch.setattr("rigkit.validation.sentinel.frames.CANDIDATES_KEPT", 300)
+        monkeypatch.setattr("rigkit.validation.monitoring.frames.CANDIDATES_KEPT", 300)

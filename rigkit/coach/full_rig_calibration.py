@@ -26,9 +26,9 @@ from rigkit.planning.goal import RemainingError, Requirement, projection_goal
 from rigkit.planning.instructions import placement
 from rigkit.planning.plan import Plan, covariance_of
 from rigkit.planning.rig_goal import rig_goal
-from rigkit.validation.sentinel.evidence import Monitored, board_information
-from rigkit.validation.sentinel.frames import Frames
-from rigkit.validation.sentinel.watch import monitored_rig
+from rigkit.validation.monitoring.evidence import Monitored, board_information
+from rigkit.validation.monitoring.frames import Frames
+from rigkit.validation.monitoring.watch import monitored_rig
 
 Views = Sequence[BoardView | None]
 """What the cameras saw at one moment, one entry per camera."""

@@ -1,4 +1,4 @@
-"""The sentinel on real captures, and on real pairs of textured scenes: see `bench_sentinel.py`."""
+"""`rigkit check` on real captures, and on real pairs of textured scenes: see `bench_sentinel.py`."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.planning.goal import projection_goal
-from rigkit.validation.sentinel.hypotheses import hypotheses_of
-from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, SentinelCheck
-from rigkit.validation.sentinel.watch import monitored_camera
+from rigkit.validation.monitoring.hypotheses import hypotheses_of
+from rigkit.validation.monitoring.judge import ALARM_CHANCE, ALARM_PX, CalibrationCheck
+from rigkit.validation.monitoring.watch import monitored_camera
 from sentinel.tally import CHANGED_PX, FRESH, KINDS, checked, tell, unchanged
 
 
@@ -80,7 +80,7 @@ def touched(full: Calibration, what: str, rng: np.random.Generator) -> Camera:
     return full.camera.with_parameters(full.camera.parameters + step * CHANGED_PX / np.sqrt(step @ weight @ step))
 
 
-UNCHANGED: dict[str, list[SentinelCheck]] = {}
+UNCHANGED: dict[str, list[CalibrationCheck]] = {}
 SAID: list[float] = []
 """Checks of unchanged cameras by set, and the chances with which changes were said to be found."""
 MAX_FLAGGED = 0.02

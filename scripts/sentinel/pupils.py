@@ -1,4 +1,4 @@
-"""The sentinel on simulated lenses whose entrance pupils move: see `bench_sentinel.py`."""
+"""`rigkit check` on simulated lenses whose entrance pupils move: see `bench_sentinel.py`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.goal import projection_goal
-from rigkit.validation.sentinel.judge import SentinelCheck
+from rigkit.validation.monitoring.judge import CalibrationCheck
 from sentinel.tally import CHANGED_PX, FRESH, checked, tell
 
 PUPIL, REACH_DEG = (3.0, -0.3), 80.0
@@ -18,7 +18,7 @@ PUPIL, REACH_DEG = (3.0, -0.3), 80.0
 
 def pupils(seeds: int) -> None:
     """Cameras unchanged, and with a focal length that changed so far that 0.15 px rms are left after the best turn."""
-    found: dict[str, list[SentinelCheck]] = {"nothing": [], "focus": []}
+    found: dict[str, list[CalibrationCheck]] = {"nothing": [], "focus": []}
     step = np.where(np.arange(TRUTH.parameters.size) < 2, TRUTH.parameters, 0.0)
     step *= CHANGED_PX / np.sqrt(step @ projection_goal(TRUTH).weight @ step)
     for seed in range(seeds):

@@ -1,4 +1,4 @@
-"""The sentinel on real pairs of textured scenes, without boards: see `bench_sentinel.py`."""
+"""`rigkit check` on real pairs of textured scenes, without boards: see `bench_sentinel.py`."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from rigkit.io.media.images import read_image
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import covariance_of, plan_views
-from rigkit.validation.sentinel.baseline import check_since
-from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, evidence_of_matches, scene_matches
-from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_of
-from rigkit.validation.sentinel.judge import SentinelCheck
+from rigkit.validation.monitoring.baseline import check_since
+from rigkit.validation.monitoring.epipolar import PairMatches, check_matches, evidence_of_matches, scene_matches
+from rigkit.validation.monitoring.evidence import FreshView, Monitored, evidence_of
+from rigkit.validation.monitoring.judge import CalibrationCheck
 from sentinel.tally import SCENE_TURNED_DEG, tell, turned
 
 BOARD = Board("b", 9, 6, 25.0, 25.0)
@@ -47,8 +47,8 @@ class ScenePair:
 def pairs(data: Path, seeds: int) -> None:
     """Real pairs: the pose as published, and as if the mount had turned since. Where there are several pairs of one
     rig, they are also checked for what moved since all others: published calibrations are not exact."""
-    found: dict[str, list[SentinelCheck]] = {"nothing": [], "rotation": []}
-    since: dict[str, list[SentinelCheck]] = {"nothing": [], "rotation": []}
+    found: dict[str, list[CalibrationCheck]] = {"nothing": [], "rotation": []}
+    since: dict[str, list[CalibrationCheck]] = {"nothing": [], "rotation": []}
     every = [_pair(entry, data) for entry in json.loads((data / "scenes/pairs.json").read_text())]
     for pair in every:
         _check(pair, [], seeds, found)
@@ -109,7 +109,9 @@ def _covariance_from_boards(rig: Monitored) -> FloatArray:
     return covariance_of(information / BOARD_SIGMA_PX**2)
 
 
-def _check(pair: ScenePair, before: Sequence[PairMatches], seeds: int, found: dict[str, list[SentinelCheck]]) -> None:
+def _check(
+    pair: ScenePair, before: Sequence[PairMatches], seeds: int, found: dict[str, list[CalibrationCheck]]
+) -> None:
     check = _judged(pair.rig, before, pair.matches)
     found["nothing"].append(check)
     message = f"{check.rms_px:.3f} px ({check.expected_px:.3f}), chance {check.chance:.2g}, {check.change}"
@@ -122,7 +124,7 @@ def _check(pair: ScenePair, before: Sequence[PairMatches], seeds: int, found: di
         found["rotation"].append(_judged(pair.rig, before, moved))
 
 
-def _judged(rig: Monitored, before: Sequence[PairMatches], now: PairMatches) -> SentinelCheck:
+def _judged(rig: Monitored, before: Sequence[PairMatches], now: PairMatches) -> CalibrationCheck:
     if not before:
         return check_matches(rig, [now])
     return check_since(

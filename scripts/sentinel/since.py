@@ -1,4 +1,4 @@
-"""The sentinel on real boards since pictures of before (`rigkit check --before`): see `bench_sentinel.py`."""
+"""`rigkit check` on real boards since pictures of before (`rigkit check --before`): see `bench_sentinel.py`."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.core.identifiers import last_number
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.validation.sentinel.baseline import check_since
-from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_of
-from rigkit.validation.sentinel.flipped import consistently_numbered
-from rigkit.validation.sentinel.judge import SentinelCheck
-from rigkit.validation.sentinel.watch import monitored_camera, monitored_rig
+from rigkit.validation.monitoring.baseline import check_since
+from rigkit.validation.monitoring.evidence import FreshView, Monitored, evidence_of
+from rigkit.validation.monitoring.flipped import consistently_numbered
+from rigkit.validation.monitoring.judge import CalibrationCheck
+from rigkit.validation.monitoring.watch import monitored_camera, monitored_rig
 from sentinel.tally import FRESH, tell, turned
 
 RIGS = ("bouguet", "bumblebee", "charuco-stereo")
@@ -34,7 +34,7 @@ DRAWS = 5
 def since_cameras(name: str, data: Path, cache: Path, splits: int) -> None:
     """Check pictures of cameras that did not change since others, neither of which the calibration has."""
     found, size = load(name, data, cache)
-    images, checks, rng = list(found.values()), list[SentinelCheck](), np.random.default_rng(31)
+    images, checks, rng = list(found.values()), list[CalibrationCheck](), np.random.default_rng(31)
     model = calibrate([v for own in images for v in own], size).camera.model
     for _ in range(splits):
         order = rng.permutation(len(images))
@@ -48,7 +48,7 @@ def since_cameras(name: str, data: Path, cache: Path, splits: int) -> None:
 def since_rigs(name: str, data: Path, cache: Path, splits: int) -> None:
     """The same of rigs, and with a mount that turned since."""
     rng = np.random.default_rng(37)
-    found: dict[float, list[SentinelCheck]] = {degrees: [] for degrees in (0.0, *TURNED_DEG)}
+    found: dict[float, list[CalibrationCheck]] = {degrees: [] for degrees in (0.0, *TURNED_DEG)}
     loaded = {side: load(f"{name}-{side}", data, cache) for side in ("left", "right")}
     by_frame = {
         side: {last_number(Path(image).stem): views for image, views in own.items()}
@@ -84,7 +84,7 @@ def _draws(
     name: str,
     monitored: Monitored,
     frames: Sequence[Sequence[FreshView]],
-    checks: list[SentinelCheck],
+    checks: list[CalibrationCheck],
     rng: np.random.Generator,
     degrees: float = 0.0,
 ) -> None:

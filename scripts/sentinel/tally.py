@@ -1,4 +1,4 @@
-"""Shared by the sentinel's benchmarks: changes, checks without a change, and counts of alarms."""
+"""Shared by the benchmarks of `rigkit check`: changes, checks without a change, and counts of alarms."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
-from rigkit.validation.sentinel.evidence import FreshView
-from rigkit.validation.sentinel.judge import SentinelCheck, check_views
-from rigkit.validation.sentinel.watch import monitored_camera
+from rigkit.validation.monitoring.evidence import FreshView
+from rigkit.validation.monitoring.judge import CalibrationCheck, check_views
+from rigkit.validation.monitoring.watch import monitored_camera
 
 CHANGED_PX, SCENE_TURNED_DEG = 0.15, 0.05
 FRESH = 3
@@ -25,7 +25,7 @@ COUNTED = {"beyond_model": True}
 """Whether what lenses may do beyond their models is counted in."""
 
 
-def tell(title: str, checks: Sequence[SentinelCheck], what: str, how: str = "") -> None:
+def tell(title: str, checks: Sequence[CalibrationCheck], what: str, how: str = "") -> None:
     """Print how many of the checks alarm, and how many of these name `what` happened; keep the sums, by `how` pictures
     were taken."""
     alarms = [c for c in checks if not c.holds]
@@ -40,7 +40,7 @@ def tell(title: str, checks: Sequence[SentinelCheck], what: str, how: str = "") 
         sums[k] += more
 
 
-def checked(known: Calibration, views: Sequence[BoardView]) -> SentinelCheck:
+def checked(known: Calibration, views: Sequence[BoardView]) -> CalibrationCheck:
     monitored = monitored_camera(known, "camera", **COUNTED)
     return check_views(monitored, [FreshView(v.image, 0, v) for v in views])
 
@@ -50,10 +50,10 @@ def unchanged(
     images: Sequence[Sequence[BoardView]],
     draws: int,
     solve: Callable[[list[BoardView]], Calibration],
-) -> list[SentinelCheck]:
+) -> list[CalibrationCheck]:
     """Check images of a camera that did not change, three, halves, and these in threes, against calibrations from the
     others; return the checks."""
-    every: list[SentinelCheck] = []
+    every: list[CalibrationCheck] = []
     for fresh in (FRESH, len(images) // 2):
         rng, checks, threes = np.random.default_rng([fresh, 3]), [], []
         for _ in range(draws):

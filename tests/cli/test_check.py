@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.calibration_scenes import noisy_view
-from helpers.sentinel_scenes import best_held, known_rig
+from helpers.monitoring_scenes import best_held, known_rig
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.cameras.base import Camera
@@ -33,9 +33,9 @@ from rigkit.report.pages.check_page import _power_words
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.validation.sentinel.hypotheses import hypotheses_of
-from rigkit.validation.sentinel.judge import Change, SentinelCheck
-from rigkit.validation.sentinel.power import Power
+from rigkit.validation.monitoring.hypotheses import hypotheses_of
+from rigkit.validation.monitoring.judge import CalibrationCheck, Change
+from rigkit.validation.monitoring.power import Power
 from rigkit.workflows.checks.check import _replaced_by_known, _require_right_order, check_pictures
 from rigkit.workflows.options.check import CheckOptions
 
@@ -109,7 +109,7 @@ def test_a_board_that_looks_the_same_turned_is_counted_alike_by_two_cameras(
     def no_pose(*_: object) -> None:
         raise DegenerateError("no pose")
 
-    monkeypatch.setattr("rigkit.validation.sentinel.flipped.cam_from_seen_board", no_pose)
+    monkeypatch.setattr("rigkit.validation.monitoring.flipped.cam_from_seen_board", no_pose)
     turned = check_pictures(tmp_path / "rig.json", pictures, CheckOptions(boards=(board,))).check
     assert turned.unexplained and turned.rms_px > 10.0
 
@@ -125,7 +125,7 @@ def test_images_of_a_rig_that_are_exchanged_are_no_change_of_it(tmp_path: Path) 
 
 
 def test_images_are_exchanged_where_the_other_order_holds_or_explains_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*_: object) -> SentinelCheck:
+    def refused(*_: object) -> CalibrationCheck:
         raise DegenerateError("no camera sees enough")
 
     rig = known_rig(Rigid3(np.eye(3), [-120.0, 0.0, 0.0]), [1.0] * 8, 1e-3, 100.0)
@@ -138,7 +138,7 @@ def test_images_are_exchanged_where_the_other_order_holds_or_explains_more(monke
         max_px=5.0,
         gain=9.0,
     )
-    moved = SentinelCheck(
+    moved = CalibrationCheck(
         chance=0.0,
         change=turn,
         monitored=rig,

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.coach_scenes import BOARD, CAMERA, SIZE, ask, options, picture
-from helpers.sentinel_scenes import best_held
+from helpers.monitoring_scenes import best_held
 
 from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.cameras.compare import compare_cameras

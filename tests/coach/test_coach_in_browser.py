@@ -13,7 +13,7 @@ import pytest
 from helpers.browser import chromium
 from helpers.coach_scenes import BOARD, CAMERA, SIZE, picture, shared_boards
 from helpers.driven import DrivenPage
-from helpers.sentinel_scenes import best_held
+from helpers.monitoring_scenes import best_held
 
 from rigkit.cameras.compare import compare_cameras
 from rigkit.coach.look import observe_frame

@@ -23,10 +23,10 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibrations.rig_file import load_saved_rig, rig_text
 from rigkit.validation.certificate.propagation import measured_points
-from rigkit.validation.sentinel.change_aim import informative_views
-from rigkit.validation.sentinel.evidence import FreshView
-from rigkit.validation.sentinel.judge import check_views
-from rigkit.validation.sentinel.watch import monitored_rig
+from rigkit.validation.monitoring.change_aim import informative_views
+from rigkit.validation.monitoring.evidence import FreshView
+from rigkit.validation.monitoring.judge import check_views
+from rigkit.validation.monitoring.watch import monitored_rig
 from rigkit.workflows.calibration.next_pictures import next_frames
 from rigkit.workflows.checks.certify import certify_file
 from rigkit.workflows.checks.check import load_monitored

@@ -17,7 +17,7 @@ from rigkit.core.printing import brief
 from rigkit.io.disk.json_reader import integer, parse_json, real
 from rigkit.io.disk.reading import MAX_NUMBER, read_text
 from rigkit.io.disk.writing import ensure_writable
-from rigkit.validation.sentinel.judge import SentinelCheck
+from rigkit.validation.monitoring.judge import CalibrationCheck
 
 HISTORY_SCHEMA = "rigkit.history/1"
 ABSOLUTE_ZERO_C = -273.15
@@ -77,7 +77,7 @@ class HistoryEntry:
     @classmethod
     def of_check(
         cls,
-        check: SentinelCheck,
+        check: CalibrationCheck,
         source: Path,
         *,
         reference: Path | None = None,
@@ -118,7 +118,7 @@ class HistoryEntry:
         )
 
 
-def _verdict(check: SentinelCheck) -> str:
+def _verdict(check: CalibrationCheck) -> str:
     if check.holds:
         return "holds"
     if check.flipped:

@@ -17,8 +17,8 @@ from rigkit.planning.goal import px_words
 from rigkit.report import svg
 from rigkit.report.pages.page_facts import PageFacts, build_facts_page
 from rigkit.report.svg import DRAWN_WIDTH, INK
-from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, Baseline, Change, SentinelCheck
-from rigkit.validation.sentinel.power import FOUND, TIMES, Power
+from rigkit.validation.monitoring.judge import ALARM_CHANCE, ALARM_PX, Baseline, CalibrationCheck, Change
+from rigkit.validation.monitoring.power import FOUND, TIMES, Power
 
 ARROWS = (21, 16)
 ARROW_LENGTH = 0.05
@@ -29,7 +29,7 @@ PART_OF = {"focus": "lens", "principal point": "lens", "distortion": "lens", "ro
 """Kinds of changes that are parts of a combined kind."""
 
 
-def check_facts(check: SentinelCheck) -> PageFacts:
+def check_facts(check: CalibrationCheck) -> PageFacts:
     """Return the facts of a check."""
     frames = counted(check.frames, "new frame")
     p = f"p = {check.chance:.3g}"
@@ -104,7 +104,7 @@ def _since_words(then: Baseline | None) -> list[str]:
     return said
 
 
-def _cost_words(check: SentinelCheck, change: Change) -> str:
+def _cost_words(check: CalibrationCheck, change: Change) -> str:
     """Return the cost of a change in words: in the measured length, or in the projection."""
     if check.cost_unit != "px":
         return f"an error of {check.cost:.2g} {check.cost_unit} rms in the length"
@@ -112,7 +112,7 @@ def _cost_words(check: SentinelCheck, change: Change) -> str:
     return px_words(check.monitored.cameras[c], change.size_px)
 
 
-def _nearest_words(check: SentinelCheck, change: Change) -> str:
+def _nearest_words(check: CalibrationCheck, change: Change) -> str:
     """Return the single change that explains most of a combined change, in words; "" for other changes."""
     simpler = [
         c
@@ -168,7 +168,7 @@ def power_table(powers: Sequence[Power], title: str = "Detectable changes") -> T
     return Table("powers", title, heads, rows or (none,))
 
 
-def check_table(check: SentinelCheck) -> Table:
+def check_table(check: CalibrationCheck) -> Table:
     """Return the table of possible changes, each as if it alone had happened."""
     rows = []
     for change in check.tried:
@@ -180,7 +180,7 @@ def check_table(check: SentinelCheck) -> Table:
     return Table("causes", "Possible changes", heads, tuple(rows) or (none,))
 
 
-def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
+def check_to_dict(check: CalibrationCheck) -> dict[str, Any]:
     """Return the check as JSON values."""
     change, facts = check.change, check_facts(check)
     return {
@@ -200,7 +200,7 @@ def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
     }
 
 
-def check_page(check: SentinelCheck, title: str, provenance: Mapping[str, str]) -> str:
+def check_page(check: CalibrationCheck, title: str, provenance: Mapping[str, str]) -> str:
     """Return the check as self-contained HTML."""
     chance = check.holds and check.chance >= ALARM_CHANCE
     moves = "not significant; magnified" if chance else "image displacement by the best explanation"
@@ -212,7 +212,7 @@ def check_page(check: SentinelCheck, title: str, provenance: Mapping[str, str]) 
     )
 
 
-def change_svg(check: SentinelCheck, c: int) -> str:
+def change_svg(check: CalibrationCheck, c: int) -> str:
     """Draw how the most likely change moves the projection of fixed points in camera `c`, magnified."""
     before, after = far_camera(check.monitored.cameras[c]), far_camera(check.fixed.cameras[c])
     turn = check.fixed.cam_from_rig[c].rotation @ check.monitored.cam_from_rig[c].rotation.T

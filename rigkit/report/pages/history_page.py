@@ -13,8 +13,8 @@ from rigkit.io.calibrations.history_file import Edition, HistoryEntry, editions
 from rigkit.report import svg
 from rigkit.report.pages.page_facts import PageFacts, build_facts_page
 from rigkit.report.svg import DRAWN_WIDTH, INK, SOFT, WRONG
-from rigkit.validation.sentinel.drift import HeatDrift, heat_drift
-from rigkit.validation.sentinel.judge import ALARM_CHANCE
+from rigkit.validation.monitoring.drift import HeatDrift, heat_drift
+from rigkit.validation.monitoring.judge import ALARM_CHANCE
 
 DRIFT_HEIGHT, LEFT_MARGIN = 190.0, 56.0
 ZERO_HEIGHT = 0.5 * (DRIFT_HEIGHT - 24.0)

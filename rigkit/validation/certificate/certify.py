@@ -29,7 +29,7 @@ from rigkit.validation.certificate.propagation import (
     variances,
 )
 from rigkit.validation.certificate.result import Certificate
-from rigkit.validation.sentinel.evidence import Monitored
+from rigkit.validation.monitoring.evidence import Monitored
 
 MAP_CELLS = (33, 25)
 """Columns and rows of the grid on which the bound is evaluated."""

@@ -33,7 +33,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays, scaled_pinv
 from rigkit.core.errors import DegenerateError
 from rigkit.core.measurement_task import Quantity, Task
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.validation.sentinel.evidence import Monitored
+from rigkit.validation.monitoring.evidence import Monitored
 
 PLANE_POINTS = 5
 """Points along each side of a measured plane."""

@@ -14,7 +14,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.core.measurement_task import Task
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.validation.sentinel.evidence import Monitored
+from rigkit.validation.monitoring.evidence import Monitored
 
 
 def instrument_of(known: Monitored, pair: tuple[str, str] | None = None) -> Monitored:

@@ -21,8 +21,8 @@ from rigkit.planning.information import Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.planning.rig_goal import rig_goal
 from rigkit.validation.certificate.propagation import gradients, measured_points
-from rigkit.validation.sentinel.evidence import Monitored
-from rigkit.validation.sentinel.frames import Frames
+from rigkit.validation.monitoring.evidence import Monitored
+from rigkit.validation.monitoring.frames import Frames
 
 NEXT_VIEWS = 3
 TASK_CELLS = (13, 10)

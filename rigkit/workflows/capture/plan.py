@@ -26,9 +26,9 @@ from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.report.pages.check_page import power_table
 from rigkit.report.pages.plan_page import plan_page
-from rigkit.validation.sentinel.change_aim import informative_views
-from rigkit.validation.sentinel.evidence import Monitored
-from rigkit.validation.sentinel.watch import monitored_camera
+from rigkit.validation.monitoring.change_aim import informative_views
+from rigkit.validation.monitoring.evidence import Monitored
+from rigkit.validation.monitoring.watch import monitored_camera
 from rigkit.workflows.calibration.calibrate import calibrate_session, session_inputs
 from rigkit.workflows.calibration.next_pictures import NEXT_VIEWS, goal_of, next_frames, next_views
 from rigkit.workflows.checks.check import load_monitored

@@ -19,7 +19,7 @@ from rigkit.report.pages.certificate_page import certificate_facts, certificate_
 from rigkit.report.pages.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.result import Certificate, instrument_of
-from rigkit.validation.sentinel.evidence import Monitored
+from rigkit.validation.monitoring.evidence import Monitored
 from rigkit.workflows.checks.check import load_monitored
 from rigkit.workflows.inputs.camera_files import bad_verdict_in_file
 from rigkit.workflows.options.cameras import CertifyOptions

@@ -41,12 +41,12 @@ from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.media.images import read_image_of
 from rigkit.report.pages.check_page import check_facts, check_page
 from rigkit.report.pages.page_facts import PageFacts
-from rigkit.validation.sentinel.baseline import check_since
-from rigkit.validation.sentinel.epipolar import evidence_of_matches, matches_of_scenes
-from rigkit.validation.sentinel.evidence import SAME_BOARD, FreshView, Monitored, evidence_of
-from rigkit.validation.sentinel.flipped import consistently_numbered, flipped_pictures
-from rigkit.validation.sentinel.judge import Look, SentinelCheck, check_views, evaluate_evidence
-from rigkit.validation.sentinel.watch import monitored_camera, monitored_rig
+from rigkit.validation.monitoring.baseline import check_since
+from rigkit.validation.monitoring.epipolar import evidence_of_matches, matches_of_scenes
+from rigkit.validation.monitoring.evidence import SAME_BOARD, FreshView, Monitored, evidence_of
+from rigkit.validation.monitoring.flipped import consistently_numbered, flipped_pictures
+from rigkit.validation.monitoring.judge import CalibrationCheck, Look, check_views, evaluate_evidence
+from rigkit.validation.monitoring.watch import monitored_camera, monitored_rig
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad
 from rigkit.workflows.inputs.identify_board import why_not_detected
@@ -63,7 +63,7 @@ class CheckedPictures:
     """The verdict, the contents of its page, images without a board with the reason, unusable images (truncated, of
     another size), and the files that were written."""
 
-    check: SentinelCheck
+    check: CalibrationCheck
     facts: PageFacts
     left_out: tuple[tuple[str, str], ...]
     unreadable: tuple[str, ...]
@@ -123,7 +123,7 @@ def check_pictures(
     )
 
 
-def _files(source: Path, check: SentinelCheck, options: CheckOptions) -> dict[Path, str | bytes]:
+def _files(source: Path, check: CalibrationCheck, options: CheckOptions) -> dict[Path, str | bytes]:
     """Return the contents of the files to write, by path: the corrected calibration, and the page."""
     files: dict[Path, str | bytes] = {}
     # No correction where it holds or where nothing explains the images; flipped images are themselves the error.
@@ -137,7 +137,7 @@ def _files(source: Path, check: SentinelCheck, options: CheckOptions) -> dict[Pa
 
 
 def _register(
-    register: Path, source: Path, check: SentinelCheck, before: Sequence[Sequence[Path]], temperature_c: float | None
+    register: Path, source: Path, check: CalibrationCheck, before: Sequence[Sequence[Path]], temperature_c: float | None
 ) -> None:
     # Only the digest, without the words on how it was computed.
     since = (digest_of_images([image for frame in before for image in frame]) or "").rpartition(": ")[2]
@@ -278,7 +278,7 @@ def _nothing_to_check(left_out: Sequence[tuple[str, str]], unreadable: Sequence[
     return f"no board was found in {where}{why}"
 
 
-def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> None:
+def _require_right_order(check: CalibrationCheck, views: Sequence[FreshView]) -> None:
     """Raise InputError where a rig's calibration holds for the images of two cameras exchanged, or a change explains
     them exchanged but not as given: with equal lenses, the cameras may have changed places instead."""
     names = check.monitored.names
@@ -298,7 +298,7 @@ def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> No
             )
 
 
-def fixed_text(source: Path, check: SentinelCheck) -> str:
+def fixed_text(source: Path, check: CalibrationCheck) -> str:
     """Return the text of the file `source` with the change that explains the images, and a finding that reports it."""
     data: dict[str, Any] = json.loads(source.read_text(encoding="utf-8"))
     monitored = load_monitored(source)[0]

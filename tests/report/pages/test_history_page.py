@@ -11,7 +11,7 @@ import pytest
 
 from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, editions
 from rigkit.report.pages.history_page import history_page
-from rigkit.validation.sentinel.drift import heat_drift
+from rigkit.validation.monitoring.drift import heat_drift
 from rigkit.workflows.checks.history import show_history
 
 

@@ -31,7 +31,7 @@ from rigkit.validation.certificate.propagation import (
     variances,
 )
 from rigkit.validation.certificate.result import Certificate, instrument_of
-from rigkit.validation.sentinel.evidence import Monitored
+from rigkit.validation.monitoring.evidence import Monitored
 
 TRIALS = 800
 COVERAGE = (0.93, 0.97)

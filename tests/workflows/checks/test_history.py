@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.calibration_scenes import lens
-from helpers.sentinel_scenes import checked
+from helpers.monitoring_scenes import checked
 
 from rigkit.calibration.result import Calibration
 from rigkit.core.errors import InputError

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, lens, noisy_view
-from helpers.sentinel_scenes import known_rig
+from helpers.monitoring_scenes import known_rig
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
@@ -21,12 +21,12 @@ from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import BoardPoses, CornerError, Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.report.pages.plan_page import plan_words
-from rigkit.validation.sentinel.change_aim import informative_views
-from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Monitored, board_information
-from rigkit.validation.sentinel.hypotheses import hypotheses_of
-from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck, check_views
-from rigkit.validation.sentinel.power import Power, powers_of
-from rigkit.validation.sentinel.watch import monitored_camera
+from rigkit.validation.monitoring.change_aim import informative_views
+from rigkit.validation.monitoring.evidence import FreshEvidence, FreshView, Monitored, board_information
+from rigkit.validation.monitoring.hypotheses import hypotheses_of
+from rigkit.validation.monitoring.judge import ALARM_CHANCE, CalibrationCheck, check_views
+from rigkit.validation.monitoring.power import Power, powers_of
+from rigkit.validation.monitoring.watch import monitored_camera
 
 NOISE_PX = 0.05
 FRESH = 3
@@ -49,7 +49,7 @@ def calibration() -> Calibration:
     return calibrate(views, camera.size_px, model=camera.model, board="flat", folds=0)
 
 
-def _checked(calibration: Calibration, plan: Plan, rng: np.random.Generator) -> SentinelCheck:
+def _checked(calibration: Calibration, plan: Plan, rng: np.random.Generator) -> CalibrationCheck:
     fresh = [FreshView(view.image, 0, view) for view in _views(plan, rng)]
     return check_views(monitored_camera(calibration, "cam"), fresh)
 

@@ -35,9 +35,9 @@ from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.planning.goal import Goal
 from rigkit.planning.information import MIN_SIGMA_PX
-from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
-from rigkit.validation.sentinel.judge import SentinelCheck, evaluate_evidence
-from rigkit.validation.sentinel.whitened import MIN_FREE_VARIANCE, disagreement
+from rigkit.validation.monitoring.evidence import FreshEvidence, Monitored
+from rigkit.validation.monitoring.judge import CalibrationCheck, evaluate_evidence
+from rigkit.validation.monitoring.whitened import MIN_FREE_VARIANCE, disagreement
 
 FEATURES = 2500
 MIN_FRAME_MATCHES = 40
@@ -117,7 +117,7 @@ def without_alignment_bias(monitored: Monitored, numbers: tuple[int, int], found
     return PairMatches(first, second, found.pixels1, pixels2)
 
 
-def check_matches(monitored: Monitored, matches: Sequence[PairMatches], cost: Sequence[Goal] = ()) -> SentinelCheck:
+def check_matches(monitored: Monitored, matches: Sequence[PairMatches], cost: Sequence[Goal] = ()) -> CalibrationCheck:
     """Return the verdict on matches of a rig's cameras; raises as `evidence_of_matches`."""
     return evaluate_evidence(monitored, lambda now: evidence_of_matches(now, matches), cost)
 

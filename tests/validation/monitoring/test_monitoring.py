@@ -1,4 +1,4 @@
-"""The sentinel: no false alarms, alarms after changes, and the right name of the change."""
+"""`rigkit check`: no false alarms, alarms after changes, and the right name of the change."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, lens, noisy_view, random_views
-from helpers.sentinel_scenes import NOISE_PX, best_held, changed_lens, checked, poses_held
+from helpers.monitoring_scenes import NOISE_PX, best_held, changed_lens, checked, poses_held
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.displaced import DisplacedCamera, lens_of
@@ -25,11 +25,11 @@ from rigkit.io.calibrations.history_file import load_history
 from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.planning.goal import projection_goal
 from rigkit.report.pages.check_page import check_facts, check_page
-from rigkit.validation.sentinel.evidence import FreshView, evidence_of
-from rigkit.validation.sentinel.judge import ALARM_CHANCE, check_views
-from rigkit.validation.sentinel.power import FOUND
-from rigkit.validation.sentinel.watch import monitored_camera
-from rigkit.validation.sentinel.whitened import Whitened
+from rigkit.validation.monitoring.evidence import FreshView, evidence_of
+from rigkit.validation.monitoring.judge import ALARM_CHANCE, check_views
+from rigkit.validation.monitoring.power import FOUND
+from rigkit.validation.monitoring.watch import monitored_camera
+from rigkit.validation.monitoring.whitened import Whitened
 from rigkit.workflows.checks.check import fixed_text
 from rigkit.workflows.checks.history import add_to_history
 

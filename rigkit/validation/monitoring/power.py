@@ -17,9 +17,9 @@ import numpy as np
 from scipy.special import chndtr, fdtri, gammaincinv
 
 from rigkit.core.arrays import FloatArray
-from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
-from rigkit.validation.sentinel.hypotheses import Hypothesis, lens_goals
-from rigkit.validation.sentinel.whitened import NULL_RANK, Whitened
+from rigkit.validation.monitoring.evidence import FreshEvidence, Monitored
+from rigkit.validation.monitoring.hypotheses import Hypothesis, lens_goals
+from rigkit.validation.monitoring.whitened import NULL_RANK, Whitened
 
 LENS_KINDS = ("focus", "principal point", "distortion")
 CHANGED_PX, TURNED_DEG = 0.15, 0.02

@@ -1,4 +1,4 @@
-"""The sentinel of rigs: changed mounts, from boards and from scenes without boards."""
+"""`rigkit check` of rigs: changed mounts, from boards and from scenes without boards."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.calibration_scenes import lens, noisy_view
-from helpers.sentinel_scenes import NOISE_PX, known_rig, poses_held, scene_pixels
+from helpers.monitoring_scenes import NOISE_PX, known_rig, poses_held, scene_pixels
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.refine_patches import HALF_WIDTH_OF_FEATURE, WINDOW_OF_PATCH
@@ -23,9 +23,14 @@ from rigkit.io.calibrations.history_file import HistoryEntry
 from rigkit.planning.candidates import Reach
 from rigkit.report.pages.check_page import check_facts
 from rigkit.validation.certificate.propagation import measured_points
-from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, evidence_of_matches, without_alignment_bias
-from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Monitored
-from rigkit.validation.sentinel.judge import ALARM_PX, SentinelCheck, check_views, evaluate_evidence
+from rigkit.validation.monitoring.epipolar import (
+    PairMatches,
+    check_matches,
+    evidence_of_matches,
+    without_alignment_bias,
+)
+from rigkit.validation.monitoring.evidence import FreshEvidence, FreshView, Monitored
+from rigkit.validation.monitoring.judge import ALARM_PX, CalibrationCheck, check_views, evaluate_evidence
 from rigkit.workflows.calibration.next_pictures import TASK_CELLS, length_goals
 
 MATCH_NOISE_PX, FINE_MATCH_NOISE_PX = 0.3, 0.07
@@ -51,7 +56,7 @@ DISTORTED = replace(
 NEAR = Reach(nearest_mm=300.0)
 
 
-def _rig_check(pose: Rigid3, second: Camera, rng: np.random.Generator) -> SentinelCheck:
+def _rig_check(pose: Rigid3, second: Camera, rng: np.random.Generator) -> CalibrationCheck:
     rig, views = _rig(), []
     for k, held in enumerate(poses_held("wide", 3, NEAR)):
         views.append(FreshView(f"{k}", 0, noisy_view(rig.cameras[0], held, f"{k}", rng, NOISE_PX)))

@@ -14,7 +14,7 @@ import numpy as np
 from rigkit.calibration.solving.clustered import effective_freedom
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError
-from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
+from rigkit.validation.monitoring.evidence import FreshEvidence, Monitored
 
 COMMON_FREEDOM = 10.0
 """Degrees of freedom of one overdispersion for all directions: lens and board deform more in some directions than in

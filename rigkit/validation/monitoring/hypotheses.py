@@ -14,7 +14,7 @@ from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rotation import skew
 from rigkit.planning.goal import GOAL_GRID, Goal, projection_goal
-from rigkit.validation.sentinel.evidence import Monitored
+from rigkit.validation.monitoring.evidence import Monitored
 
 FIELD_GRID = (24, 18)
 FIT_RANK = 1e-9

@@ -21,12 +21,12 @@ from rigkit.core.errors import InputError
 from rigkit.planning.candidates import Reach
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, choose_views, covariance_of
-from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
-from rigkit.validation.sentinel.frames import Frames
-from rigkit.validation.sentinel.hypotheses import Hypothesis, hypotheses_of, lens_goals, turn_weight
-from rigkit.validation.sentinel.judge import ALARM_CHANCE
-from rigkit.validation.sentinel.power import LENS_KINDS, Power, powers_of
-from rigkit.validation.sentinel.whitened import NULL_RANK
+from rigkit.validation.monitoring.evidence import FreshEvidence, Monitored
+from rigkit.validation.monitoring.frames import Frames
+from rigkit.validation.monitoring.hypotheses import Hypothesis, hypotheses_of, lens_goals, turn_weight
+from rigkit.validation.monitoring.judge import ALARM_CHANCE
+from rigkit.validation.monitoring.power import LENS_KINDS, Power, powers_of
+from rigkit.validation.monitoring.whitened import NULL_RANK
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -20,10 +20,10 @@ from rigkit.calibration.solving.clustered import LARGE_FREEDOM
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError
 from rigkit.planning.goal import Goal
-from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Monitored, evidence_of
-from rigkit.validation.sentinel.hypotheses import Hypothesis, hypotheses_of, lens_goals, turn_weight
-from rigkit.validation.sentinel.power import Power, powers_of
-from rigkit.validation.sentinel.whitened import NULL_RANK, Whitened
+from rigkit.validation.monitoring.evidence import FreshEvidence, FreshView, Monitored, evidence_of
+from rigkit.validation.monitoring.hypotheses import Hypothesis, hypotheses_of, lens_goals, turn_weight
+from rigkit.validation.monitoring.power import Power, powers_of
+from rigkit.validation.monitoring.whitened import NULL_RANK, Whitened
 
 Look: TypeAlias = Callable[[Monitored], FreshEvidence]
 """The evidence of fresh frames as a function of cameras and mounts."""
@@ -109,7 +109,7 @@ class Baseline:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class SentinelCheck:
+class CalibrationCheck:
     """The verdict on fresh images.
 
     Attributes
@@ -165,7 +165,7 @@ def exceeds_expected(rms_px: float, expected_px: float) -> bool:
     return not rms_px <= max(MAX_OF_EXPECTED * expected_px, ALARM_PX)
 
 
-def check_views(monitored: Monitored, views: Sequence[FreshView], cost: Sequence[Goal] = ()) -> SentinelCheck:
+def check_views(monitored: Monitored, views: Sequence[FreshView], cost: Sequence[Goal] = ()) -> CalibrationCheck:
     """Return whether fresh views of boards agree with the `monitored` calibration. `cost` are quadratic forms of a
     change of theta: its effect on measurements (the largest is stated), by default on the projection.
 
@@ -174,7 +174,7 @@ def check_views(monitored: Monitored, views: Sequence[FreshView], cost: Sequence
     return evaluate_evidence(monitored, lambda now: evidence_of(now, views), cost)
 
 
-def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
+def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = ()) -> CalibrationCheck:
     """Return the verdict on the evidence of fresh frames, `look`."""
     evidence = look(monitored)
     expected_px, known, chance = unchanged_px(monitored, evidence), list[Change](), 1.0
@@ -213,7 +213,7 @@ def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = (
     goals = cost or lens_goals(monitored)
     # Goals are of lenses and mounts, which come first.
     moved = step[: len(goals[0].weight)]
-    return SentinelCheck(
+    return CalibrationCheck(
         chance=chance,
         change=change,
         monitored=monitored,

@@ -15,7 +15,7 @@ from rigkit.planning.candidates import CANDIDATES_KEPT, Reach, board_in_view, bo
 from rigkit.planning.goal import Goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, Proposal, choose_views, covariance_of
-from rigkit.validation.sentinel.evidence import Monitored, board_information
+from rigkit.validation.monitoring.evidence import Monitored, board_information
 
 
 @dataclass(frozen=True, eq=False, slots=True)

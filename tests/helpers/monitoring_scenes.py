@@ -17,9 +17,9 @@ from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
-from rigkit.validation.sentinel.evidence import FreshView, Monitored
-from rigkit.validation.sentinel.judge import SentinelCheck, check_views
-from rigkit.validation.sentinel.watch import monitored_camera
+from rigkit.validation.monitoring.evidence import FreshView, Monitored
+from rigkit.validation.monitoring.judge import CalibrationCheck, check_views
+from rigkit.validation.monitoring.watch import monitored_camera
 
 NOISE_PX = 0.03
 CHANGED_PX = 0.25
@@ -39,7 +39,7 @@ def poses_held(name: str, count: int, reach: Reach | None = None) -> list[Rigid3
     return best_held(lens(name), BOARD, count, NOISE_PX, reach)
 
 
-def checked(calibration: Calibration, camera: Camera, rng: np.random.Generator) -> SentinelCheck:
+def checked(calibration: Calibration, camera: Camera, rng: np.random.Generator) -> CalibrationCheck:
     poses = poses_held("reg", 3)
     views = [FreshView(f"{k}", 0, noisy_view(camera, pose, f"{k}", rng, NOISE_PX)) for k, pose in enumerate(poses)]
     return check_views(monitored_camera(calibration, "cam"), views)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.calibration_scenes import lens, noisy_view
-from helpers.sentinel_scenes import NOISE_PX, poses_held, scene_pixels
+from helpers.monitoring_scenes import NOISE_PX, poses_held, scene_pixels
 
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
@@ -15,10 +15,10 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.report.pages.check_page import check_facts
-from rigkit.validation.sentinel.baseline import check_since
-from rigkit.validation.sentinel.epipolar import PairMatches, evidence_of_matches
-from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Monitored, evidence_of
-from rigkit.validation.sentinel.judge import ALARM_CHANCE, Look, evaluate_evidence
+from rigkit.validation.monitoring.baseline import check_since
+from rigkit.validation.monitoring.epipolar import PairMatches, evidence_of_matches
+from rigkit.validation.monitoring.evidence import FreshEvidence, FreshView, Monitored, evidence_of
+from rigkit.validation.monitoring.judge import ALARM_CHANCE, Look, evaluate_evidence
 
 MOUNT = Rigid3(exp_so3(np.array([0.01, -0.08, 0.02])), [-120.0, 2.0, 3.0])
 MATCH_NOISE_PX = 0.1

@@ -21,22 +21,22 @@ from scipy.special import fdtrc
 
 from rigkit.core.errors import InputError
 from rigkit.planning.goal import Goal
-from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
-from rigkit.validation.sentinel.judge import (
+from rigkit.validation.monitoring.evidence import FreshEvidence, Monitored
+from rigkit.validation.monitoring.judge import (
     Baseline,
+    CalibrationCheck,
     Look,
-    SentinelCheck,
     evaluate_evidence,
     exceeds_expected,
     unchanged_px,
 )
-from rigkit.validation.sentinel.whitened import Whitened, disagreement
+from rigkit.validation.monitoring.whitened import Whitened, disagreement
 
 CORRECTIONS = 4
 """Gauss-Newton iterations of the correction: published lenses are off by up to 2 px."""
 
 
-def check_since(monitored: Monitored, before: Look, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
+def check_since(monitored: Monitored, before: Look, look: Look, cost: Sequence[Goal] = ()) -> CalibrationCheck:
     """Return the verdict on the evidence of fresh frames, `look`, against the cameras corrected by the evidence of
     frames from the time when they were trusted, `before`.
 

@@ -17,7 +17,7 @@ from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.information import Knowledge
-from rigkit.validation.sentinel.evidence import Monitored
+from rigkit.validation.monitoring.evidence import Monitored
 
 
 def monitored_camera(calibration: Calibration, name: str, *, beyond_model: bool = True) -> Monitored:
