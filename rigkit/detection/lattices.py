@@ -45,7 +45,7 @@ MIN_PART_CORNERS = 6
 
 MIN_BOARD_CORNERS = MIN_ROWS**2
 
-Vouched = Callable[[GreyImage, Lattice], bool]
+MarkerTest = Callable[[GreyImage, Lattice], bool]
 """Returns whether markers in the squares of a lattice prove that it is a board."""
 
 SMEARED_CORNERS = 12
@@ -63,12 +63,12 @@ class BoardCriteria:
     ----------
     min_corners : smallest number of corners.
     sizes : (columns, rows) of all possible boards, if known.
-    vouched : the test that proves a lattice to be one of them.
+    has_markers : the test that proves a lattice to be one of them.
     """
 
     min_corners: int
     sizes: Sequence[tuple[int, int]] = ()
-    vouched: Vouched | None = None
+    has_markers: MarkerTest | None = None
 
 
 def find_lattices(
@@ -76,21 +76,21 @@ def find_lattices(
     min_corners: int,
     sizes: Sequence[tuple[int, int]] = (),
     *,
-    vouched: Vouched | None = None,
+    has_markers: MarkerTest | None = None,
 ) -> list[RefinedLattice]:
     """Return the refined lattices of all boards in `image`, in arbitrary order and orientation.
 
     `sizes` : (columns, rows) of all possible boards, if known.
-    `vouched` : for boards with markers in their squares, which affect edges and fit. Lattices with edge offsets
+    `has_markers` : for boards with markers in their squares, which affect edges and fit. Lattices with edge offsets
     (`has_edge_offset`) are then not rejected, and those for which it is true are accepted regardless of their evidence
     and shape.
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
-    criteria = BoardCriteria(min_corners, sizes, vouched)
+    criteria = BoardCriteria(min_corners, sizes, has_markers)
     searched, plausible = (
         SearchedImage.of(grey),
-        _RejectionCounter(_is_plausible if vouched is None else _plausible_or_vouched(vouched)),
+        _RejectionCounter(_is_plausible if has_markers is None else _plausible_or_marked(has_markers)),
     )
 
     def search(at: SearchedImage, more_than: int = 0) -> list[RefinedLattice]:
@@ -119,7 +119,7 @@ def find_lattices(
         for item in found
         if _of_size(item.lattice, sizes)
         or is_compact(item.lattice, size_px)
-        or (vouched is not None and vouched(grey, item.lattice))
+        or (has_markers is not None and has_markers(grey, item.lattice))
     ]
 
 
@@ -232,7 +232,7 @@ def _evidence_score(grey: GreyImage, criteria: BoardCriteria) -> EvidenceScore:
 
     def score(item: RefinedLattice, placed: Sequence[tuple[Lattice, RefinedLattice]]) -> float:
         own, (columns, rows) = Evidence.of(item).score, item.lattice.size
-        if own <= 0.0 and criteria.vouched is not None and criteria.vouched(grey, item.lattice):
+        if own <= 0.0 and criteria.has_markers is not None and criteria.has_markers(grey, item.lattice):
             return np.inf
         # The fit removes additional rows and columns (`part_of_known_size`), but adds none.
         if own > 0.0 or not any(columns >= c and rows >= r for both in every for c, r in both):
@@ -274,7 +274,7 @@ def _confirmed_parts(
         if len(parts) == 1:
             if is_large_enough(own.lattice, criteria.min_corners):
                 # Corners of squares with markers are fitted again by their finder.
-                out.append(_with_scatter(placed_together(grey, own, criteria.vouched)))
+                out.append(_with_scatter(placed_together(grey, own, criteria.has_markers)))
             continue
         # The fits of these corners used edges on the other side of the discontinuity: fit them again.
         alone = [part.lattice.trimmed() for part in parts]
@@ -303,7 +303,7 @@ def _accepted(
     sure = [
         after
         for before, after in every
-        if is_board(after, before.count, min_corners) or _is_proven_by_markers(grey, before, after, criteria)
+        if is_board(after, before.count, min_corners) or _is_marked_board(grey, before, after, criteria)
     ]
     room = len(sizes) - len(sure)
     if room <= 0:
@@ -321,11 +321,11 @@ def _accepted(
     return sure + sorted(likely, key=lambda item: -Evidence.of(item).score)[:room]
 
 
-def _is_proven_by_markers(grey: GreyImage, before: Lattice, after: RefinedLattice, criteria: BoardCriteria) -> bool:
+def _is_marked_board(grey: GreyImage, before: Lattice, after: RefinedLattice, criteria: BoardCriteria) -> bool:
     """Return whether markers in the squares of a fitted lattice prove that it is a board."""
-    if criteria.vouched is None or not is_board(after, before.count, criteria.min_corners, np.inf):
+    if criteria.has_markers is None or not is_board(after, before.count, criteria.min_corners, np.inf):
         return False
-    return criteria.vouched(grey, after.lattice)
+    return criteria.has_markers(grey, after.lattice)
 
 
 def _of_size(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
@@ -338,9 +338,9 @@ def _is_plausible(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
     return not (lattice.solid and has_edge_offset(lattice, finest)) and _sample_is_plausible(grey, finest, lattice)
 
 
-def _plausible_or_vouched(vouched: Vouched) -> IsPlausible:
+def _plausible_or_marked(has_markers: MarkerTest) -> IsPlausible:
     """Return the plausibility test of lattices that may have markers in their squares."""
-    return lambda grey, finest, lattice: _sample_is_plausible(grey, finest, lattice) or vouched(grey, lattice)
+    return lambda grey, finest, lattice: _sample_is_plausible(grey, finest, lattice) or has_markers(grey, lattice)
 
 
 def _sample_is_plausible(grey: GreyImage, _: Level, lattice: Lattice) -> bool:

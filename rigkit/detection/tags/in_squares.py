@@ -38,7 +38,7 @@ ADJACENT_MARKERS = 2
 """Number of markers that touch a corner inside the board."""
 
 
-def vouched_by_markers(boards: Sequence[Board], image: GreyImage, lattice: Lattice) -> bool:
+def has_markers_of(boards: Sequence[Board], image: GreyImage, lattice: Lattice) -> bool:
     """Return whether the markers in a lattice's squares place it on one of these ChArUco boards.
 
     The blurred ink of markers disturbs the fit of the corners beside them, so that the evidence of the corners is that

@@ -17,7 +17,7 @@ from rigkit.detection.lattices import MIN_BOARD_CORNERS, BoardCriteria, find_lat
 from rigkit.detection.saddles.local_contrast import equalised, stretched
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.refined import RefinedLattice
-from rigkit.detection.tags.in_squares import vouched_by_markers
+from rigkit.detection.tags.in_squares import has_markers_of
 
 
 class Search:
@@ -83,14 +83,14 @@ class Search:
         plain = all(board.pattern.type == Chessboard.type for board in self.boards)
         only = self.chessboard_sizes if plain else ()
         marked = [board for board in self.boards if board.pattern.type == Charuco.type]
-        vouched = functools.partial(vouched_by_markers, marked) if marked else None
-        found = find_lattices(self.grey, self.min_corners_seen, only, vouched=vouched)
+        has_markers = functools.partial(has_markers_of, marked) if marked else None
+        found = find_lattices(self.grey, self.min_corners_seen, only, has_markers=has_markers)
         if not found and self.grey.dtype != np.uint8:
             # In images of more than 8 bits a board may use a hundredth of the range of brightness.
             seen = [item.lattice for item in find_lattices(equalised(self.grey), self.min_corners_seen, only)]
             # Equalisation shifts corners beside bright objects: they are fitted on a linearly stretched image.
             self.grey = stretched(self.grey, [lattice.pixels for lattice in seen])
-            found = fit_and_confirm(self.grey, seen, BoardCriteria(self.min_corners_seen, only, vouched))
+            found = fit_and_confirm(self.grey, seen, BoardCriteria(self.min_corners_seen, only, has_markers))
         return found
 
 
