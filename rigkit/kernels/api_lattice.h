@@ -110,7 +110,9 @@ EXPORT int64_t find_links(
 
 /* growth.c */
 
-enum { FIT_COLUMNS = 12 };
+/* Results of a fit, and the largest numbers that the kernels have room for: rows and columns on each side of a cell in a fit, and
+ * saddles that are tried in a cell. */
+enum { FIT_COLUMNS = 12, MAX_FIT_RADIUS = 3, MAX_TRIED = 16 };
 
 /* The constants of detection.lattice.local_fit. */
 typedef struct {
@@ -171,6 +173,9 @@ EXPORT int64_t find_components(
 
 /* lattice.c */
 
+/* The largest order of differences, and the largest degree of surfaces, that the kernels have room for. */
+enum { MAX_DIFFERENCE_ORDER = 8, MAX_SCATTER_DEGREE = 4, SCATTER_TERMS = (MAX_SCATTER_DEGREE + 1) * (MAX_SCATTER_DEGREE + 2) / 2 };
+
 /* The constants of detection.subpixel.scatter. */
 typedef struct {
     double unexplained, median_of_normal, min_term;
@@ -190,7 +195,7 @@ EXPORT void excess_scatter(
     SCRATCH(double, scratch, 7 * height * width), RESULT(double, out, count));
 EXPORT void surface_scatter(
     ARRAY(const double, pixels, rows, columns, 2), ARRAY(const double, sigma, rows, columns), int64_t rows, int64_t columns,
-    const scatter_rules_t *rules, SCRATCH(double, scratch, 20 * rows * columns), RESULT(double, out, 2));
+    const scatter_rules_t *rules, SCRATCH(double, scratch, (5 + SCATTER_TERMS) * rows * columns), RESULT(double, out, 2));
 EXPORT void edge_shifts(
     ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns, double sign, image_t image, double scale,
     double offset, double reach, ARRAY(const double, along, parts), int64_t parts, int64_t steps, int64_t most,

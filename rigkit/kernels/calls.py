@@ -170,6 +170,15 @@ class Struct(ctypes.Structure):
     _names: frozenset[str]
     _make: Callable[..., Self] | None
     _kept: dict[str, Any]
+    _largest: dict[str, int]
+
+    def __init__(self, *values: Any, **named: Any) -> None:
+        """Raises ValueError if a member is larger than the kernels have room for."""
+        super().__init__(*values, **named)
+        for name, largest in self._largest.items():
+            value = getattr(self, name)
+            if max(value if isinstance(value, ctypes.Array) else (value,)) > largest:
+                raise ValueError(f"{type(self).__name__}: '{name}' is larger than {largest}")
 
     @classmethod
     def of(cls, **values: Any) -> Self:
@@ -184,14 +193,18 @@ class Struct(ctypes.Structure):
         return cls._make(**values)
 
 
-def structure(name: str) -> Any:
-    """Return a decorator that makes a class the structure `name` of api.h."""
+def structure(name: str, **largest: str) -> Any:
+    """Return a decorator that makes a class the structure `name` of api.h.
+
+    `largest` : constants of api.h that members must not exceed, by the members' names.
+    """
 
     def fill(cls: type[AnyStruct]) -> type[AnyStruct]:
         members = header().structures[name]
         pointed = frozenset(one.name for one in members if one.pointer and one.type in STRUCTURES)
         cls._call = _Call(name, members, pointed)
         cls._names, cls._make = frozenset(cls._call.names), None
+        cls._largest = {member: header().constants[limit] for member, limit in largest.items()}
         cls._fields_ = [(one.name, _ctype(one)) for one in members]
         STRUCTURES[name] = cls
         return cls

@@ -3,7 +3,7 @@
  * The definitions in numpy are in tests/kernels/reference/growth.py, the numbers in rigkit.detection.lattice. */
 #include "rings.h"
 
-enum { MAX_TERMS = 10, MAX_DEGREE = 3, MAX_RADIUS = 3, MAX_TRIED = 16 };
+enum { MAX_TERMS = 10, MAX_DEGREE = 3 };
 
 /* The smallest ridge on any term: no exact pivot of the normal equations is smaller, so that rounding cannot make one. */
 static const double MIN_PULL = 1e-12;
@@ -47,7 +47,7 @@ static const int POWER_R[MAX_TERMS] = {0, 0, 1, 0, 1, 2, 0, 1, 2, 3};
 typedef struct {
     int64_t row, column, low_r, low_c, high_r, high_c, support;
     double moment[2 * MAX_DEGREE + 1][2 * MAX_DEGREE + 1], position[MAX_TERMS][2], near[2];
-    double weights[2 * MAX_RADIUS + 1][2 * MAX_RADIUS + 1];
+    double weights[2 * MAX_FIT_RADIUS + 1][2 * MAX_FIT_RADIUS + 1];
 } surroundings_t;
 
 /* Add the known cells of row `r`. */
@@ -188,7 +188,7 @@ FOR_EACH_PROCESSOR void fit_cells(
 {
     (void)count;
     fit_t *fits = (fit_t *)out;
-    double bell[MAX_RADIUS + 1];
+    double bell[MAX_FIT_RADIUS + 1];
     fill_bell(rules, bell);
     for (int64_t row = 0; row < rows; row++)
         for (int64_t column = 0; column < columns; column++)
@@ -360,7 +360,7 @@ FOR_EACH_PROCESSOR int64_t grow_lattice(
         int64_t count = 0;
         for (int way = 0; way < 2 && count == 0; way++) {
             const fit_rules_t *prediction = &rules->predictions[way];
-            double bell[MAX_RADIUS + 1];
+            double bell[MAX_FIT_RADIUS + 1];
             fill_bell(prediction, bell);
             for (int64_t row = 0; row < rows; row++)
                 for (int64_t column = 0; column < columns; column++) {
@@ -381,8 +381,8 @@ FOR_EACH_PROCESSOR int64_t grow_lattice(
             sheet->contrast[where[k]] = fresh[3 * k + 2];
             /* Predictions that failed before may have changed within the reach of the fits. */
             const int64_t row = where[k] / columns, column = where[k] % columns;
-            for (int64_t r = row - MAX_RADIUS; r <= row + MAX_RADIUS; r++)
-                for (int64_t c = column - MAX_RADIUS; c <= column + MAX_RADIUS; c++)
+            for (int64_t r = row - MAX_FIT_RADIUS; r <= row + MAX_FIT_RADIUS; r++)
+                for (int64_t c = column - MAX_FIT_RADIUS; c <= column + MAX_FIT_RADIUS; c++)
                     if (r >= 0 && c >= 0 && r < rows && c < columns)
                         sheet->due[r * columns + c] = sheet->due[(rows + r) * columns + c] = 1;
         }

@@ -12,12 +12,12 @@ from rigkit.kernels.calls import Struct, make_struct, structure
 from rigkit.kernels.front import ImageOf, RingRules
 
 
-@structure("fit_rules_t")
+@structure("fit_rules_t", radius="MAX_FIT_RADIUS")
 class FitRules(Struct):
     """Parameters of local polynomial fits."""
 
 
-@structure("growth_rules_t")
+@structure("growth_rules_t", tried="MAX_TRIED")
 class GrowthRules(Struct):
     """Parameters of the growth of lattices."""
 

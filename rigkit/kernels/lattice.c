@@ -59,7 +59,7 @@ void line_gaps(const double *sides, const double *curvatures, int64_t count, dou
     }
 }
 
-enum { MAX_ORDER = 8, PLANE = 8 };
+enum { PLANE = 8 };
 
 /* A part of a sheet, one row after the other: corners, their variance, and room for four numbers for each of them. */
 typedef struct {
@@ -70,7 +70,7 @@ typedef struct {
 /* Return the typical difference of `order` over the expected one, NaN for few (reference.lattice._roughness). */
 static double roughness(const part_t part, int64_t order, const scatter_rules_t *rules)
 {
-    double factor[MAX_ORDER + 1] = {1.0};
+    double factor[MAX_DIFFERENCE_ORDER + 1] = {1.0};
     for (int64_t k = 1; k <= order; k++)
         factor[k] = -factor[k - 1] * (double)(order + 1 - k) / (double)k;
     int64_t count = 0;
@@ -128,9 +128,9 @@ INLINE void take_away(double *values, const double *along, int64_t count)
         values[i] -= part * along[i];
 }
 
-/* Set `out` to the residuals of surfaces of both degrees (the second at most 4) over the corners' sigmas (rms), NaN
- * where these fit any (reference.lattice.surface_scatter), or where rows and columns have differences enough. `scratch` holds
- * 20 numbers for each corner: the 15 terms are kept. */
+/* Set `out` to the residuals of surfaces of both degrees over the corners' sigmas (rms), NaN where these fit any
+ * (reference.lattice.surface_scatter), or where rows and columns have differences enough. `scratch` holds five numbers and all
+ * terms for each corner. */
 void surface_scatter(
     const double *pixels, const double *sigma, int64_t rows, int64_t columns, const scatter_rules_t *rules, double *scratch,
     double *out)

@@ -13,7 +13,7 @@ from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.front import ImageOf
 
 
-@structure("scatter_rules_t")
+@structure("scatter_rules_t", last_order="MAX_DIFFERENCE_ORDER", degrees="MAX_SCATTER_DEGREE")
 class ScatterRules(Struct):
     """The constants of `detection.subpixel.scatter`."""
 

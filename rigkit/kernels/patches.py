@@ -33,7 +33,7 @@ class Pyramid(Struct):
         return out
 
 
-@structure("patch_rules_t")
+@structure("patch_rules_t", half="MAX_HALF")
 class PatchRules(Struct):
     """Parameters of the alignment of patches, and of their tests."""
 

@@ -19,8 +19,9 @@ from rigkit.kernels.building import library_name, mismatch
 from rigkit.kernels.calls import Struct, make_struct, structure
 from rigkit.kernels.declarations import header, parsed
 from rigkit.kernels.front import ImageOf
-from rigkit.kernels.growth import FitRules
-from rigkit.kernels.patches import PATCH_COLUMNS
+from rigkit.kernels.growth import FitRules, GrowthRules
+from rigkit.kernels.lattice import ScatterRules
+from rigkit.kernels.patches import PATCH_COLUMNS, PatchRules
 from rigkit.kernels.pose import qualities
 
 
@@ -195,3 +196,22 @@ def test_the_header_is_read_as_c_reads_it() -> None:
 def test_only_declared_structures_can_be_made() -> None:
     with pytest.raises(KeyError):
         structure("nothing_t")(type("Nothing", (Struct,), {}))
+
+
+@pytest.mark.parametrize(
+    ("kind", "member", "most"),
+    [
+        (ScatterRules, "last_order", 8),
+        (ScatterRules, "degrees", 4),
+        (FitRules, "radius", 3),
+        (GrowthRules, "tried", 16),
+        (PatchRules, "half", 16),
+    ],
+)
+def test_numbers_for_which_a_kernel_has_no_room_are_refused(kind: type[Struct], member: str, most: int) -> None:
+    def of(value: int) -> object:
+        return (3, value) if member == "degrees" else value
+
+    kind(**{member: of(most)})
+    with pytest.raises(ValueError, match=f"'{member}' is larger than {most}"):
+        kind(**{member: of(most + 1)})
