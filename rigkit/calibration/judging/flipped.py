@@ -138,10 +138,13 @@ def _fitting_better_flipped(
     every, weight = np.ones(len(observations.views), dtype=bool), fit.weight(observations)
     now, costs = weighted_squares(state, observations, weight), []
     for turns in (0, 2):
+        numbered = turns == 2 and math.prod(FLIP_SIGNS[way]) > 0.0
+        possible = np.array([not numbered or view.board.looks_same_turned for view in observations.views])
+        if not possible.any():
+            break
         flipped, start = _flipped(way, every, np.full(len(every), turns), observations, state)
         cost = refine_poses(flipped, start, weight, tolerance=START_TOLERANCE)[1]
-        numbered = turns == 2 and math.prod(FLIP_SIGNS[way]) > 0.0
-        costs.append(np.where([numbered and not view.board.looks_same_turned for view in flipped.views], np.inf, cost))
+        costs.append(np.where(possible, cost, np.inf))
     best = np.min(costs, axis=0)
     better = best < now
     gain = float((now - best)[better].sum() / max(float(now.sum()), np.finfo(float).tiny))
