@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -156,6 +157,7 @@ def test_without_heldout_errors_the_rig_is_solved_once(monkeypatch: pytest.Monke
     assert solved == ["lags"]
 
 
+@cache
 def joint_with_readouts(seed: int) -> JointRig:
     """Return the solution of boards in hand whose images are read row by row."""
     joints = list[JointRig]()
