@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 from helpers.data import REPOSITORY
+from helpers.trihedral_captures import pair_toml, write_manifest
 
 from rigkit.cli.main import main
 from rigkit.io.manifests.manifest import load_dataset
+from rigkit.synthetic.pairs import StereoScene
 from rigkit.workflows.reconstruction.datasets import load_cameras
 
 LAB = REPOSITORY / "datasets" / "lab-a"
@@ -19,23 +21,17 @@ QUICK = ["--no-pictures", "--no-crosscheck"]
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def captures(trihedral: tuple[Path, dict[str, StereoScene]], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Data sets of one pair each: a right one, one that contradicts what was measured, and one without its images."""
-    folder = tmp_path_factory.mktemp("captures")
-    text = (LAB / "dataset.toml").read_text(encoding="utf-8").replace("../../calib", str(REPOSITORY / "calib"))
-    text = text.replace('"images/', f'"{LAB}/images/')
-    head, *pairs = text.split("[[pairs]]")
-    pair = next(p for p in pairs if 'id = "fisheye-general"' in p)
-    for name, change in (
-        ("one", ("", "")),
-        ("two", ("value_deg = 90.0", "value_deg = 80.0")),
-        ("three", ("view1.jpg", "none.jpg")),
+    root = tmp_path_factory.mktemp("captures")
+    pair = pair_toml(trihedral[1]["same"], "same", ("regular", "regular"))
+    for name, own in (
+        ("one", pair),
+        ("two", pair.replace("value_deg = 90.0", "value_deg = 80.0")),
+        ("three", pair.replace("same1.png", "none.png")),
     ):
-        (folder / name).mkdir()
-        own = pair.replace(*change) if change[0] else pair
-        manifest = head.replace('name = "lab-a"', f'name = "{name}"') + "[[pairs]]" + own
-        (folder / name / "dataset.toml").write_text(manifest, encoding="utf-8")
-    return folder
+        write_manifest(Path(shutil.copytree(trihedral[0], root / name)), own, name=name)
+    return root
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -51,7 +47,7 @@ def test_many_data_sets_are_one_table(captures: Path, tmp_path: Path, capsys: py
     found = rows(tmp_path / "a" / "summary.csv")
     assert [row["data set"] for row in found] == names
     assert [row["verdict"] for row in found] == ["pass", "FAIL", "not validated"]
-    assert found[0]["why"] == "" and "pair" in found[1]["why"] and "none.jpg" in found[2]["why"]
+    assert found[0]["why"] == "" and "pair" in found[1]["why"] and "none.png" in found[2]["why"]
     assert (tmp_path / "a" / "one" / "tables.md").is_file()
     assert "1 of 3 data sets pass" in (tmp_path / "a" / "summary.html").read_text()
     twice = [str(captures / "one"), str(captures / "two"), str(captures / "one")]
@@ -111,17 +107,19 @@ def _pictures_of_one(pictures: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_bad_calibration_of_a_data_set_is_warned_of(captures: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_bad_calibration_of_a_data_set_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """What it says of angles and baselines rests on it; cameras that no pair uses do not matter."""
-    folder = Path(shutil.copytree(captures / "one", captures / "called-bad"))
-    manifest = folder / "dataset.toml"
-    text = manifest.read_text(encoding="utf-8")
+    text = (LAB / "dataset.toml").read_text(encoding="utf-8").replace("../../calib", str(REPOSITORY / "calib"))
+    text = text.replace('"images/', f'"{LAB}/images/')
+    head, *pairs = text.split("[[pairs]]")
+    text = head + "[[pairs]]" + next(p for p in pairs if 'id = "fisheye-general"' in p)
     printed = {"severity": "bad", "message": "two cameras are mixed", "remedy": "calibrate each"}
     for name in ("mvca020_r61", "mvca020_fe185"):
         source = REPOSITORY / "calib" / "cameras" / name / "calibration.json"
-        own = folder / f"{name}.json"
+        own = tmp_path / f"{name}.json"
         own.write_text(json.dumps(json.loads(source.read_text()) | {"verdicts": [printed]}))
         text = text.replace(str(source), str(own))
+    manifest = tmp_path / "dataset.toml"
     manifest.write_text(text, encoding="utf-8")
     load_cameras(load_dataset(manifest))
     called = "the calibration's verdict is bad: two cameras are mixed"
