@@ -8,8 +8,9 @@ import importlib
 import sys
 import types
 import zlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -50,15 +51,34 @@ def pytest_collection(session: pytest.Session) -> None:
                     importlib.import_module(".".join(file.relative_to(ROOT).with_suffix("").parts))
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """Switch garbage collection off while tests are collected: the many new objects stay, so each pass is wasted.
 
     Open3D imports Dash for drawings in a browser, which no test makes: 1.0 of its 1.7 s in each process.
     """
+    if not config.option.durations:
+        _send_less(config)
     gc.disable()
     dash = types.ModuleType("dash")
     vars(dash).update(dcc=None, html=None, Dash=None)
     sys.modules.setdefault("dash", dash)
+
+
+def _send_less(config: pytest.Config) -> None:
+    """Let a process of xdist tell of each test that passed in two messages, not six, of which nothing is printed: they
+    took 4 s of processor time of all tests (as many empty ones: 2.8 ms each with six, 1.5 with two)."""
+    for worker in config.pluginmanager.get_plugins():
+        if type(worker).__name__ == "WorkerInteractor":
+            send = worker.sendevent
+
+            def told(name: str, send: Callable[..., None] = send, **told: Any) -> None:
+                if name in ("logstart", "logfinish"):
+                    return
+                if name == "testreport" and told["data"]["outcome"] == "passed" and told["data"]["when"] != "call":
+                    return
+                send(name, **told)
+
+            worker.sendevent = told
 
 
 def pytest_collection_finish() -> None:
@@ -98,14 +118,25 @@ def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.cpu_count", lambda: 1)
 
 
-PLANNED_BESIDES = ("cli", "coach", "fuzz", "workflows")
-"""Folders of tests in which plans are made, but not what is tested."""
+BESIDES = ("cli", "coach", "fuzz", "workflows")
+"""Folders of tests in which plans, choices of a lens model and pictures are made, but not what is tested."""
+LESS: dict[str, object] = {
+    # Plans choose among a third of the poses: how well they choose is for tests/planning and tests/validation.
+    "rigkit.planning.candidates.CANDIDATES_DRAWN": 800,
+    "rigkit.planning.candidates.CANDIDATES_KEPT": 300,
+    "rigkit.validation.monitoring.frames.CANDIDATES_KEPT": 300,
+    # Of each lens model one size is tried: tests/calibration/choosing is about the choice.
+    "rigkit.calibration.choosing.models_tried.DEGREES_TRIED": {"scaramuzza": (6,), "brown": (5,)},
+    "rigkit.calibration.choosing.models_tried.DEGREES_BEYOND": {"scaramuzza": (8,)},
+    # A fifth of the pixels: tests/report looks at pictures.
+    "rigkit.report.pictures.figures.DPI": 50,
+    "rigkit.report.pages.certificate_page.DPI": 50,
+}
+"""What is done less in these."""
 
 
 @pytest.fixture(autouse=True)
-def fewer_poses(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plans choose among a third of the poses: how well they choose is for tests/planning and tests/validation."""
-    if request.path.is_relative_to(ROOT) and request.path.relative_to(ROOT).parts[1] in PLANNED_BESIDES:
-        monkeypatch.setattr("rigkit.planning.candidates.CANDIDATES_DRAWN", 800)
-        monkeypatch.setattr("rigkit.planning.candidates.CANDIDATES_KEPT", 300)
-        monkeypatch.setattr("rigkit.validation.monitoring.frames.CANDIDATES_KEPT", 300)
+def less_work(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if request.path.is_relative_to(ROOT) and request.path.relative_to(ROOT).parts[1] in BESIDES:
+        for name, value in LESS.items():
+            monkeypatch.setattr(name, value)
