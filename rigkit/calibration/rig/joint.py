@@ -171,16 +171,15 @@ def solve_jointly(
     progress("rig", MAX_ROUNDS, MAX_ROUNDS)
     typical_sigmas = float(np.sqrt(typical) / max(sigma, MIN_PX))
     typical_px, size_px = typical_distance_px(observations, cost), _boards_px(seen)
-    if typical_px > MAX_DISTANCE_OF_SIZE * size_px:
-        raise DegenerateError(
-            f"rig: the views of a frame disagree by {typical_px:.0f} px on the boards' poses (boards are {size_px:.0f} "
-            f"px large); {_advice(seen)}"
-        )
+    _require_common_moments(typical_px, size_px, seen)
     if typical_sigmas > DISAGREES:
         observations = replace(observations, held=_lens_priors(single, sigma, typical_sigmas**2 - 1.0))
         if known is not None:
             observations = known.hold(observations, solution.state, views.names)
         solution = solve_rig(observations, solution.state, sigma)
+        # Lenses that are held no longer bend towards frames that do not belong together.
+        held_px = typical_distance_px(observations, cost_of_sharing(observations, solution, seen))
+        _require_common_moments(held_px, size_px, seen)
         also = (_disagreement(cost, sigma, (typical_px, typical_sigmas), several=len(seen) > 1),)
     return JointRig(
         views=views,
@@ -350,6 +349,16 @@ def _require_agreement(views: RigViews, left: int, shared: int) -> None:
         raise DegenerateError(
             f"{error}; {left} boards were left out because the cameras disagree on their poses: {advice}"
         ) from error
+
+
+def _require_common_moments(distance_px: float, size_px: float, seen: Sequence[FrameObservations]) -> None:
+    """Raise DegenerateError where the typical distance between views that share a pose is a large part of the boards'
+    size in the images."""
+    if distance_px > MAX_DISTANCE_OF_SIZE * size_px:
+        raise DegenerateError(
+            f"rig: the views of a frame disagree by {distance_px:.0f} px on the boards' poses (boards are "
+            f"{size_px:.0f} px large); {_advice(seen)}"
+        )
 
 
 def _advice(seen: Sequence[FrameObservations]) -> str:
