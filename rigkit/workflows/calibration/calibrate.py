@@ -119,7 +119,7 @@ def calibration_from(
                 progress=progress,
             )
         except DegenerateError as error:
-            shown = why_misplaced(session.images, session.boards)
+            shown = why_misplaced(session.images, session.boards, progress)
             if shown is None:
                 raise
             raise InputError(f"{shown} ({error})") from error
@@ -128,7 +128,7 @@ def calibration_from(
     also = [*suggest_rigid_boards(views, result), *interlaced(result, images), *black_borders(result, images), *prints]
     verdicts = diagnose_session(result, dropped, also)
     if verdicts[0].severity is Severity.BAD:
-        shown = why_misplaced(session.images, session.boards)
+        shown = why_misplaced(session.images, session.boards, progress)
         if shown is not None and 2 * len(views) < len(session.images):
             # The few views of the declared board are misread.
             raise InputError(f"{session.path}: {shown}")

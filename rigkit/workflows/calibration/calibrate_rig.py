@@ -182,7 +182,7 @@ def rig_from(
             progress=progress,
         )
     except DegenerateError as error:
-        causes = _misread(session)
+        causes = _misread(session, progress)
         if not causes:
             raise
         raise InputError(f"{session.path}: {causes[0]} ({error})") from error
@@ -194,7 +194,7 @@ def rig_from(
         also += wrong_print(seen, named_images(session.cameras[name]))
     rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(also)))
     if rig.verdicts[0].severity is Severity.BAD:
-        wrong = [Finding.bad(words) for words in _misread(session)]
+        wrong = [Finding.bad(words) for words in _misread(session, progress)]
         rig = replace(rig, verdicts=(rig.verdicts[0], *wrong, *rig.verdicts[1:]))
     single = [replace(c, dropped=(*dropped[n], *c.dropped)) for n, c in zip(session.cameras, rig.single, strict=True)]
     cameras = [
@@ -204,9 +204,9 @@ def rig_from(
     return replace(rig, single=tuple(single), cameras=tuple(cameras))
 
 
-def _misread(session: RigSession) -> list[str]:
+def _misread(session: RigSession, progress: Progress) -> list[str]:
     """Return in words why corners of boards with marks are misplaced, each reason once."""
-    shown = (why_misplaced(own.images, own.boards) for own in session.cameras.values())
+    shown = (why_misplaced(own.images, own.boards, progress) for own in session.cameras.values())
     return list(dict.fromkeys(words for words in shown if words is not None))
 
 

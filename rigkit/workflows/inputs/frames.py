@@ -125,7 +125,7 @@ def frames_of_videos(
     images = keeper.finish()
     if not images:
         names = ", ".join(f"'{path}'" for path in sources.values())
-        shown = None if live or not boards else why_not_detected(list(sources.values()), boards)
+        shown = None if live or not boards else why_not_detected(list(sources.values()), boards, progress)
         raise InputError(
             f"{names}: no board in {looked_at} frames; {shown or 'check focus, light and the size of the board'}"
         )

@@ -126,12 +126,12 @@ def _other_board(rest: Sequence[tuple[str, GreyImage]]) -> tuple[str, tuple[str,
     return words_of_board(guess.board), tuple(rest[k][0] for k in guess.images)
 
 
-def why_not_detected(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
+def why_not_detected(paths: Sequence[Path], boards: Sequence[Board], progress: Progress = silent) -> str | None:
     """Return in words why images do not show the declared boards; None if unknown."""
     mirrored = _mirrored(paths, [board for board in boards if board.identified])
     if mirrored is not None:
         return mirrored
-    guess, *_ = _guess(paths)
+    guess, *_ = _guess(paths, progress)
     if guess is None or not guess.determined:
         return None
     determined = [difference(seen, board) for board in boards for seen in (guess.board, *guess.beside)]
@@ -147,7 +147,7 @@ def why_not_detected(paths: Sequence[Path], boards: Sequence[Board]) -> str | No
     return f"{what} seen in {counted(count, 'image')}; {words[0]}{whole}"
 
 
-def why_misplaced(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
+def why_misplaced(paths: Sequence[Path], boards: Sequence[Board], progress: Progress = silent) -> str | None:
     """Return in words why corners of boards with marks are misplaced; None if unknown.
 
     The images may show another board with the same marks, or two copies of the board. Chessboards are checked by their
@@ -155,7 +155,7 @@ def why_misplaced(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     """
     if not any(board.identified for board in boards):
         return None
-    return why_not_detected(paths, boards) or _duplicate_board(paths, boards)
+    return why_not_detected(paths, boards, progress) or _duplicate_board(paths, boards)
 
 
 def _duplicate_board(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:

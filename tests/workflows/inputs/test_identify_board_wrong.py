@@ -90,7 +90,10 @@ def test_boards_alike_are_named_where_a_rig_comes_to_nothing(
 
 
 def test_boards_that_are_as_declared_are_not_misread(folder: Path) -> None:
-    assert why_misplaced(sorted(folder.glob("*.png")), [BOARD]) is None
+    """The board is identified once more meanwhile, which takes a minute with large ones: its progress is shown."""
+    said: list[str] = []
+    assert why_misplaced(sorted(folder.glob("*.png")), [BOARD], lambda what, done, total: said.append(what)) is None
+    assert set(said) == {"identifying the board"}
     assert why_misplaced([folder / "0.png"], [Board("plain", 7, 7, 30.0, 30.0)]) is None
 
 
