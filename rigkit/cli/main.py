@@ -13,7 +13,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rigkit.cli.examples import EXAMPLES, FIRST_STEPS
@@ -71,8 +71,18 @@ class _VerbParser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         known, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+            options = [one for one in self._option_string_actions if one.startswith("--")]
+            meant = next(filter(None, (_similar(one.partition("=")[0], options) for one in unknown)), "")
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{meant}")
         return known, unknown
+
+
+def _similar(word: str, known: Iterable[str]) -> str:
+    """Return a question for the one of the `known` words that is similar; "" if there is none."""
+    from difflib import get_close_matches
+
+    close = get_close_matches(word, list(known), 1)
+    return f"; did you mean {close[0]}?" if close else ""
 
 
 def build_parser(verb: str | None) -> argparse.ArgumentParser:
@@ -119,6 +129,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             # As a path it would be the current folder.
             if any(not one or (one.startswith("--") and one.endswith("=")) for one in arguments):
                 raise InputError("an argument is empty (''), perhaps an unset shell variable; give a value")
+            if verb is not None and (meant := _similar(verb, () if verb in VERBS else VERBS)):
+                raise InputError(f"no verb is called '{verb}'{meant}")
             args = build_parser(verb).parse_args(arguments)
             with logging_to(verbose=args.verbose, log_file=args.log_file):
                 return logged_run(args)

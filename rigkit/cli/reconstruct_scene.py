@@ -42,6 +42,11 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
 def is_scene(args: argparse.Namespace) -> bool:
     """Return whether a scene is given; raises InputError for both or neither of scene and data set."""
     scene = bool(args.images or args.correspondences)
+    if scene and args.dataset:
+        raise InputError(
+            f"reconstruct: give either a DATASET or a scene: '{args.dataset}' is taken for a DATASET; images follow "
+            "--images together, and the second image's camera is --camera2"
+        )
     if scene == bool(args.dataset):
         raise InputError("reconstruct: give either a DATASET, or --images A B or --correspondences FILE with --camera")
     if scene and not (args.camera or args.rig):

@@ -378,3 +378,17 @@ def test_an_unknown_option_shows_the_usage_of_its_verb(capsys: pytest.CaptureFix
     assert stop.value.code == 2
     printed = capsys.readouterr().err
     assert printed.startswith("usage: rigkit diff") and "unrecognized arguments: --nonsense" in printed
+
+
+def test_words_that_are_nearly_right_are_proposed(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["board", "9x6", "--sqare-mm=25", "-o", "x"])
+    assert "unrecognized arguments: --sqare-mm=25; did you mean --square-mm?" in capsys.readouterr().err
+    assert main(["calibrat", "photos"]) == 2
+    assert capsys.readouterr().err == "rigkit: no verb is called 'calibrat'; did you mean calibrate?\n"
+
+
+def test_a_camera_too_many_is_no_data_set(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reconstruct", "--images", "a.png", "b.png", "--camera", "a.json", "b.json"]) == 2
+    printed = capsys.readouterr().err
+    assert "'b.json' is taken for a DATASET" in printed and "the second image's camera is --camera2" in printed

@@ -15,7 +15,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -124,12 +124,21 @@ def measured_board(table: TomlTable, default_id: str) -> Board:
         if count > MAX_CORNERS:
             words = board.pattern.count_word
             raise table.error(f"'{key}' is {count}, more than {MAX_CORNERS}; count the {words} along one side")
-    for side in (*board.squares_mm, *(table[key] for key in PRINTED if any(key in table for key in PRINTED))):
-        if not SQUARES_MM[0] <= side <= SQUARES_MM[1]:
-            raise table.error(f"{word}s of {side:g} mm are outside {SQUARES_MM[0]:g} to {SQUARES_MM[1]:g} mm; write mm")
+    sides = (*board.squares_mm, *(table[key] for key in PRINTED if any(key in table for key in PRINTED)))
+    if wrong := wrong_unit(word, sides):
+        raise table.error(wrong)
     with table.located("; correct the board"):
         board.ink()
     return board
+
+
+def wrong_unit(word: str, sides_mm: Iterable[float]) -> str | None:
+    """Return in words which of the sides of squares (or of what `word` calls them) is no length in mm; None if all
+    may be."""
+    wrong = next((side for side in sides_mm if not SQUARES_MM[0] <= side <= SQUARES_MM[1]), None)
+    if wrong is None:
+        return None
+    return f"{word}s of {wrong:g} mm are outside {SQUARES_MM[0]:g} to {SQUARES_MM[1]:g} mm; write mm"
 
 
 def board_from_table(table: TomlTable, default_id: str) -> Board:

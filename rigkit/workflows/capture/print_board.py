@@ -8,7 +8,7 @@ from pathlib import Path
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
-from rigkit.io.boards.board_file import board_text, load_layout
+from rigkit.io.boards.board_file import board_text, load_layout, wrong_unit
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import write_atomic, write_together
 from rigkit.report.pictures.board_sheet import board_sheet, pdf_bytes, svg_text
@@ -43,9 +43,12 @@ def print_board(board: Board | str | Path, options: PrintOptions) -> tuple[Path,
 
     The board of a file is printed with its original layout, even if a print was measured since.
 
-    Raises InputError for a board that does not fit on the paper, or a file that cannot be written.
+    Raises InputError for a board that does not fit on the paper, squares that are not in mm, or a file that cannot be
+    written.
     """
     layout = board if isinstance(board, Board) else load_layout(board)
+    if wrong := wrong_unit(layout.pattern.size_word, layout.squares_mm):
+        raise InputError(f"board: {wrong}")
     with about(layout.describe().split(", ")[0] if isinstance(board, Board) else board):
         sheet = board_sheet(layout, options.paper)
     name = options.output.with_suffix("") if options.output.suffix in ENDINGS else options.output

@@ -8,6 +8,7 @@ import pytest
 
 from rigkit.cli.board_identify import without_scale
 from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.circles import Circles
 from rigkit.workflows.capture.print_board import print_board
@@ -20,6 +21,12 @@ from rigkit.workflows.options.cameras import PrintOptions
 def test_a_name_with_its_ending_has_it_once(given: str, stem: str, tmp_path: Path) -> None:
     written = print_board(Board("x", 4, 3, 20.0, 20.0), PrintOptions(output=tmp_path / given))
     assert [path.name for path in written] == [f"{stem}.pdf", f"{stem}.svg", f"{stem}.toml"]
+
+
+def test_squares_in_metres_are_not_printed(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"squares of 0\.025 mm are outside 0\.1 to 5000 mm; write mm"):
+        print_board(Board("x", 4, 3, 0.025, 0.025), PrintOptions(output=tmp_path / "x"))
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
