@@ -22,15 +22,18 @@ QUICK = ["--no-pictures", "--no-crosscheck"]
 
 @pytest.fixture(scope="module")
 def captures(trihedral: tuple[Path, dict[str, StereoScene]], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data sets of one pair each: a right one, one that contradicts what was measured, and one without its images."""
+    """Data sets of one pair each: a right one with calibrations that say how sure they are, one that contradicts what
+    was measured, and one without its images."""
     root = tmp_path_factory.mktemp("captures")
+    text = (LAB / "dataset.toml").read_text(encoding="utf-8").replace("../../calib", str(REPOSITORY / "calib"))
+    text = text.replace('"images/', f'"{LAB}/images/').replace('name = "lab-a"', 'name = "one"')
+    head, *pairs = text.split("[[pairs]]")
+    (root / "one").mkdir()
+    manifest = head + "[[pairs]]" + next(p for p in pairs if 'id = "fisheye-general"' in p)
+    (root / "one" / "dataset.toml").write_text(manifest, encoding="utf-8")
     pair = pair_toml(trihedral[1]["same"], "same", ("regular", "regular"))
-    for name, own in (
-        ("one", pair),
-        ("two", pair.replace("value_deg = 90.0", "value_deg = 80.0")),
-        ("three", pair.replace("same1.png", "none.png")),
-    ):
-        write_manifest(Path(shutil.copytree(trihedral[0], root / name)), own, name=name)
+    for name, change in (("two", ("value_deg = 90.0", "value_deg = 80.0")), ("three", ("same1.png", "none.png"))):
+        write_manifest(Path(shutil.copytree(trihedral[0], root / name)), pair.replace(*change), name=name)
     return root
 
 
@@ -107,19 +110,17 @@ def _pictures_of_one(pictures: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_bad_calibration_of_a_data_set_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_bad_calibration_of_a_data_set_is_warned_of(captures: Path, caplog: pytest.LogCaptureFixture) -> None:
     """What it says of angles and baselines rests on it; cameras that no pair uses do not matter."""
-    text = (LAB / "dataset.toml").read_text(encoding="utf-8").replace("../../calib", str(REPOSITORY / "calib"))
-    text = text.replace('"images/', f'"{LAB}/images/')
-    head, *pairs = text.split("[[pairs]]")
-    text = head + "[[pairs]]" + next(p for p in pairs if 'id = "fisheye-general"' in p)
+    folder = Path(shutil.copytree(captures / "one", captures / "called-bad"))
+    manifest = folder / "dataset.toml"
+    text = manifest.read_text(encoding="utf-8")
     printed = {"severity": "bad", "message": "two cameras are mixed", "remedy": "calibrate each"}
     for name in ("mvca020_r61", "mvca020_fe185"):
         source = REPOSITORY / "calib" / "cameras" / name / "calibration.json"
-        own = tmp_path / f"{name}.json"
+        own = folder / f"{name}.json"
         own.write_text(json.dumps(json.loads(source.read_text()) | {"verdicts": [printed]}))
         text = text.replace(str(source), str(own))
-    manifest = tmp_path / "dataset.toml"
     manifest.write_text(text, encoding="utf-8")
     load_cameras(load_dataset(manifest))
     called = "the calibration's verdict is bad: two cameras are mixed"

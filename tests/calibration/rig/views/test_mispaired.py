@@ -25,15 +25,15 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
 NOISE_PX = 0.1
-FRAMES, FEW_FRAMES = 10, 6
+FRAMES = 10
 LENS = lens("reg")
 RIGHT_FROM_LEFT = Rigid3(exp_so3(np.array([0.01, -0.05, 0.02])), [-100.0, 2.0, 1.0])
 
 
-def pair(rng: np.random.Generator, board: Board = BOARD, frames: int = FRAMES) -> Views:
+def pair(rng: np.random.Generator, board: Board = BOARD) -> Views:
     """Return frames that two cameras of one lens see."""
     views: Views = {"left": [], "right": []}
-    while len(views["left"]) < frames:
+    while len(views["left"]) < FRAMES:
         rotation = exp_so3(rng.normal(size=3) * np.array([0.4, 0.4, 0.3]))
         place = np.array([rng.uniform(-80, 150), rng.uniform(-90, 90), rng.uniform(400, 700)])
         left_from_board = Rigid3(rotation, place - rotation @ board.points().mean(axis=0))
@@ -122,7 +122,7 @@ def test_a_board_that_was_moved_is_no_such_mistake(rng: np.random.Generator) -> 
 
 
 def test_one_off_in_all_frames(rng: np.random.Generator) -> None:
-    views = pair(rng, frames=FEW_FRAMES)
+    views = pair(rng)
     views["right"] = [(str(int(f) + 1), view) for f, view in views["right"]]
     assert "the images of 'right' belong to one frame earlier in all frames:" in cause(views)
 
@@ -130,7 +130,7 @@ def test_one_off_in_all_frames(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize("board", [BOARD, Board("even", 8, 6, 30.0, 30.0)])
 def test_one_camera_mirrored(board: Board, rng: np.random.Generator) -> None:
     """A chessboard's mirror image is one: its rows or its columns are counted from the other end."""
-    views = pair(rng, board, FEW_FRAMES)
+    views = pair(rng, board)
     width, side = LENS.size_px[0] - 1.0, 0 if board.columns % 2 == 0 else 1
     far = board.size[side] - 1
     flipped = []
