@@ -238,6 +238,7 @@ def test_a_session_of_as_many_cameras_as_are_known(tmp_path: Path, capsys: pytes
     [
         ("photos --square-mm -3", "init: --square-mm: a positive number of mm is needed, got '-3.0'"),
         ("photos --square-mm nan", "init: --square-mm: a positive number of mm is needed, got 'nan'"),
+        ("photos --square-mm 50 --model foo", "rigkit: camera model 'foo' is unknown; known: brown"),
         ("photos --square-mm 50 --board 8x6x50", "rigkit: --board states the square size already"),
         ("photos/1.jpg --board 8x6x50", "'photos/1.jpg' is an image; give the folder that holds it instead, 'photos'"),
         ("photos --board b.toml -o b.toml --force", "'b.toml'"),

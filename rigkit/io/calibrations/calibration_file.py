@@ -288,13 +288,15 @@ Entry = TypeVar("Entry", Outlier, Candidate, Convergence, BoardShape)
 
 
 def _entry(kind: type[Entry], values: dict[str, Any]) -> Entry:
-    """Return the dataclass of these values; raises TypeError if a str, int or bool field has another type."""
+    """Return the dataclass of these values; raises TypeError or ValueError if a field has another type."""
     for name, wanted in get_type_hints(kind).items():
+        value = values.get(name)
         # Not isinstance: a bool is an int in Python.
-        if wanted in (str, int, bool) and type(values.get(name)) is not wanted:
-            raise TypeError(f"'{name}' is {values.get(name)!r}, not {wanted.__name__}")
-        if wanted is float and name in values and not math.isnan(values[name]):
-            real(values[name])
+        if wanted in (str, int, bool) and type(value) is not wanted:
+            raise TypeError(f"'{name}' is {value!r}, not {wanted.__name__}")
+        number = wanted is float or (wanted == float | None and value is not None)
+        if number and name in values and value is not math.nan:
+            real(value)
     return kind(**values)
 
 

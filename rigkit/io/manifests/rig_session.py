@@ -178,7 +178,8 @@ def _baseline(entry: TomlTable, names: Sequence[str]) -> MeasuredBaseline:
             raise entry.error(f"'{end}' is '{entry[end]}', which is unknown; known: {', '.join(names)}")
     if entry["a"] == entry["b"]:
         raise entry.error(f"'a' and 'b' are both '{entry['a']}'; name two cameras")
-    return MeasuredBaseline(entry["a"], entry["b"], MeasuredLength(*measured_value(entry, "mm")))
+    with entry.located():
+        return MeasuredBaseline(entry["a"], entry["b"], MeasuredLength(*measured_value(entry, "mm")))
 
 
 def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None) -> dict[str, dict[str, str]]:

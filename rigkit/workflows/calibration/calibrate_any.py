@@ -9,6 +9,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 
+from rigkit.cameras.registry import camera_model
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.progress import Progress, silent
 from rigkit.io.boards.board_words import board_of_words
@@ -156,6 +157,8 @@ def new_session(
 
     Raises as `calibrate_folders` for boards and cameras.
     """
+    if folder_options.model not in (None, "auto"):
+        camera_model(folder_options.model)  # Refused before boards are searched for, which takes long.
     boards = _boards([folder], folder_options, progress)
     return _session([folder], boards, path, folder_options, CalibrateOptions(), progress)[0]
 

@@ -172,6 +172,8 @@ def spoiled(data: object, rng: np.random.Generator) -> object:
         ("candidates", "name", 7),
         ("candidates", "chosen", 1),
         ("candidates", "parameter_count", 1.5),
+        ("candidates", "heldout_rms_px", "0.1"),
+        ("candidates", "heldout_rms_px", True),
         ("convergence", "iterations", True),
         ("convergence", "reason", None),
     ],

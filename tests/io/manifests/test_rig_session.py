@@ -82,6 +82,7 @@ def test_reads_boards_on_one_mount(tmp_path: Path) -> None:
         (TWO + IMAGES + RIGID + "angles = [ { a = 'board', b = 'other', value_deg = 90.0 } ]\n", "sigma_deg"),
         (TWO + IMAGES + RIGID + 'baseline = { value_mm = 3.0, sigma_mm = 1.0, how = "rule" }\n', "key 'baseline'"),
         (TWO + IMAGES + RIGID + "images = 'x.png'\n", "unknown key 'images'"),
+        (HEAD + LEFT + RIGHT + BASELINE.replace("100.0", "0.5"), "session.toml: [[baselines]] number 1: length"),
     ],
 )
 def test_bad_files_are_explained(text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
