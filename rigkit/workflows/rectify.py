@@ -138,7 +138,7 @@ def rectify_stereo_images(
     ----------
     images : two images; two folders; one folder of both cameras' images (left01, right01, or folders left and right);
         or two videos. Images of the same name or number are paired, as are frames of the same number. If both are
-        named after the cameras, the names assign them to the cameras, else their order does.
+        named after the cameras (right, left; right01, left01), the names assign them to the cameras, else their order.
     rig : file of the rig, of rigkit or another tool.
     options : the view, without angles and size.
     names : the two cameras; None: the rig's first two.
@@ -149,8 +149,7 @@ def rectify_stereo_images(
         )
     both, (camera1, camera2), cam2_from_cam1 = import_pair(rig, names)
     if names is None and not isinstance(images, (str, Path)):
-        called = {Path(one).name if Path(one).is_dir() else Path(one).stem: one for one in images}
-        images = (called[both[0]], called[both[1]]) if called.keys() == set(both) else images
+        images = _in_order(images, both)
     with ExitStack() as stack:
         sources, single = _pairs(images, both, stack)
         out = options.output
@@ -175,6 +174,13 @@ def rectify_stereo_images(
         written, failures = _write(both_jobs, covered, rig, options, progress)
     _write_maps([pair.map1, pair.map2], pair, options)
     return RectificationResult(written, {**single, **failures}, pair)
+
+
+def _in_order(images: tuple[str | Path, str | Path], names: tuple[str, str]) -> tuple[str | Path, str | Path]:
+    """Return the images in the order of the cameras, if their names differ by the names of the cameras only."""
+    one, two = (Path(image).name if Path(image).is_dir() else Path(image).stem for image in images)
+    first, second = names
+    return images[::-1] if second in one and one.replace(second, first) == two else images
 
 
 def _pairs(

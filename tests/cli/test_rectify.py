@@ -86,19 +86,20 @@ def test_nothing_is_overwritten_and_errors_are_one_line(
 
 @pytest.mark.parametrize("projection", ["perspective", "equirectangular"])
 def test_a_pair_gets_the_same_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str], projection: str) -> None:
-    """A bright blob in both images, where each camera sees one point: after rectification on one row."""
+    """A bright blob in both images, where each camera sees one point: after rectification on one row. Their names say
+    which camera took which, not their order."""
     poses = {"left": Rigid3.identity(), "right": Rigid3(exp_so3(np.array([0.05, -0.1, 0.2])), [-200.0, 20.0, 10.0])}
     entries = []
     for name, pose in poses.items():
         blob, _ = CAMERA.project(pose.apply(np.array([150.0, 200.0, 900.0])))
         v, u = np.mgrid[0:120, 0:160]
         image = 30.0 + 200.0 * np.exp(-((u - blob[0]) ** 2 + (v - blob[1]) ** 2) / 18.0)
-        cv2.imwrite(str(tmp_path / f"{name}.png"), np.rint(image).astype(np.uint8))
+        cv2.imwrite(str(tmp_path / f"{name}04.png"), np.rint(image).astype(np.uint8))
         matrix = pose.matrix()[:3].tolist()
         entries.append({"name": name, "camera": camera_to_json(CAMERA), "cam_from_rig": matrix, "rms_px": 0.1})
     rig = tmp_path / "rig.json"
     rig.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": entries}))
-    images = [str(tmp_path / "left.png"), str(tmp_path / "right.png")]
+    images = [str(tmp_path / "right04.png"), str(tmp_path / "left04.png")]
     arguments = ["rectify", *images, "--rig", str(rig), "-o", str(tmp_path / "r.png"), "--projection", projection]
     assert main([*arguments, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
