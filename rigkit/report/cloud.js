@@ -8,6 +8,8 @@ const CLOUD_START = {yaw: -0.3, pitch: 0.2, zoom: 1, u: 0, v: 0};
 const CLOUD_DISTANCE = 2.6;
 const CLOUD_FILL = 1.3;
 const CLOUD_TURN = 0.008;
+const CLOUD_SHARE = 0.88;
+const CLOUD_INSIDE = 0.99;
 const NEAREST = 0.1;
 const MAX_PX = 7;
 
@@ -18,11 +20,33 @@ function cloudView(canvas) {
   const normals = new Int8Array(packed.buffer, 12 * count, 3 * count), colours = packed.subarray(15 * count);
   const tools = canvas.parentElement, pen = canvas.getContext("2d", {willReadFrequently: true});
   const shape = tools.querySelector("[data-shape]"), turning = tools.querySelector("[data-turn]");
-  let view = {...CLOUD_START}, image = null, depths = null, asked = false, last = null;
+  let view = null, image = null, depths = null, asked = false, last = null;
+
+  // The first view, zoomed and moved until nearly all points fill the canvas.
+  function fitted() {
+    const start = CLOUD_START, cy = Math.cos(start.yaw), sy = Math.sin(start.yaw);
+    const cp = Math.cos(start.pitch), sp = Math.sin(start.pitch);
+    const across = [], along = [];
+    for (let j = 0; j < 3 * count; j += 3) {
+      const ahead = cy * places[j + 2] - sy * places[j], far = cp * ahead - sp * places[j + 1] + CLOUD_DISTANCE;
+      if (far < NEAREST) continue;
+      across.push((cy * places[j] + sy * places[j + 2]) / far);
+      along.push((cp * places[j + 1] + sp * ahead) / far);
+    }
+    const width = canvas.clientWidth, height = canvas.clientHeight, scale = CLOUD_FILL * Math.min(width, height);
+    const ends = [across, along].map((own) => {
+      const sorted = Float64Array.from(own).sort(), last = sorted.length - 1;
+      return [sorted[Math.floor((1 - CLOUD_INSIDE) * last)] * scale, sorted[Math.ceil(CLOUD_INSIDE * last)] * scale];
+    });
+    const zoom = CLOUD_SHARE * Math.min(width / (ends[0][1] - ends[0][0]), height / (ends[1][1] - ends[1][0]));
+    if (!Number.isFinite(zoom)) return {...start};
+    return {...start, zoom, u: (-zoom * (ends[0][0] + ends[0][1])) / 2, v: (-zoom * (ends[1][0] + ends[1][1])) / 2};
+  }
 
   function draw() {
     asked = false;
     if (!canvas.clientWidth) return;
+    view = view || fitted();
     const begin = performance.now(), ratio = window.devicePixelRatio || 1;
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (!image || canvas.width !== width || canvas.height !== height) {
@@ -100,7 +124,7 @@ function cloudView(canvas) {
     ask();
   }, {passive: false});
   canvas.addEventListener("dblclick", () => {
-    view = {...CLOUD_START};
+    view = fitted();
     ask();
   });
   canvas.addEventListener("keydown", (e) => {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,12 @@ box.checked = true;
 const grey = drawn();
 const differ = before.filter((v, i) => v !== after[i]).length;
 const same = grey.filter((v, i) => i % 4 === 0 && (v !== grey[i + 1] || v !== grey[i + 2])).length;
-document.body.dataset.probe = [first, second, count(before, 0), count(before, 2), differ, same].join("|");
+const rows = before.flatMap((v, i) => i % 4 === 3 && v ? [Math.floor(i / 4 / canvas.width)] : []);
+const columns = before.flatMap((v, i) => i % 4 === 3 && v ? [Math.floor(i / 4) % canvas.width] : []);
+columns.sort((a, b) => a - b);
+const wide = (columns[columns.length - 1] - columns[0]) / canvas.width;
+const tall = (rows[rows.length - 1] - rows[0]) / canvas.height;
+document.body.dataset.probe = [first, second, count(before, 0), count(before, 2), differ, same, tall, wide].join("|");
 </script></body>"""
 
 
@@ -50,12 +56,21 @@ def test_a_cloud_is_drawn_near_points_before_far_ones_and_turns(tmp_path: Path, 
     assert not re.search(r"""(src|href)=["']?https?:""", page)
     assert "A &lt; B" in page
     assert "half of them known to 0.25 mm or better" in page
-    first, second, red, blue, differ, coloured = probed(page.replace("</body>", PROBE), tmp_path)
+    first, second, red, blue, differ, coloured, *_ = probed(page.replace("</body>", PROBE), tmp_path)
     assert abs(float(first.split()[0]) - float(second.split()[0])) > 0.05
     assert int(red) > 20_000
     assert 0 < int(blue) < 0.5 * int(red)
     assert int(differ) > 10_000
     assert int(coloured) == 0
+
+
+def test_a_deep_cloud_fills_the_first_view(tmp_path: Path, rng: np.random.Generator) -> None:
+    cloud = sheets(20_000, rng)
+    deep = replace(
+        cloud, points_mm=cloud.points_mm * [1.0, 1.0, 0.0] + [[0.0, 0.0, 1.0]] * rng.uniform(500, 1700, (20_000, 1))
+    )
+    *_, tall, wide = probed(build_cloud_page("deep", deep, {}, unit="mm").replace("</body>", PROBE), tmp_path)
+    assert 0.8 < max(float(tall), float(wide)) < 1.0
 
 
 def test_of_very_many_points_some_are_shown(rng: np.random.Generator) -> None:
