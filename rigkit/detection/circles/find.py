@@ -12,7 +12,15 @@ from rigkit.detection.circles.blobs import Blobs, find_blobs
 from rigkit.detection.circles.certainty import centre_sigmas
 from rigkit.detection.circles.evidence import GridEvidence
 from rigkit.detection.circles.fit import CircleFit, edge_reach, fit_circles
-from rigkit.detection.circles.local_map import CORNER, PlaneMap, beside_each, local_maps, steps, with_smooth_curvatures
+from rigkit.detection.circles.local_map import (
+    CORNER,
+    PlaneMap,
+    Radii,
+    beside_each,
+    local_maps,
+    steps,
+    with_smooth_curvatures,
+)
 from rigkit.detection.circles.rows import joined, rows_of
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS
@@ -70,7 +78,7 @@ class CircleGrid:
     maps : (N, 2, 2) px per radius.
     hexagonal : whether the second direction is at 60 degrees to the first, not at 90.
     bright : whether the circles are brighter than the sheet.
-    radius : of the circles, in distances of neighbours.
+    radius : of the printed circles, in distances of neighbours.
     blur_px, contrast, share : typical blur of an edge, contrast in grey levels, and contrast relative to the brighter
         of circle and sheet.
     uneven_px2 : (2,) anisotropy of the blur (`fit_circles`).
@@ -129,7 +137,7 @@ class _Draft:
     label: IntArray
     fit: CircleFit
     around: PlaneMap
-    radius: float
+    radius: Radii
     hexagonal: bool
     bright: bool
     uneven_px2: FloatArray = field(default_factory=lambda: np.zeros(2))
@@ -163,7 +171,7 @@ def _first(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, beside: bool 
     """Return the circles of blobs; `beside`: fitted with the light of neighbours."""
     own, label, hexagonal = blobs.chosen(found.index), found.label, found.hexagonal
     around = local_maps(label, own.pixels, label, hexagonal=hexagonal, sigma_px=FIRST_SIGMA_PX)
-    radius = _radius(own.shape, around.first)
+    radius = Radii.of(own.shape, around)
     others, corner = (beside_each(label, hexagonal), CORNER[hexagonal]) if beside else (None, 1.0)
     blur = np.full(len(own), FIRST_EDGE_BLUR)
     fit = _fitted(grey, own.pixels, around, radius, corner, blur, np.zeros(2), others)
@@ -194,18 +202,11 @@ def _enough(draft: _Draft) -> bool:
     return len(draft.label) >= MIN_CIRCLES and _wide(draft.label)
 
 
-def _radius(maps: FloatArray, first: FloatArray) -> float:
-    """Return the radius in distances of neighbours."""
-    with np.errstate(all="ignore"):
-        ratio = np.sqrt(np.abs(np.linalg.det(maps) / np.linalg.det(first)))
-    return float(np.nanmedian(ratio))
-
-
 def _fitted(
     grey: GreyImage,
     pixels: FloatArray,
     around: PlaneMap,
-    radius: float,
+    radius: Radii,
     corner: float,
     blur_px: FloatArray,
     uneven_px2: FloatArray,
@@ -213,10 +214,10 @@ def _fitted(
     known: int = 0,
 ) -> CircleFit:
     """Return the fitted circles, except for the first `known`, which are only used as neighbours of the others."""
-    maps = radius * around.first
-    reach = edge_reach(maps, 0.5 / radius, blur_px, around.surrounded, corner)
+    maps = radius.seen * around.first
+    reach = edge_reach(maps, 0.5 / radius.seen, blur_px, around.surrounded, corner)
     reach[:known] = 0.0
-    return fit_circles(grey, pixels, maps, radius**2 * around.second, blur_px, reach, beside, uneven_px2)
+    return fit_circles(grey, pixels, maps, radius.printed**2 * around.second, blur_px, reach, beside, uneven_px2)
 
 
 def like_contrast(fit: CircleFit, contrast: float, share: float) -> BoolArray:
@@ -257,10 +258,8 @@ def _tested(draft: _Draft, tolerance: float = 1.0) -> _Draft:
 
 
 def _own_growth(fit: CircleFit, good: BoolArray) -> FloatArray:
-    """Return the growth (N, 3) of circles minus the median growth of size of the `good` ones.
-
-    Fitted without their neighbours' light, all circles seem smaller than they are.
-    """
+    """Return the growth (N, 3) of circles minus the median growth of size of the `good` ones: fitted without their
+    neighbours' light, all circles seem smaller than they are."""
     common = float(np.median(fit.growth[good, 0])) if good.any() else 0.0
     return np.asarray(fit.growth - np.array([common, 0.0, 0.0]))
 
@@ -276,7 +275,7 @@ def _again(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
     around = local_maps(draft.label, fit.pixels, draft.label, hexagonal=draft.hexagonal, sigma_px=_sigma(fit))
     size_px = (grey.shape[1], grey.shape[0])
     around = with_smooth_curvatures(around, draft.label, fit.pixels, size_px, hexagonal=draft.hexagonal)
-    radius = _radius(fit.maps, around.first)
+    radius = Radii.of(fit.maps, around, moved=bool(draft.uneven_px2.any()))
     others = beside_each(draft.label, draft.hexagonal) if beside else None
     fresh = _fitted(grey, fit.pixels, around, radius, draft.corner, fit.blur_px, draft.uneven_px2, others)
     return _tested(replace(draft, fit=fresh, around=around, radius=radius))
@@ -304,7 +303,7 @@ def _through_its_blur(grey: GreyImage, draft: _Draft) -> _Draft:
     """
     grown = False
     for done in range(BLUR_ROUNDS):
-        half_gap_px = (0.5 / draft.radius - 1.0) * np.sqrt(np.abs(np.linalg.det(draft.fit.maps)))
+        half_gap_px = (0.5 / draft.radius.seen - 1.0) * np.sqrt(np.abs(np.linalg.det(draft.fit.maps)))
         beside = bool((half_gap_px < TAIL_SIGMAS * draft.fit.blur_px).any())
         uneven = _uneven(draft)
         change = float(np.linalg.norm(uneven - draft.uneven_px2))
@@ -358,7 +357,7 @@ def _beside(draft: _Draft, size_px: tuple[int, int]) -> tuple[IntArray, PlaneMap
     beside = {tuple(place) for place in (draft.label[:, None] + step).reshape(-1, 2).tolist()}
     places = np.array(sorted(beside - known), np.int64).reshape(-1, 2)
     around = local_maps(draft.label, draft.fit.pixels, places, hexagonal=draft.hexagonal, sigma_px=_sigma(draft.fit))
-    extent = draft.radius * np.sqrt((around.first**2).sum(axis=2))
+    extent = draft.radius.seen * np.sqrt((around.first**2).sum(axis=2))
     inside = ((around.pixels > extent) & (around.pixels < np.array(size_px) - 1.0 - extent)).all(axis=1)
     fine = inside & (around.support >= SUPPORT) & (around.gain < MAX_GAIN) & (extent.min(axis=1) > 1.0)
     return places[fine], rows_of(around, fine)
@@ -386,11 +385,11 @@ def _finished(draft: _Draft, evidence: GridEvidence, size_px: tuple[int, int]) -
     return CircleGrid(
         label=label[order],
         pixels=fit.pixels[order],
-        sigma_px=centre_sigmas(fit, label, draft.around.slope_gain, draft.radius)[order],
+        sigma_px=centre_sigmas(fit, label, draft.around.slope_gain, draft.radius.seen)[order],
         maps=fit.maps[order],
         hexagonal=draft.hexagonal,
         bright=draft.bright,
-        radius=draft.radius,
+        radius=draft.radius.printed,
         blur_px=float(np.median(fit.blur_px)),
         contrast=float(np.median(np.abs(fit.contrast))),
         share=float(np.median(fit.share)),

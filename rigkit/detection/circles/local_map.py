@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import factorial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +26,9 @@ TYPICAL_DERIVATIVES = (np.inf, np.inf, 0.3, 0.1, 0.03)
 """Prior standard deviations of derivatives of order 0 to 4, in distances of neighbours: each is a third of the one
 before if lens or slant bends the lattice as strongly as its circles can still be linked. They limit the effect of the
 scatter of few neighbours."""
+SPREAD_PX, MIN_SCATTER_PX = 0.5, 1e-3
+"""Prior standard deviation of the px by which the edges of all circles are moved alike, and smallest standard deviation
+of half axes. They matter only where all circles are as large, and then the centre hardly depends on them."""
 MIN_RIDGE = 1e-9
 """Smallest regularisation, for fewer neighbours than terms."""
 SLIGHT = 1e-4
@@ -56,6 +60,38 @@ class PlaneMap:
     surrounded: BoolArray
     gain: FloatArray
     slope_gain: FloatArray
+
+
+class Radii(NamedTuple):
+    """The radius of a board's circles in distances of neighbours: as their edges are `seen`, and as they are `printed`.
+
+    A tone curve, saturation and ink move all edges by the same number of px. The image of the centre follows from the
+    printed circle, the rim of a larger one curves more.
+    """
+
+    seen: float
+    printed: float
+
+    @classmethod
+    def of(cls, maps: FloatArray, around: PlaneMap, *, moved: bool = False) -> Radii:
+        """Return the radii of circles with `maps` (N, 2, 2), px per radius.
+
+        The printed one is the slope of the line through the half axes over the distances of neighbours, both in px:
+        slanted and distant circles have small ones. It is not told from the other if the camera `moved`: edges are then
+        moved by different amounts along the motion and across.
+        """
+        with np.errstate(all="ignore"):
+            seen = float(np.nanmedian(np.sqrt(np.abs(np.linalg.det(maps) / np.linalg.det(around.first)))))
+        used = around.surrounded & np.isfinite(around.first).all(axis=(1, 2)) & np.isfinite(maps).all(axis=(1, 2))
+        if moved or not used.any():
+            return cls(seen, seen)
+        directions, distance_px, _ = np.linalg.svd(around.first[used])
+        half_px = np.linalg.norm(np.swapaxes(maps[used], 1, 2) @ directions, axis=1)
+        distance, off_px = distance_px.ravel(), half_px.ravel() - seen * distance_px.ravel()
+        terms = np.stack([distance, np.ones_like(distance)], axis=1)
+        scatter_px = MIN_SCATTER_PX + float(np.median(np.abs(off_px - np.median(off_px))))
+        more, _ = np.linalg.solve(terms.T @ terms + np.diag([0.0, (scatter_px / SPREAD_PX) ** 2]), terms.T @ off_px)
+        return cls(seen, seen + float(more))
 
 
 CORNER = {False: np.sqrt(2.0), True: np.sqrt(4.0 / 3.0)}
