@@ -1,17 +1,17 @@
-"""`rigkit check` on simulated lenses whose entrance pupils move: see `bench_sentinel.py`."""
+"""`rigkit check` on simulated lenses whose entrance pupils move: see `bench_check.py`."""
 
 from __future__ import annotations
 
 import numpy as np
 from measure_pupil import BOARD, NEAREST_MM, NOISE_PX, SIZE, TRUTH, drawn_session, near_boards
 
+from checking.tally import CHANGED_PX, FRESH, checked, tell
 from rigkit.calibration.calibrate import calibrate
 from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.goal import projection_goal
 from rigkit.validation.monitoring.judge import CalibrationCheck
-from sentinel.tally import CHANGED_PX, FRESH, checked, tell
 
 PUPIL, REACH_DEG = (3.0, -0.3), 80.0
 

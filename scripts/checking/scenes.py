@@ -1,4 +1,4 @@
-"""`rigkit check` on real pairs of textured scenes, without boards: see `bench_sentinel.py`."""
+"""`rigkit check` on real pairs of textured scenes, without boards: see `bench_check.py`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from checking.tally import SCENE_TURNED_DEG, tell, turned
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
@@ -24,7 +25,6 @@ from rigkit.validation.monitoring.baseline import check_since
 from rigkit.validation.monitoring.epipolar import PairMatches, check_matches, evidence_of_matches, scene_matches
 from rigkit.validation.monitoring.evidence import FreshView, Monitored, evidence_of
 from rigkit.validation.monitoring.judge import CalibrationCheck
-from sentinel.tally import SCENE_TURNED_DEG, tell, turned
 
 BOARD = Board("b", 9, 6, 25.0, 25.0)
 BASELINE_MM = 100.0

@@ -17,7 +17,7 @@ real: real captures; three, or half, of the images are checked against a calibra
 ordered: real captures; the first or last images are checked against a calibration from the others.
 since: the same as real, and real rigs whose mount turned, since others of these images (`--before`).
 
-    python scripts/bench_sentinel.py [lens] [rig] [departs] [pupil] [rendered] [scene] [pairs] [real] [ordered] [since]
+    python scripts/bench_check.py [lens] [rig] [departs] [pupil] [rendered] [scene] [pairs] [real] [ordered] [since]
         [--seeds 20] [--lens NAME ...] [--board 9x6x25] [--parameters-alone]
 """
 
@@ -34,13 +34,13 @@ from pathlib import Path
 import bench_planner
 import numpy as np
 from bench_planner import LENSES, Lens, by_hand, free_poses, see
+from checking.captures import SAID, left_out, ordered, real
+from checking.pupils import pupils
+from checking.scenes import pairs
+from checking.since import RIGS, since_cameras, since_rigs
+from checking.tally import CHANGED_PX, COUNTED, FRESH, KINDS, SCENE_TURNED_DEG, TALLY, checked, tell, turned, unchanged
 from halves.captures import identified
 from scipy.special import ndtr, ndtri
-from sentinel.captures import SAID, left_out, ordered, real
-from sentinel.pupils import pupils
-from sentinel.scenes import pairs
-from sentinel.since import RIGS, since_cameras, since_rigs
-from sentinel.tally import CHANGED_PX, COUNTED, FRESH, KINDS, SCENE_TURNED_DEG, TALLY, checked, tell, turned, unchanged
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.displaced import DisplacedCamera
@@ -292,7 +292,7 @@ def rendered_view(camera: Camera, pose: Rigid3, name: str, rng: np.random.Genera
 
 def rendered(name: str, seeds: int, cache: Path) -> None:
     """Pictures of one lens, unchanged and changed."""
-    lens, kept = LENSES[name], cache / f"sentinel-told-{name}-{seeds}.pickle"
+    lens, kept = LENSES[name], cache / f"bench-check-told-{name}-{seeds}.pickle"
     if not kept.is_file():
         rng = np.random.default_rng(17)
         free = free_poses(lens, rng)

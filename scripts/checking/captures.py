@@ -1,4 +1,4 @@
-"""`rigkit check` on real captures, and on real pairs of textured scenes: see `bench_sentinel.py`."""
+"""`rigkit check` on real captures, and on real pairs of textured scenes: see `bench_check.py`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from halves.captures import load
 
+from checking.tally import CHANGED_PX, FRESH, KINDS, checked, tell, unchanged
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
@@ -16,7 +17,6 @@ from rigkit.planning.goal import projection_goal
 from rigkit.validation.monitoring.hypotheses import hypotheses_of
 from rigkit.validation.monitoring.judge import ALARM_CHANCE, ALARM_PX, CalibrationCheck
 from rigkit.validation.monitoring.watch import monitored_camera
-from sentinel.tally import CHANGED_PX, FRESH, KINDS, checked, tell, unchanged
 
 
 def real(name: str, data: Path, cache: Path, draws: int) -> None:

@@ -1,4 +1,4 @@
-"""`rigkit check` on real boards since pictures of before (`rigkit check --before`): see `bench_sentinel.py`."""
+"""`rigkit check` on real boards since pictures of before (`rigkit check --before`): see `bench_check.py`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from halves.captures import load
 
+from checking.tally import FRESH, tell, turned
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.base import Camera
@@ -22,7 +23,6 @@ from rigkit.validation.monitoring.evidence import FreshView, Monitored, evidence
 from rigkit.validation.monitoring.flipped import consistently_numbered
 from rigkit.validation.monitoring.judge import CalibrationCheck
 from rigkit.validation.monitoring.watch import monitored_camera, monitored_rig
-from sentinel.tally import FRESH, tell, turned
 
 RIGS = ("bouguet", "bumblebee", "charuco-stereo")
 """Of these names with -left and -right."""

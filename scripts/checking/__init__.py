@@ -1,0 +1,1 @@
+"""Real captures, scenes and statistics for `bench_check.py`."""

@@ -1,1 +1,0 @@
-"""Real captures, scenes and statistics for `bench_sentinel.py`."""
