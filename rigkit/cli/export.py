@@ -1,4 +1,4 @@
-"""`rigkit export`: convert cameras and rigs between formats; clouds to PLY and LAS, of a data set also to npz and COLMAP."""
+"""`rigkit export`: convert cameras and rigs between formats; clouds to PLY, LAS, of a data set also to npz, COLMAP."""
 
 from __future__ import annotations
 
