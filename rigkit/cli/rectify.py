@@ -29,7 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     stereo.add_argument("--rig", metavar="RIG", help="the rig's file, instead of --camera")
     stereo.add_argument(
-        "--names", nargs=2, metavar=("ONE", "TWO"), help="cameras of the two images (default: the rig's first two)"
+        "--names",
+        nargs=2,
+        metavar=("ONE", "TWO"),
+        help="cameras of the two images (default: those that their names say, else the rig's first two)",
     )
     view = parser.add_argument_group("view")
     add_options(view, RectifyOptions, projection="", hfov_deg="DEG")

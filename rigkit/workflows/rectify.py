@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_
 from rigkit.rectification.stereo import StereoRectification, rectify_pair
 from rigkit.rectification.targets import target_camera
 from rigkit.workflows.detect import images_in
-from rigkit.workflows.inputs.camera_files import import_camera, import_pair
+from rigkit.workflows.inputs.camera_files import import_camera, import_pair, rig_of_file
 from rigkit.workflows.inputs.folder_session import cameras_in, images_of_camera
 from rigkit.workflows.moments import grouped_by_moment, warn_of_several_cameras
 from rigkit.workflows.options.cameras import RectifyOptions
@@ -141,15 +142,15 @@ def rectify_stereo_images(
         named after the cameras (right, left; right01, left01), the names assign them to the cameras, else their order.
     rig : file of the rig, of rigkit or another tool.
     options : the view, without angles and size.
-    names : the two cameras; None: the rig's first two.
+    names : the two cameras; None: those that the images are named after, else the rig's first two.
     """
     if options.hfov_deg is not None or options.size_px is not None or any(options.angles_deg):
         raise InputError(
             "rectify: the baseline determines the view of a stereo pair; leave out the view's angles and --size"
         )
-    both, (camera1, camera2), cam2_from_cam1 = import_pair(rig, names)
     if names is None and not isinstance(images, (str, Path)):
-        images = _in_order(images, both)
+        images, names = _assigned(images, tuple(rig_of_file(rig).cameras))
+    both, (camera1, camera2), cam2_from_cam1 = import_pair(rig, names)
     with ExitStack() as stack:
         sources, single = _pairs(images, both, stack)
         out = options.output
@@ -176,11 +177,18 @@ def rectify_stereo_images(
     return RectificationResult(written, {**single, **failures}, pair)
 
 
-def _in_order(images: tuple[str | Path, str | Path], names: tuple[str, str]) -> tuple[str | Path, str | Path]:
-    """Return the images in the order of the cameras, if their names differ by the names of the cameras only."""
+def _assigned(
+    images: tuple[str | Path, str | Path], cameras: Sequence[str]
+) -> tuple[tuple[str | Path, str | Path], tuple[str, str] | None]:
+    """Return the images in the order of their `cameras`, and these two, if the images' names differ by the names of two
+    cameras only; else the images as given, and None."""
     one, two = (Path(image).name if Path(image).is_dir() else Path(image).stem for image in images)
-    first, second = names
-    return images[::-1] if second in one and one.replace(second, first) == two else images
+    for first, second in combinations(cameras, 2):
+        if first in one and one.replace(first, second) == two:
+            return images, (first, second)
+        if second in one and one.replace(second, first) == two:
+            return images[::-1], (first, second)
+    return images, None
 
 
 def _pairs(

@@ -312,9 +312,11 @@ def test_every_frame_of_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_two_videos_frame_by_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = tmp_path / "rig.json"
     poses = {"left": Rigid3.identity(), "right": Rigid3(np.eye(3), np.array([-100.0, 0.0, 0.0]))}
+    # A third camera, which is neither the first nor the second of the rig, is known by the videos' names.
+    every = {"front": Rigid3(np.eye(3), np.array([70.0, 0.0, 0.0])), **poses}
     entries = [
         {"name": name, "camera": camera_to_json(CAMERA), "cam_from_rig": pose.matrix()[:3].tolist(), "rms_px": 0.1}
-        for name, pose in poses.items()
+        for name, pose in every.items()
     ]
     rig.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": entries}))
     _video(tmp_path / "left.avi", [60, 80, 100])
