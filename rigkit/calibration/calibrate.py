@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.choosing.between_models import (
+    RivalFit,
     rival_fits,
     rival_shapes,
     same_model,
@@ -26,7 +27,7 @@ from rigkit.calibration.choosing.lens_choice import ModelChoice, best_sizes, cho
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.choosing.one_model import ModelOutcome, on_same_images
 from rigkit.calibration.judging.moved import moved_lens
-from rigkit.calibration.judging.pupil import may_move
+from rigkit.calibration.judging.pupil import may_move, pupil_is_significant, solved_again
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.solving.fit import Fit
@@ -34,7 +35,6 @@ from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.with_pupil import (
     against_central,
     kept_central,
-    pupil_is_significant,
     require_known,
     solved_with_pupil,
 )
@@ -133,12 +133,12 @@ class _Solution:
     rivals: Sequence[FittedModel]
     likely: Mapping[str, float]
 
-    def assembled(self) -> tuple[Calibration, FarProjection]:
-        """Return the result without verdicts, and the uncertainty of its projection of far points; raises
-        DegenerateError if the views do not determine it."""
+    def assembled(self, more: Sequence[RivalFit] = ()) -> tuple[Calibration, FarProjection]:
+        """Return the result without verdicts, with `more` rivals, and the uncertainty of its projection of far points;
+        raises DegenerateError if the views do not determine it."""
         outcome, fit = self.outcome, self.outcome.chosen.fit
         others = _others(self.tried, far_camera(fit.state.camera).model) if len(models_of(self.tried)) > 1 else []
-        close = rival_fits(outcome.observations, fit, self.rivals, self.likely)
+        close = [*rival_fits(outcome.observations, fit, self.rivals, self.likely), *more]
         if not self.fits.name:
             # In a rig all cameras together choose the boards' shapes.
             close += rival_shapes(outcome.chosen, outcome.shapes)
@@ -228,15 +228,18 @@ def _result(solution: _Solution) -> Calibration:
     if request.pupil == "central" or (request.pupil == "auto" and not may_move(central)):
         return solution.with_verdicts(central, far)
     moving = solved_with_pupil(solution.outcome, solution.fits.observations, request)
-    compared: list[Candidate] = []
+    compared: Sequence[Candidate] = ()
     if moving is not None:
-        better, candidates = against_central(solution.outcome, moving, request)
+        better, candidates, possible = against_central(solution.outcome, moving, request)
         compared = kept_central(candidates)
         other = solution.with_pupil(replace(moving, candidates=[*candidates, *moving.candidates]))
         with suppress(DegenerateError):
             result, far_of_moving = other.assembled()
             if result.pupil is not None and (request.pupil == "moving" or (better and pupil_is_significant(result))):
                 return other.with_verdicts(result, far_of_moving)
+            if possible and solved_again(result) is not None:
+                central, far = solution.assembled(possible)
+                compared = with_rivals(compared, [one.rival for one in possible])
     if request.pupil == "moving":
         raise DegenerateError(
             "calibration: the images do not determine how the entrance pupil moves; take boards near and far, up to "

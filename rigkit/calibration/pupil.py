@@ -55,15 +55,6 @@ class SolvedPupil:
         mm = float(pupil_shift_mm(np.array(theta_rad), self.terms))
         return mm, float(np.sqrt(max(float(by_terms @ self.covariance @ by_terms), 0.0)))
 
-    def chance(self, freedom: float) -> float:
-        """Return the probability of a movement this large for a central lens: the p-value of an F test, where the
-        covariance has `freedom` degrees of freedom."""
-        # Imported here: scipy is slow to import, and few lenses ask.
-        from scipy.special import fdtrc
-
-        size = float(self.terms @ np.linalg.pinv(self.covariance, hermitian=True) @ self.terms) / PUPIL_TERMS
-        return float(fdtrc(PUPIL_TERMS, min(freedom, 1e9), size))
-
 
 def without_pupil(camera: Camera, joint: FloatArray) -> tuple[Camera, FloatArray, SolvedPupil | None]:
     """Return the central camera, the covariance (P + 6, P + 6) of its parameters and the boards' mean motion, and the

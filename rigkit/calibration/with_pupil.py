@@ -2,7 +2,8 @@
 
 The central camera is calibrated first. Where its residuals indicate a moving pupil (`judging.pupil`), all sizes of the
 same model and all board shapes are fitted again with a pupil, and chosen as before. The pupil is kept if it lowers the
-held-out error as two more parameters must, and if it is significant against the scatter between images.
+held-out error as two more parameters must, and if it is significant against the scatter between images with any
+displacement of a central lens free. One that is neither confirmed nor contradicted is a rival of the central lens.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, choose, described
+from rigkit.calibration.choosing.between_models import MIN_LIKELY, RivalFit
+from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut, choose, described
 from rigkit.calibration.choosing.models_tried import Request, cross_validated, enough_agree, reweighted
 from rigkit.calibration.choosing.one_model import ModelOutcome, chosen_of_sizes, on_same_images
-from rigkit.calibration.judging.pupil import BY_CHANCE
-from rigkit.calibration.result import Calibration, Candidate
+from rigkit.calibration.result import Candidate, Rival
 from rigkit.calibration.solving.fit import fit_kept, fit_other_lens, identifiable, posed, robust_sigma
 from rigkit.calibration.solving.outliers import inliers
 from rigkit.calibration.solving.state import State, evaluate
@@ -95,13 +96,20 @@ def _with_dropped_views(
     return replace(found, observations=whole, used=used, reasons=reasons), poses, kept_of_all
 
 
-def against_central(central: ModelOutcome, moving: ModelOutcome, request: Request) -> tuple[bool, list[Candidate]]:
-    """Return whether the held-out error is lower with the moving pupil, on the same corners, and both as candidates."""
+def against_central(
+    central: ModelOutcome, moving: ModelOutcome, request: Request
+) -> tuple[bool, list[Candidate], list[RivalFit]]:
+    """Return whether the held-out error is lower with the moving pupil, on the same corners, both as candidates, and
+    the lens with the pupil as a rival of the central one, if it is probable."""
     options = on_same_images(central, moving, (CENTRAL, MOVING))
     if moving.observations is central.observations:
         options = cross_validated(central.observations, options, request)
-    chosen = choose(options, MIN_SIGMAS)
-    return chosen.name == MOVING, described(options, chosen)
+    chosen, likely = choose(options, MIN_SIGMAS), HeldOut.of([options]).likely().get(MOVING, 0.0)
+    # Views that the central lens dropped come last.
+    state = moving.chosen.fit.state.subset(np.arange(len(central.observations.views)))
+    far = replace(state, camera=far_camera(state.camera))
+    rivals = [RivalFit(Rival(MOVING, far.camera, likely), far)] if likely >= MIN_LIKELY else []
+    return chosen.name == MOVING, described(options, chosen), rivals
 
 
 def kept_central(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -110,11 +118,6 @@ def kept_central(candidates: Sequence[Candidate]) -> list[Candidate]:
         return list(candidates)
     reasons = {CENTRAL: "a moving pupil is not significant", MOVING: "movement not significant"}
     return [replace(c, chosen=c.name == CENTRAL, reason=reasons[c.name]) for c in candidates]
-
-
-def pupil_is_significant(calibration: Calibration) -> bool:
-    """Return whether the pupil of a calibration moves significantly."""
-    return calibration.pupil is not None and calibration.pupil.chance(calibration.freedom) <= BY_CHANCE
 
 
 def require_known(pupil: str) -> None:

@@ -16,6 +16,7 @@ from functools import partial
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
 from rigkit.calibration.choosing.candidate_fits import CandidateFits, camera_named_in_errors
 from rigkit.calibration.choosing.models_tried import Request
+from rigkit.calibration.judging.pupil import pupil_is_significant
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig
@@ -28,7 +29,7 @@ from rigkit.calibration.rig.verdicts import diagnose_rig
 from rigkit.calibration.rig.views.board_places import board_places
 from rigkit.calibration.rig.views.mispaired import duplicate_images, mixup_of_all_frames, mixups_of_frames
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews, frame_observations
-from rigkit.calibration.with_pupil import pupil_is_significant, require_known
+from rigkit.calibration.with_pupil import require_known
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError

@@ -12,7 +12,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty
 from rigkit.calibration.judging.changing import changing
-from rigkit.calibration.judging.pupil import BY_CHANCE, MovingPupil
+from rigkit.calibration.judging.pupil import BY_CHANCE, MovingPupil, pupil_is_significant, solved_again
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.judging.view_evidence import neighbour_correlation, view_evidence
 from rigkit.calibration.pupil import SolvedPupil
@@ -165,8 +165,8 @@ def test_residuals_are_those_of_points_in_mm() -> None:
 
 def test_the_option_pupil_decides_whether_one_is_solved_for() -> None:
     assert session(NEAR, MM_PER_RAD2, 0).pupil is None
-    forced = session(NEAR, 0.0, 1, pupil="moving").pupil
-    assert forced is not None and forced.chance(1e9) > BY_CHANCE
+    forced = session(NEAR, 0.0, 1, pupil="moving")
+    assert forced.pupil is not None and not pupil_is_significant(forced)
     with pytest.raises(InputError, match="auto, central, moving"):
         session(NEAR, 0.0, 1, pupil="perhaps")
 
@@ -179,6 +179,24 @@ def test_an_insignificant_pupil_is_dropped_with_a_finding(monkeypatch: pytest.Mo
     assert printed[CENTRAL].chosen and printed[CENTRAL].reason == "a moving pupil is not significant"
     assert not printed[MOVING].chosen and printed[MOVING].reason == "movement not significant"
     assert session(NEAR, MM_PER_RAD2, 0, pupil="moving").pupil is not None
+
+
+def test_a_few_images_have_a_pupil_or_sigmas_that_include_it() -> None:
+    """Where three to five images do not confirm the pupil, it is a rival of the central lens."""
+    for count in (3, 4, 5):
+        views = views_of_session(NEAR, MM_PER_RAD2, 0)[:count]
+        found = calibrate(views, SIZE, model="kannala_brandt", board="flat")
+        assert found.pupil is not None or MOVING in [rival.name for rival in found.rivals]
+        assert off_far_away(found) < 3.0 * FarProjection.of(found).typical_px
+
+
+def test_residuals_take_back_a_pupil_that_only_a_wrong_model_asks_for() -> None:
+    rng = np.random.default_rng(0)
+    views = random_views(lens("reg"), 12, rng, reach_deg=REACH_DEG["reg"], noise_px=0.05)[0]
+    wrong = calibrate(views, SIZE, model="pinhole", board="flat", folds=0, pupil="moving")
+    assert wrong.pupil is not None and solved_again(wrong) is None and not pupil_is_significant(wrong)
+    again = solved_again(session(NEAR, MM_PER_RAD2, 0, pupil="moving"))
+    assert again is not None and 0.9 * MM_PER_RAD2 < again.mm_per_rad2 < 1.1 * MM_PER_RAD2
 
 
 def test_a_requested_pupil_that_images_do_not_determine_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -200,7 +200,7 @@ def test_the_verdict_does_not_depend_on_how_the_model_was_reached(rng: np.random
     assert "the lens (or the board) changed at image" in str(chosen.verdicts[0])
     tried = {candidate.name.split()[0] for candidate in chosen.candidates}
     assert {"pinhole", "brown", "kannala_brandt", "scaramuzza"} <= tried
-    assert [c.chosen for c in chosen.candidates].count(True) == 1
+    assert [c.chosen for c in chosen.candidates if "pupil" not in c.name].count(True) == 1
 
 
 def test_images_with_two_kinds_of_names_are_of_two_cameras(rng: np.random.Generator) -> None:
