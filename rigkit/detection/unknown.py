@@ -141,7 +141,9 @@ def _guess_from_observations(
     determined = guess is not None and guess.determined
     # There may be a chessboard in the background, or markers that were not read.
     unexplained = [k for k in range(len(images)) if guess is None or k not in guess.images]
-    possibly_marked = marked and guess is not None and guess.board.pattern.type == Chessboard.type
+    # The squares between the tags of an AprilGrid are empty.
+    possibly_marked = marked or not _in_most(plain)
+    possibly_marked &= guess is not None and guess.board.pattern.type == Chessboard.type
     if determined and not unexplained and not possibly_marked:
         return guess
     grids = _inverted_or_aruco_grids(images, unexplained or range(len(images)), determined=determined)

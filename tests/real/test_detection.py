@@ -155,3 +155,10 @@ def test_a_wide_board_is_not_taken_for_a_square_one() -> None:
     (found,) = detect_boards(image, [Board("wide", 22, 12, 88.0, 88.0, pattern=AprilGrid(0.3))])
     assert len(found.grid) > 200
     assert detect_boards(image, [Board("square", 12, 12, 88.0, 88.0, pattern=AprilGrid(0.3))]) == ()
+
+
+def test_a_single_aprilgrid_in_white_on_black_is_no_chessboard() -> None:
+    """The squares between its tags look like one of 5 x 5 corners."""
+    guess = guess_board([255 - read_grey(shared_data("public/aprilgrid") / "r45.png")])
+    assert guess is not None and isinstance(guess.board.pattern, AprilGrid)
+    assert guess.board.pattern.inverted and guess.board.size == (12, 12)
