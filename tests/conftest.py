@@ -8,9 +8,8 @@ import importlib
 import sys
 import types
 import zlib
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -51,35 +50,15 @@ def pytest_collection(session: pytest.Session) -> None:
                     importlib.import_module(".".join(file.relative_to(ROOT).with_suffix("").parts))
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure() -> None:
     """Switch garbage collection off while tests are collected: the many new objects stay, so each pass is wasted.
 
     Open3D imports Dash for drawings in a browser, which no test makes: 1.0 of its 1.7 s in each process.
     """
-    # Which tell of setting up and taking down, too.
-    if not config.option.durations and not getattr(config.option, "xmlpath", None):
-        _send_less(config)
     gc.disable()
     dash = types.ModuleType("dash")
     vars(dash).update(dcc=None, html=None, Dash=None)
     sys.modules.setdefault("dash", dash)
-
-
-def _send_less(config: pytest.Config) -> None:
-    """Let a process of xdist tell of each test that passed in two messages, not six, of which nothing is printed: they
-    took 4 s of processor time of all tests (as many empty ones: 2.8 ms each with six, 1.5 with two)."""
-    for worker in config.pluginmanager.get_plugins():
-        if type(worker).__name__ == "WorkerInteractor":
-            send = worker.sendevent
-
-            def told(name: str, send: Callable[..., None] = send, **told: Any) -> None:
-                if name in ("logstart", "logfinish"):
-                    return
-                if name == "testreport" and told["data"]["outcome"] == "passed" and told["data"]["when"] != "call":
-                    return
-                send(name, **told)
-
-            worker.sendevent = told
 
 
 def pytest_collection_finish() -> None:
