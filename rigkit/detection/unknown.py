@@ -142,7 +142,7 @@ def _guess_from_observations(
     # There may be a chessboard in the background, or markers that were not read.
     unexplained = [k for k in range(len(images)) if guess is None or k not in guess.images]
     # The squares between the tags of an AprilGrid are empty.
-    possibly_marked = marked or not _in_most(plain)
+    possibly_marked = marked or not _most_show_one_size(plain)
     possibly_marked &= guess is not None and guess.board.pattern.type == Chessboard.type
     if determined and not unexplained and not possibly_marked:
         return guess
