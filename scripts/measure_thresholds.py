@@ -8,7 +8,9 @@ Rendered boards (all conditions of the benchmark, blurs up to 3.5 px, squares do
 blank pictures of the benchmark, grids of dots) are always used; `--boards` adds folders of images of boards,
 `--without` folders of images without boards. Each real image and pattern is used with degraded copies: blurred, noisy,
 compressed, sharpened, faint, shrunk, covered, cut. Lattices at boards found in the original image are positives; other
-lattices of such images are left out. Random blocks of codes and mosaics, which are real pieces of chessboards, are left
+lattices of such images are left out. As in a search, the finest level of the image's pyramid is followed by the corners
+with motion blur, and by the coarser levels alone: of images with boards up to the first with a board's lattices, of
+others all. Random blocks of codes and mosaics, which are real pieces of chessboards, are left
 to `validate.is_compact`.
 
 Prints the weights of a logistic regression (equal weights of the kinds of images; with the prior of
@@ -48,7 +50,6 @@ from rigkit.core.arrays import FloatArray
 from rigkit.detection.checks.border import squares_end
 from rigkit.detection.checks.evidence import (
     MIN_EXPECTED_CORNERS,
-    MIN_MEASURE,
     OF_EXPECTED_SIZE,
     OFFSET,
     SCORE,
@@ -61,6 +62,7 @@ from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.lattices import SearchedImage, candidate_lattices
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image
+from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.subpixel import refine
 from rigkit.io.media.images import read_image
 
@@ -113,15 +115,7 @@ class Candidate:
 
     def measures(self) -> list[float]:
         """Return the logarithms that are weighed."""
-        sigma_cells, scatter, excess_residual, change, raggedness, blur = self.evidence
-        return [
-            float(np.log(sigma_cells)),
-            float(np.log(scatter)),
-            float(np.log(max(excess_residual, MIN_MEASURE))),
-            float(np.log(max(change, MIN_MEASURE))),
-            float(np.log(raggedness)),
-            float(np.log(max(blur, MIN_MEASURE))),
-        ]
+        return self.evidence.logarithms()
 
 
 def dot_grid(rng: np.random.Generator, size_px: tuple[int, int]) -> NDArray[np.uint8]:
@@ -205,14 +199,18 @@ def judged(kind: str, image: str, board: bool, pixels: NDArray[np.generic], wors
 def _judged(kind: str, image: str, board: bool, pixels: Grey, boards: list[FloatArray]) -> list[Candidate]:
     grey = without_bad_pixels(pixels)
 
-    def promising(_: GreyImage, finest: Level, lattice: Lattice) -> bool:
+    def promising(_: object, finest: Level, lattice: Lattice) -> bool:
         return not (lattice.solid and has_edge_offset(lattice, finest))
 
     least = MIN_BOARD if board else MIN_CORNERS
     size_px = (grey.shape[1], grey.shape[0])
-    fitted = refine(grey, candidate_lattices(SearchedImage.of(grey), MIN_CORNERS, promising))
-    kept = [item for item in fitted if item.lattice.count >= least and is_compact(item.lattice, size_px)]
-    mine = [item for item in kept if not board or any(_of_board(item.lattice, corners) for corners in boards)]
+    mine: list[RefinedLattice] = []
+    for seen in _searches(grey):
+        fitted = refine(grey, candidate_lattices(seen, MIN_CORNERS, promising))
+        kept = [item for item in fitted if item.lattice.count >= least and is_compact(item.lattice, size_px)]
+        mine += [item for item in kept if not board or any(_of_board(item.lattice, corners) for corners in boards)]
+        if board and mine:
+            break
     return [
         Candidate(
             kind=kind,
@@ -226,6 +224,18 @@ def _judged(kind: str, image: str, board: bool, pixels: Grey, boards: list[Float
         )
         for item in mine
     ]
+
+
+def _searches(grey: GreyImage) -> Iterator[SearchedImage]:
+    """Yield the corners of an image as `find_lattices` searches them, one after the other."""
+    seen = SearchedImage.of(grey)
+    yield seen
+    if len(seen.saddles.smeared):
+        yield seen.with_smeared()
+    for k in range(1, len(seen.levels)):
+        coarser = seen.coarser(k)
+        if coarser is not None:
+            yield coarser
 
 
 def _of_board(lattice: Lattice, corners: FloatArray) -> bool:
@@ -337,10 +347,10 @@ def main() -> None:
     print_sizes(found)
     print("in use:  ", ", ".join(f"{n} {w:.2f}" for n, w in SCORE.items()), f"offset {OFFSET:.2f}")
     print(
-        "\n| score | image | corners | sigma, cells | scatter | excess residual | spacing change | raggedness "
-        "| blur, cells |"
+        "\n| score | image | corners | sigma, cells | scatter | excess residual | spacing change "
+        "| contrast change | raggedness | blur, cells |"
     )
-    print("|--:|:--|--:|--:|--:|--:|--:|--:|--:|")
+    print("|--:|:--|--:|--:|--:|--:|--:|--:|--:|--:|")
     for board in (True, False):
         mine = [c for c in found if c.board is board]
         ranked = sorted(mine, key=lambda c: c.evidence.score, reverse=not board)

@@ -41,6 +41,11 @@ sides unequal. On RENDERED boards under a ruler the factor is 12 and more and th
 markers the factor is seldom 6; glare on single squares of blurred boards with little noise gives 0.04."""
 
 
+LOCATED_CELLS = 0.25
+"""Largest standard deviation of a corner, in sides of its cell: more would not tell it from the middle of an edge. In
+REAL images of boards it is at most 0.13, beside a seam of two boards; without contrast it is up to thousands."""
+
+
 def with_predicted_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray]:
     """Return the lattice with predictions in those empty cells `inside` that have known neighbours, and these cells."""
     known = lattice.known
@@ -69,6 +74,15 @@ def without_unconfirmed_holes(item: RefinedLattice, start: Lattice, holes: BoolA
         )
         good &= item.sigma_px < HOLE_SIGMA * _mean_of_neighbours(item.sigma_px, settled)
     return item.without(holes & ~good)
+
+
+def without_uncertain(item: RefinedLattice) -> RefinedLattice:
+    """Return `item` without corners whose standard deviation exceeds LOCATED_CELLS."""
+    known = item.lattice.known
+    vague = np.zeros_like(known)
+    cell_px = fit_cells(item.lattice.pixels, known, degree=1).cell_px()
+    vague[known] = item.sigma_px[known] > LOCATED_CELLS * cell_px
+    return item.without(vague) if vague.any() else item
 
 
 def _mean_of_neighbours(values: FloatArray, known: BoolArray) -> FloatArray:

@@ -15,7 +15,12 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, upper_median
 from rigkit.detection.lattice.lattice import Lattice, LatticeStack
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.subpixel.consistent import with_predicted_holes, without_inconsistent, without_unconfirmed_holes
+from rigkit.detection.subpixel.consistent import (
+    with_predicted_holes,
+    without_inconsistent,
+    without_uncertain,
+    without_unconfirmed_holes,
+)
 from rigkit.detection.subpixel.correlation import board_factors
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
@@ -231,7 +236,7 @@ class _Stacked:
         # paper).
         scatter = scatter_factors(good.lattice.pixels, good.sigma_px, parts)
         return [
-            replace(item, sigma_px=item.sigma_px * raised, scatter=raised, correlated=factor)
+            without_uncertain(replace(item, sigma_px=item.sigma_px * raised, scatter=raised, correlated=factor))
             for item, raised, factor in zip(
                 [self.cut(good, k) for k in numbers], scatter.tolist(), factors.tolist(), strict=True
             )

@@ -8,13 +8,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from detection_bench.blanks import blank
 from detection_bench.scenes import CONDITIONS, one_board
 
 from rigkit.core.boards import Board
-from rigkit.detection.checks.evidence import Evidence
+from rigkit.detection.checks.evidence import OF_NOISE, SCORE, Evidence
 from rigkit.detection.checks.validate import without_shared_corners
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import excess_scatter, scatter_factors
 
 BOARD = Board("board", 9, 6, 30.0, 30.0)
@@ -58,6 +60,42 @@ def test_no_single_measure_decides() -> None:
         assert worse.score < board.score
         assert worse.score > 0.0
     assert Evidence(*(4.0 * np.array(board))).score < 0.0
+
+
+@pytest.mark.parametrize(("name", "seed"), [("gingham", 207), ("gingham", 326), ("gingham", 347), ("gingham", 415)])
+def test_what_only_coarser_levels_show_is_no_board(name: str, seed: int) -> None:
+    """There are saddles between the crossings of stripes, where the image is uniform."""
+    assert not detect_boards(blank(name, np.random.default_rng(seed)))
+
+
+def fitted(contrast: np.ndarray) -> RefinedLattice:
+    """Corners 20 px apart with these contrasts, each fitted with noise of 2 grey levels and no other residuals."""
+    rows, columns = contrast.shape
+    every = np.ones(contrast.shape)
+    lattice = replace(grid(rows, columns, (0.0, 0.0)), contrast=contrast)
+    return RefinedLattice(lattice, 0.05 * every, 0.7 * every, 2.0 * every, 2.0 * every)
+
+
+def test_corners_of_one_board_have_similar_contrasts(rng: np.random.Generator) -> None:
+    shaded = 50.0 * np.exp(0.12 * np.add.outer(np.arange(6), np.arange(9)))
+    board = Evidence.of(fitted(shaded))
+    assert board.contrast_change == pytest.approx(0.12) and board.score > 0.0
+    # A faint corner, or one under a lamp, is no evidence against a board.
+    shaded[2, 3], shaded[4, 4] = 3.0, 900.0
+    assert Evidence.of(fitted(shaded)).score == pytest.approx(board.score, abs=0.1)
+    # Contrasts by chance are.
+    assert Evidence.of(fitted(rng.permutation(np.geomspace(10.0, 400.0, 54)).reshape(6, 9))).score < board.score - 5.0
+
+
+def test_noise_hides_other_residuals() -> None:
+    faint = Evidence.of(fitted(np.full((6, 9), 2.0)))
+    assert faint.excess_residual == pytest.approx(OF_NOISE)
+    assert faint.score < Evidence.of(fitted(np.full((6, 9), 50.0))).score - 3.0
+
+
+def test_every_measure_is_weighed_and_large_ones_count_against_a_board() -> None:
+    assert tuple(SCORE) == Evidence._fields
+    assert all(weight < 0.0 for weight in SCORE.values())
 
 
 def test_a_heat_image_with_a_faint_board_beside_something_hot() -> None:
