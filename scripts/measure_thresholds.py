@@ -55,7 +55,7 @@ from rigkit.detection.checks.evidence import (
     SCORE,
     Evidence,
 )
-from rigkit.detection.checks.validate import has_edge_offset, is_compact
+from rigkit.detection.checks.validate import has_bowed_edges, has_edge_offset, is_compact
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
@@ -208,6 +208,7 @@ def _judged(kind: str, image: str, board: bool, pixels: Grey, boards: list[Float
     for seen in _searches(grey):
         fitted = refine(grey, candidate_lattices(seen, MIN_CORNERS, promising))
         kept = [item for item in fitted if item.lattice.count >= least and is_compact(item.lattice, size_px)]
+        kept = [item for item in kept if not (item.lattice.solid and has_bowed_edges(item.lattice, seen.finest))]
         mine += [item for item in kept if not board or any(_of_board(item.lattice, corners) for corners in boards)]
         if board and mine:
             break

@@ -16,6 +16,7 @@ from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at
 from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS, OF_EXPECTED_SIZE, Evidence
 from rigkit.detection.checks.validate import (
     exceeds_known_sizes,
+    has_bowed_edges,
     has_edge_offset,
     is_board,
     is_compact,
@@ -98,6 +99,9 @@ def find_lattices(
         if sum(item.count for item in boards) <= more_than:
             return []
         out = fit_and_confirm(grey, boards, criteria)
+        if has_markers is None:
+            # Of discs that nearly touch, coarser levels show corners that hide how far the edges bow between them.
+            out = [item for item in out if not (item.lattice.solid and has_bowed_edges(item.lattice, searched.finest))]
         plausible.rejected += 0 if out else len(boards)
         return out
 

@@ -158,7 +158,16 @@ def has_edge_offset(lattice: Lattice, level: Level) -> bool:
     if -MAX_DARK < shift < MAX_BRIGHT:
         return False
     start, middle, end = _edge_offsets(lattice, level, WIDE_STRIPE, OFFSET_PARTS)
-    return not (abs(middle) < MAX_SHIFT and abs(middle - 0.5 * (start + end)) < MAX_BOW)
+    return not abs(middle) < MAX_SHIFT or _bowed(start, middle, end)
+
+
+def has_bowed_edges(lattice: Lattice, level: Level) -> bool:
+    """Return whether the edges of `lattice` on `level` are bowed, as those of discs are."""
+    return _bowed(*_edge_offsets(lattice, level, WIDE_STRIPE, OFFSET_PARTS))
+
+
+def _bowed(start: float, middle: float, end: float) -> bool:
+    return not abs(middle - 0.5 * (start + end)) < MAX_BOW
 
 
 def _edge_offsets(lattice: Lattice, level: Level, reach: float, along: Sequence[float]) -> FloatArray:

@@ -62,9 +62,13 @@ def test_no_single_measure_decides() -> None:
     assert Evidence(*(4.0 * np.array(board))).score < 0.0
 
 
-@pytest.mark.parametrize(("name", "seed"), [("gingham", 207), ("gingham", 326), ("gingham", 347), ("gingham", 415)])
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [("gingham", 207), ("gingham", 326), ("gingham", 347), ("gingham", 415), ("staggered", 323)],
+)
 def test_what_only_coarser_levels_show_is_no_board(name: str, seed: int) -> None:
-    """There are saddles between the crossings of stripes, where the image is uniform."""
+    """There are saddles between the crossings of stripes, where the image is uniform, and between discs, whose edges
+    are off the lines of the saddles."""
     assert not detect_boards(blank(name, np.random.default_rng(seed)))
 
 
