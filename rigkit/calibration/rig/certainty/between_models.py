@@ -1,6 +1,7 @@
 """Uncertainty of the model selection in a rig: `choosing.between_models` for several cameras.
 
-The rig is solved again with each rival model, for all cameras that have it at once: like cameras have one model.
+The rig is solved again with each rival model, for all cameras that have it at once: like cameras have one model. An
+entrance pupil that may move is such a rival.
 """
 
 from __future__ import annotations
@@ -12,13 +13,16 @@ import numpy as np
 
 from rigkit.calibration.certainty.uncertainty import step_to_lens
 from rigkit.calibration.choosing.between_models import same_model, spread_rays
+from rigkit.calibration.result import Rival
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.calibration.rig.solving.solver import solve_rig
 from rigkit.calibration.rig.solving.state import RigState
 from rigkit.calibration.solving.poses import steps_between
 from rigkit.calibration.solving.solver import FROM_OPTIMUM
-from rigkit.cameras.moving_pupil import with_pupil_of
+from rigkit.calibration.with_pupil import MOVING
+from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import NearCamera, far_camera, with_pupil_of
 from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.core.errors import DegenerateError, InputError
 
@@ -43,18 +47,21 @@ def between_rig_models(joint: JointRig, sigmas: FloatArray) -> FloatArray:
         found = [step_to_lens(camera, other, own, sigmas[run]) for camera, other, own, run in both]
         return [step for step, _ in found], [turn for _, turn in found]
 
-    others = [rival.name for one in single for rival in one.rivals if not same_model(rival.camera, one.camera)]
+    others = [
+        rival.name
+        for one in single
+        for rival in one.rivals
+        if rival.name == MOVING or not same_model(rival.camera, one.camera)
+    ]
     for name in dict.fromkeys(others):
         own = [next((r for r in calibration.rivals if r.name == name), None) for calibration in single]
         start = replace(
             here,
-            cameras=tuple(
-                c if r is None else with_pupil_of(r.camera, c) for c, r in zip(here.cameras, own, strict=True)
-            ),
+            cameras=tuple(c if r is None else _lens_of(r, c) for c, r in zip(here.cameras, own, strict=True)),
         )
         try:
             start = _turned(start, fitted_to(start)[1])
-            there = solve_rig(joint.observations, start, joint.sigma_px, FROM_OPTIMUM).state
+            there = _as_central(solve_rig(joint.observations, start, joint.sigma_px, FROM_OPTIMUM).state, here)
             steps, turns = fitted_to(there)
         except (InputError, DegenerateError):
             continue
@@ -64,6 +71,17 @@ def between_rig_models(joint: JointRig, sigmas: FloatArray) -> FloatArray:
         likely = [r.likely for r in own if r is not None]
         out += np.mean(likely) * np.outer(global_step, global_step)
     return out
+
+
+def _lens_of(rival: Rival, camera: Camera) -> Camera:
+    """Return the lens of a rival from which to solve, in place of `camera`."""
+    return NearCamera.of(rival.camera) if rival.name == MOVING else with_pupil_of(rival.camera, camera)
+
+
+def _as_central(there: RigState, here: RigState) -> RigState:
+    """Return the state without the pupils of the cameras that are central `here`."""
+    both = zip(there.cameras, here.cameras, strict=True)
+    return replace(there, cameras=tuple(c if isinstance(own, NearCamera) else far_camera(c) for c, own in both))
 
 
 def _turned(state: RigState, turns: Sequence[Mat3]) -> RigState:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,40 +14,67 @@ from rigkit.calibration.result import Rival
 from rigkit.calibration.rig import assemble
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.certainty.between_models import between_rig_models
+from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.exposure_times import Lag
 from rigkit.calibration.rig.verdicts import _worse
+from rigkit.calibration.with_pupil import MOVING
+from rigkit.core.arrays import FloatArray
 
 LIKELY = 0.25
 FIRST_ORDER = 0.1
 """A lens is followed to first order, by a model that cannot show all of it."""
 
 
-def test_a_rival_widens_the_baseline_by_its_own_difference(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    views = {name: own for name, own in rig_views(rng, 12).items() if name != "fish"}
-    given = {}
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Return what `between_rig_models` was given last."""
+    arguments: dict[str, Any] = {}
 
-    def keep(*arguments: object) -> np.ndarray:
-        given["arguments"] = arguments
-        return between_rig_models(*arguments)  # type: ignore[arg-type]
+    def keep(joint: JointRig, sigmas: FloatArray) -> FloatArray:
+        arguments.update(joint=joint, sigmas=sigmas)
+        return between_rig_models(joint, sigmas)
 
     monkeypatch.setattr(assemble, "between_rig_models", keep)
+    return arguments
+
+
+def extra_with(joint: JointRig, sigmas: FloatArray, rivals: Sequence[Rival | None]) -> FloatArray:
+    """Return the contribution to the covariance of one rival of each camera, or None."""
+    own = zip(joint.views.single, rivals, strict=True)
+    single = tuple(replace(one, rivals=() if rival is None else (rival,)) for one, rival in own)
+    return between_rig_models(replace(joint, views=replace(joint.views, single=single)), sigmas)
+
+
+def baseline_sigma(rig: RigCalibration, extra: FloatArray) -> float:
+    """Return the standard deviation of the baseline by this part of the covariance alone."""
+    count = len(rig.covariance)
+    alone = replace(rig, covariance=extra[:count, :count], scale_sigma=0.0, departures=())
+    return alone.baseline_mm(*(camera.name for camera in rig.cameras))[1]
+
+
+def test_a_rival_widens_the_baseline_by_its_own_difference(rng: np.random.Generator, given: dict[str, Any]) -> None:
+    views = {name: own for name, own in rig_views(rng, 12).items() if name != "fish"}
     other = calibrate_rig(views, sizes(), model={**MODELS, "wide": "double_sphere"})
     rig = calibrate_rig(views, sizes(), model=MODELS)
-    joint, sigmas = given["arguments"]
-    single = joint.views.single  # type: ignore[attr-defined]
-    rival = Rival("double_sphere", other.single[1].camera, LIKELY)
-    views_with_rival = replace(joint.views, single=(single[0], replace(single[1], rivals=(rival,))))  # type: ignore[attr-defined]
-    extra = between_rig_models(replace(joint, views=views_with_rival), sigmas)  # type: ignore[arg-type, type-var]
-    count = len(rig.covariance)
-    length, _ = rig.baseline_mm("reg", "wide")
-    apart = abs(other.baseline_mm("reg", "wide")[0] - length)
-    alone = replace(rig, covariance=extra[:count, :count], scale_sigma=0.0, departures=())
+    extra = extra_with(**given, rivals=(None, Rival("double_sphere", other.single[1].camera, LIKELY)))
+    apart = abs(other.baseline_mm("reg", "wide")[0] - rig.baseline_mm("reg", "wide")[0])
     assert apart > 0.01
-    assert alone.baseline_mm("reg", "wide")[1] == pytest.approx(np.sqrt(LIKELY) * apart, rel=FIRST_ORDER)
-    assert not between_rig_models(joint, sigmas).any()  # type: ignore[arg-type]
+    assert baseline_sigma(rig, extra) == pytest.approx(np.sqrt(LIKELY) * apart, rel=FIRST_ORDER)
+    assert not between_rig_models(**given).any()
+
+
+def test_a_pupil_that_may_move_widens_the_baseline_by_its_difference(
+    rng: np.random.Generator, given: dict[str, Any]
+) -> None:
+    """The rival has the same model and size as the central lens."""
+    views = {name: own for name, own in rig_views(rng, 12).items() if name != "reg"}
+    other = calibrate_rig(views, sizes(), model=MODELS, board="flat", pupil="moving")
+    rig = calibrate_rig(views, sizes(), model=MODELS, board="flat", pupil="central")
+    extra = extra_with(**given, rivals=[Rival(MOVING, one.camera, LIKELY) for one in other.single])
+    apart = abs(other.baseline_mm("wide", "fish")[0] - rig.baseline_mm("wide", "fish")[0])
+    assert apart > 0.01
+    assert baseline_sigma(rig, extra) == pytest.approx(np.sqrt(LIKELY) * apart, rel=FIRST_ORDER)
 
 
 def with_heldout_errors(alone: tuple[float | None, ...], together: float) -> RigCalibration:
