@@ -90,7 +90,9 @@ class Radii(NamedTuple):
         distance, off_px = distance_px.ravel(), half_px.ravel() - seen * distance_px.ravel()
         terms = np.stack([distance, np.ones_like(distance)], axis=1)
         scatter_px = MIN_SCATTER_PX + float(np.median(np.abs(off_px - np.median(off_px))))
-        more, _ = np.linalg.solve(terms.T @ terms + np.diag([0.0, (scatter_px / SPREAD_PX) ** 2]), terms.T @ off_px)
+        # The distances come from maps that share their circles, and with them their errors: they count as one.
+        ridge = float(np.mean(around.support[used])) * (scatter_px / SPREAD_PX) ** 2
+        more, _ = np.linalg.solve(terms.T @ terms + np.diag([0.0, ridge]), terms.T @ off_px)
         return cls(seen, seen + float(more))
 
 

@@ -212,6 +212,13 @@ def test_edges_that_a_tone_curve_moves_leave_centres_where_they_are(light: Photo
     assert np.sqrt((np.concatenate(relative) ** 2).mean()) < HONEST[1]
 
 
+def test_circles_that_are_all_as_large_are_printed_as_they_are_seen() -> None:
+    """Their sizes do not tell how far light or ink moves their edges: the errors of distances would give 0.25."""
+    scene = slanted(Board("b", 28, 20, 25.0, 25.0, pattern=Circles(diameter_mm=15.0)), "regular", 0.0, 0.0, 700.0)
+    (found,) = find_grids(grey_image(scene.render(noise_levels=2.0, rng=np.random.default_rng(1))))
+    assert found.radius == pytest.approx(0.3, rel=0.03)
+
+
 def test_circles_whose_light_a_motion_mixes_are_where_they_are() -> None:
     """With one blur for all directions four of 108 fitted no more, and the others were off by 2 of their sigmas."""
     error_px, in_sigmas = errors_of_moved(1, 16.7, 6.0)
