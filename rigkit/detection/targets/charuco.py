@@ -44,10 +44,12 @@ from rigkit.kernels.surface import maps_of_quads
 SAME_CELLS = 0.2
 """Largest distance of a marker's corner from the same corner of a lattice, in sides of a cell."""
 
-MASKING_ROUNDS, MAX_MASKING_ROUNDS, SETTLED = 2, 8, 0.15
+MASKING_ROUNDS, MAX_MASKING_ROUNDS, SETTLED, MAX_FURTHER = 2, 8, 0.15, 1.5
 """Rounds of removing markers and fitting corners: the second starts from corners that their ink does not affect; more
 follow until corners would move by less than this part of their sigmas. Out of focus each leaves 0.7 of the errors
-(RENDERED, blur 3 px, squares of 20 to 30 px): after two rounds they are twice those after eight."""
+(RENDERED, blur 3 px, squares of 20 to 30 px): after two rounds they are twice those after eight. Each begins at most
+this many times the last movement further on: more is only measured where rounds hardly converge, and there corners are
+carried away (RENDERED, markers of 0.9 of their squares: by 2 px)."""
 
 MOVED_PX, MIN_MOVED, MIN_DRAWN = 0.05, 12, -0.75
 """Random shift, per coordinate, of the corners around which markers are removed, to measure its effect on the fit;
@@ -299,7 +301,8 @@ def _with_markers_masked(
         if turn == enough:
             drawn = _drawn_by_markers(image, light, given, narrow, board, before)
         # By how much all further rounds would move corners; with a positive effect there is hardly anything left.
-        further = max(-drawn, 0.0) / (1.0 + drawn) * np.nan_to_num(narrow.lattice.pixels - given.lattice.pixels)
+        more = min(max(-drawn, 0.0) / (1.0 + drawn), MAX_FURTHER)
+        further = more * np.nan_to_num(narrow.lattice.pixels - given.lattice.pixels)
         if turn >= enough and np.mean(further**2) < (SETTLED * known_median(narrow.sigma_px) / (1.0 + drawn)) ** 2:
             break
         given = narrow.of(replace(narrow.lattice, pixels=narrow.lattice.pixels + further))

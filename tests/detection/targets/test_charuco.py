@@ -259,6 +259,15 @@ def test_markers_far_out_of_focus_are_removed_until_corners_settle() -> None:
     assert np.sqrt((in_sigmas**2).mean()) < 1.5
 
 
+def test_rounds_that_hardly_converge_carry_no_corners_away() -> None:
+    """Markers leave a twentieth of the squares around them: corners were off by 2.4 px, and three lost."""
+    rng = np.random.default_rng(1)
+    scene = one_board(rng, board=Board("c", 6, 4, 30.0, 30.0, pattern=Charuco("DICT_4X4_50", 27.0)))
+    off, in_sigmas = _scored(scene, scene.render(blur_px=2.5, noise_levels=2.0, rng=rng))
+    assert np.sqrt((off**2).mean()) < 0.5
+    assert np.sqrt((in_sigmas**2).mean()) < 1.5
+
+
 def test_an_inverted_board_out_of_focus_is_placed_as_finely() -> None:
     """It is rendered, too, with black and white exchanged."""
     rng = np.random.default_rng(0)
