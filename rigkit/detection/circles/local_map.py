@@ -26,6 +26,9 @@ TYPICAL_DERIVATIVES = (np.inf, np.inf, 0.3, 0.1, 0.03)
 """Prior standard deviations of derivatives of order 0 to 4, in distances of neighbours: each is a third of the one
 before if lens or slant bends the lattice as strongly as its circles can still be linked. They limit the effect of the
 scatter of few neighbours."""
+CLIPPED = 4.0
+"""Half axes further from the typical one count as this many median absolute deviations off: a smear or a lamp on one
+circle would turn the line through all."""
 SPREAD_PX, MIN_SCATTER_PX = 0.5, 1e-3
 """Prior standard deviation of the px by which the edges of all circles are moved alike, and smallest standard deviation
 of half axes. They matter only where all circles are as large, and then the centre hardly depends on them."""
@@ -89,7 +92,9 @@ class Radii(NamedTuple):
         half_px = np.linalg.norm(np.swapaxes(maps[used], 1, 2) @ directions, axis=1)
         distance, off_px = distance_px.ravel(), half_px.ravel() - seen * distance_px.ravel()
         terms = np.stack([distance, np.ones_like(distance)], axis=1)
-        scatter_px = MIN_SCATTER_PX + float(np.median(np.abs(off_px - np.median(off_px))))
+        typical_px = float(np.median(off_px))
+        scatter_px = MIN_SCATTER_PX + float(np.median(np.abs(off_px - typical_px)))
+        off_px = np.clip(off_px, typical_px - CLIPPED * scatter_px, typical_px + CLIPPED * scatter_px)
         # The distances come from maps that share their circles, and with them their errors: they count as one.
         ridge = float(np.mean(around.support[used])) * (scatter_px / SPREAD_PX) ** 2
         more, _ = np.linalg.solve(terms.T @ terms + np.diag([0.0, ridge]), terms.T @ off_px)
