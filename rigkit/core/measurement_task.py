@@ -46,7 +46,9 @@ class Task:
         if not (math.isfinite(self.distance_sigma_mm) and self.distance_sigma_mm >= 0.0):
             raise InputError(f"certificate: the distance cannot be known to {self.distance_sigma_mm} mm")
         if not 0.0 < self.confidence < 1.0:
-            raise InputError(f"certificate: the confidence must lie between 0 and 1, got {self.confidence}")
+            raise InputError(
+                f"certificate: the confidence must lie between 0 and 100 %, got {100.0 * self.confidence:g} %"
+            )
 
     @property
     def unit(self) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigkit.calibration.certainty.displaced import lens_of
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.measurement_task import Quantity
 from rigkit.core.tables import Table, cells, columns
@@ -32,6 +33,13 @@ LEVELS = 8
 COVERED = 98.0
 """Percentile at which the colours end: at the border of the field the bound is unlimited."""
 LINE_CHARACTERS = 98
+"""Width of a line of words of WORDS_SIZE on the sheet."""
+WORDS_SIZE, FACT_SIZE = 9.5, 8.0
+"""Sizes of the statements and of the basis on the sheet, points."""
+PARAGRAPH_GAP = 0.4
+"""Gap after a paragraph, lines."""
+MAP_HEIGHT, SIGNATURE_TOP = 0.34, 0.075
+"""Heights on the sheet, relative to it: of the map where the words leave room, and of the lines for the signature."""
 
 
 def certificate_facts(certificate: Certificate, limit: float | None = None) -> PageFacts:
@@ -110,7 +118,7 @@ def basis(certificate: Certificate) -> dict[str, str]:
     """Return the basis of the certificate: cameras, corners, baseline and statistics, in words."""
     i = certificate.instrument
     cameras = "; ".join(
-        f"'{name}', {camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px"
+        f"'{name}', {lens_of(camera).model}, {camera.size_px[0]}x{camera.size_px[1]} px"
         for name, camera in zip(i.names, i.cameras, strict=True)
     )
     facts = {"cameras": cameras, "corners": f"standard deviation {i.sigma_px:.3g} px per coordinate"}
@@ -140,13 +148,14 @@ def sheet_pdf(certificate: Certificate, title: str, statements: Sequence[str], f
     """Return one A4 page with statements, map, causes, basis, and lines for a signature."""
     figure = new_figure(*A4_INCHES)
     figure.text(0.09, 0.945, title, fontsize=15, weight="bold", va="top")
-    top = _write(figure, 0.905, statements, size=9.5)
-    map_height = 0.34
+    top = _write(figure, 0.905, statements, size=WORDS_SIZE)
+    lines = sum(len(_lines(fact, FACT_SIZE)) + PARAGRAPH_GAP for fact in facts)
+    map_height = min(MAP_HEIGHT, top - 0.09 - lines * _line_height(FACT_SIZE) - SIGNATURE_TOP)
     left = figure.add_axes((0.11, top - map_height - 0.03, 0.52, map_height))
     right = figure.add_axes((0.76, top - map_height - 0.01, 0.15, map_height - 0.04))
     _draw_map(left, certificate)
     _draw_causes(right, certificate)
-    _write(figure, top - map_height - 0.09, facts, size=8)
+    _write(figure, top - map_height - 0.09, facts, size=FACT_SIZE)
     for x, words in ((0.09, "Date"), (0.32, "Name"), (0.62, "Signature")):
         figure.text(x, 0.052, words, fontsize=8, color="0.35")
     for x, width in ((0.09, 0.19), (0.32, 0.26), (0.62, 0.29)):
@@ -159,10 +168,12 @@ def _draw_map(axis: Any, certificate: Certificate) -> None:
     bound = np.ma.masked_invalid(certificate.bound)
     top = float(np.nanpercentile(certificate.bound, COVERED))
     mesh = axis.pcolormesh(u, v, bound, shading="nearest", cmap="viridis", vmin=0.0, vmax=top)
+    bar = axis.figure.colorbar(mesh, ax=axis, shrink=0.8, extend="max")
+    bar.ax.tick_params(labelsize=7)
     if bound.min() < top:
         levels = np.linspace(0.0, top, LEVELS + 1)[1:]
-        lines = axis.contour(u, v, bound, levels=levels, colors="white", linewidths=0.7)
-        axis.clabel(lines, fontsize=7, fmt="%.3g")
+        contours = axis.contour(u, v, bound, levels=levels, colors="white", linewidths=0.7)
+        bar.add_lines(contours)
     if certificate.coarse.any():
         rough = np.ma.masked_where(~certificate.coarse, np.ones(u.shape))
         axis.contourf(u, v, rough, levels=[0.5, 1.5], colors="none", hatches=["////"])
@@ -171,7 +182,6 @@ def _draw_map(axis: Any, certificate: Certificate) -> None:
     axis.tick_params(labelsize=7)
     task, name = certificate.task, certificate.instrument.names[0]
     axis.set_title(f"{100.0 * task.confidence:g} % of errors within, {task.unit}; image of camera '{name}'", fontsize=8)
-    axis.figure.colorbar(mesh, ax=axis, shrink=0.8, extend="max").ax.tick_params(labelsize=7)
 
 
 def _draw_causes(axis: Any, certificate: Certificate) -> None:
@@ -185,6 +195,7 @@ def _draw_causes(axis: Any, certificate: Certificate) -> None:
             axis.bar(place, part, 0.7, bottom=base, color=f"C{index}", label=cause if place == 0 else None)
             base += part
     axis.set_xticks([0, 1], ["median", "worst"], fontsize=7)
+    axis.set_ylim(0.0, 100.0)
     axis.set_ylabel("share of the variance, %", fontsize=7)
     axis.tick_params(labelsize=7)
     axis.legend(fontsize=7, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0))
@@ -194,13 +205,22 @@ def _draw_causes(axis: Any, certificate: Certificate) -> None:
 
 def _write(figure: Figure, top: float, paragraphs: Sequence[str], *, size: float) -> float:
     """Write paragraphs downwards from `top`; return the position of their end."""
-    step = size * 1.45 / (72.0 * A4_INCHES[1])
+    step = _line_height(size)
     for paragraph in paragraphs:
-        for line in textwrap.wrap(paragraph, int(LINE_CHARACTERS * 9.5 / size)):
+        for line in _lines(paragraph, size):
             figure.text(0.09, top, line, fontsize=size, va="top")
             top -= step
-        top -= 0.4 * step
+        top -= PARAGRAPH_GAP * step
     return top
+
+
+def _lines(paragraph: str, size: float) -> list[str]:
+    return textwrap.wrap(paragraph, int(LINE_CHARACTERS * WORDS_SIZE / size))
+
+
+def _line_height(size: float) -> float:
+    """Return the distance of lines of words of `size` (points), relative to the height of the sheet."""
+    return size * 1.45 / (72.0 * A4_INCHES[1])
 
 
 def _rule(x: float, y: float, width: float) -> Any:

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from helpers.cameras import PARAMETERS, SIZE_PX
 from helpers.measuring import read_off
+from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
+from rigkit.calibration.certainty.displaced import DisplacedCamera
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
@@ -19,7 +21,8 @@ from rigkit.core.measurement_task import Quantity, Task
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
-from rigkit.report.pages.certificate_page import bound_figure
+from rigkit.report.pages import certificate_page
+from rigkit.report.pages.certificate_page import basis, bound_figure, certificate_pdf
 from rigkit.report.pictures.figures import _drawn
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.propagation import (
@@ -258,3 +261,29 @@ def test_the_bound_is_drawn_with_and_without_places_where_it_is_a_lower_one(rng:
     sure = certify(rig, Task(quantity=Quantity.LENGTH, size_mm=200.0, distance_mm=1500.0), cells=(9, 7))
     drawn = [_drawn(bound_figure(replace(sure, coarse=np.full(sure.bound.shape, coarse)))) for coarse in (False, True)]
     assert drawn[0].shape == drawn[1].shape and (drawn[0] != drawn[1]).mean() > 0.01
+
+
+def test_the_sheet_keeps_its_words_above_the_lines_for_the_signature(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many words there are. The cameras are named by their models, also where their inadequacy is known."""
+    rig = rig_of("brown", rig_covariance(lens("brown"), rng))
+    modes = np.zeros((2, 1))
+    displaced = [DisplacedCamera(c.size_px, np.append(c.parameters, 0.0), c, modes) for c in rig.cameras]
+    sure = certify(rig, Task(quantity=Quantity.LENGTH, size_mm=200.0, distance_mm=1500.0), cells=(9, 7))
+    named = replace(sure, instrument=replace(rig, cameras=tuple(displaced)))
+    assert basis(named)["cameras"] == basis(sure)["cameras"] and "brown" in basis(sure)["cameras"]
+    sheets: list[Figure] = []
+
+    def kept(figure: Figure) -> bytes:
+        sheets.append(figure)
+        return b""
+
+    monkeypatch.setattr(certificate_page, "as_pdf", kept)
+    for count in (1, 14):
+        certificate_pdf(sure, "a rig", {f"file {k}": "SHA-256 " + "0" * 64 for k in range(count)})
+        figure = sheets.pop()
+        figure.canvas.draw()
+        under = ("Date", "Name", "Signature")
+        lowest = min(text.get_window_extent().y0 for text in figure.texts if text.get_text() not in under)
+        assert lowest > max(line.get_window_extent().y1 for line in figure.artists)
