@@ -9,10 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from rigkit.core.errors import InputError
 from rigkit.core.posetype import PoseType
 from rigkit.report.pages.study_page import cell_table, study_tables
+from rigkit.report.pictures import study_figure as study_figure_module
+from rigkit.report.pictures.figures import new_figure
 from rigkit.report.pictures.study_figure import study_figure
 from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import CHUNK_TRIALS, Claim, Study, Variant, chunk_count, run_chunk
@@ -190,6 +193,24 @@ def test_one_noise_and_one_estimator_need_no_legend() -> None:
     table = run(replace(GENERAL, trials=2, sigmas=(1.0,)))
     assert b"<svg" in study_figure(table, "svg")
     assert b"<svg" in study_figure(run(replace(GENERAL, trials=2, methods=("F2UDIR", "3SDIR"))), "svg")
+
+
+def test_the_legend_of_many_estimators_is_within_the_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Figure] = []
+
+    def kept(*size: float, **more: Any) -> Figure:
+        drawn.append(new_figure(*size, **more))
+        return drawn[-1]
+
+    monkeypatch.setattr(study_figure_module, "new_figure", kept)
+    variants = tuple(Variant(f"DET3UDIR, chord, number {k}", "DET3UDIR", "chord", "area") for k in range(12))
+    methods = tuple(variant.name for variant in variants)
+    study_figure(
+        run(replace(GENERAL, trials=2, noise="corners", sigmas=(0.1, 0.3), variants=variants, methods=methods))
+    )
+    box = drawn[0].legends[0].get_window_extent()
+    assert box.x0 >= 0.0 and box.x1 <= drawn[0].bbox.width
+    assert len(set(study_figure_module.METHOD_COLOURS)) >= len(methods)
 
 
 def test_csv_has_every_cell() -> None:

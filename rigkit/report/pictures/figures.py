@@ -160,12 +160,16 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
             colour = board_colour(index)
             axis.scatter(*p.T, s=5, color=colour, label=name, depthshade=False)
             axis.quiver(*p.T, *n.T, color=colour, linewidth=0.6, arrow_length_ratio=0.25)
-        cameras = ((Rigid3.identity(), "camera 1"), (reconstruction.cam2_from_cam1.inverse(), "camera 2"))
+        second = reconstruction.cam2_from_cam1.inverse()
+        # Words on the far side of each: they would cover one another where the baseline is short.
+        to_the_right = np.array([-np.sin(np.radians(azimuth)), 0.0, np.cos(np.radians(azimuth))])
+        sides = ("right", "left") if to_the_right @ second.translation_mm >= 0.0 else ("left", "right")
+        cameras = ((Rigid3.identity(), "camera 1", sides[0]), (second, "camera 2", sides[1]))
         depth = reach * PYRAMID_DEPTH_IN_FIGURE
-        for cam1_from_cam, name in cameras:
-            _draw_pyramid(axis, cam1_from_cam, depth, name)
+        for cam1_from_cam, name, side in cameras:
+            _draw_pyramid(axis, cam1_from_cam, depth, name, side)
         axis.view_init(elev=elevation, azim=azimuth)
-        _fit_equal(axis, reconstruction, np.concatenate([_pyramid(pose, depth) for pose, _ in cameras]))
+        _fit_equal(axis, reconstruction, np.concatenate([_pyramid(pose, depth) for pose, _, _ in cameras]))
         axis.set_xlabel(f"x {unit}", fontsize=7)
         from_above = elevation > 45.0
         axis.set_ylabel(f"z {unit}", fontsize=7, labelpad=ABOVE_PAD if from_above else SIDE_PAD)
@@ -228,13 +232,13 @@ def _pyramid(cam1_from_cam: Rigid3, depth: float) -> FloatArray:
     return _in_plot_axes(cam1_from_cam.apply(depth * PYRAMID))
 
 
-def _draw_pyramid(axis: Any, cam1_from_cam: Rigid3, depth: float, name: str) -> None:
+def _draw_pyramid(axis: Any, cam1_from_cam: Rigid3, depth: float, name: str, side: str) -> None:
     tip, *base = _pyramid(cam1_from_cam, depth)
     # One line through all eight edges; two of them are drawn twice.
     edges = np.stack([tip, base[0], base[1], tip, base[2], base[3], tip, base[3], base[0], base[1], base[2]])
     axis.plot(*edges.T, color="black", linewidth=0.8)
     # Below the tip, so that it does not cover the numbers of an axis.
-    axis.text(*tip, f"\n{name}", fontsize=7, horizontalalignment="center", verticalalignment="top", linespacing=0.5)
+    axis.text(*tip, f"\n{name}", fontsize=7, horizontalalignment=side, verticalalignment="top", linespacing=0.5)
 
 
 def _fit_equal(axis: Any, reconstruction: Reconstruction, pyramids: FloatArray) -> None:

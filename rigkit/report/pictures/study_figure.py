@@ -11,7 +11,10 @@ from rigkit.report.pictures.figures import new_figure
 from rigkit.study.study import STUDY_PLANES
 from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
-METHOD_COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee")
+METHOD_COLOURS: tuple[str, ...] = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
+METHOD_COLOURS += ("#332288", "#44aa99", "#882255", "#999933", "#cc6677", "#111111")
+SWATCH_INCHES, LETTER_INCHES = 0.6, 0.085
+"""Widths in the legend: of a swatch with the gaps around it, and of a letter of a method's name."""
 
 
 def study_figure(table: StudyTable, file_format: str = "png") -> bytes:
@@ -40,7 +43,9 @@ def study_figure(table: StudyTable, file_format: str = "png") -> bytes:
     figure.suptitle(study.title, fontsize=11)
     if len(study.methods) > 1 and len(study.sigmas) > 1:
         handles = [_swatch(m) for m in range(len(study.methods))]
-        figure.legend(handles, study.methods, loc="outside lower center", ncols=len(study.methods), frameon=False)
+        entry = SWATCH_INCHES + LETTER_INCHES * max(map(len, study.methods))
+        fitting = min(len(study.methods), max(1, int(figure.get_figwidth() / entry)))
+        figure.legend(handles, study.methods, loc="outside lower center", ncols=fitting, frameon=False)
     data = io.BytesIO()
     metadata = {"Software": None} if file_format == "png" else {"CreationDate": None} if file_format == "pdf" else None
     figure.savefig(data, format=file_format, dpi=150, metadata=metadata)

@@ -94,3 +94,22 @@ def test_words_and_lines_of_drawings_have_a_colour_for_the_night(rng: np.random.
     assert used <= known
     coded = data_uri("image/svg+xml", drawings[0].encode()).partition(",")[2]
     assert b"prefers-color-scheme: dark" in base64.b64decode(coded)
+
+
+@pytest.mark.parametrize("baseline_mm", [(-20.0, 0.0, 0.0), (20.0, 0.0, 0.0), (5.0, 0.0, -20.0)])
+def test_the_names_of_cameras_close_together_do_not_cover_each_other(baseline_mm: tuple[float, float, float]) -> None:
+    from mpl_toolkits.mplot3d import Axes3D, proj3d
+
+    figure = cloud_figure(make_reconstruction(cam2_from_cam1=Rigid3(np.eye(3), np.array(baseline_mm))))
+    figure.canvas.draw()
+    for axes in figure.axes:
+        assert isinstance(axes, Axes3D)
+        spans = []
+        for text in axes.texts:
+            u, v, _ = proj3d.proj_transform(*text.get_position_3d(), axes.get_proj())
+            # The window extent of a text in space is where it was before it was projected; its width is right.
+            width, x = text.get_window_extent().width, axes.transData.transform((u, v))[0]
+            left = x - {"left": 0.0, "center": 0.5, "right": 1.0}[text.get_horizontalalignment()] * width
+            spans.append((left, left + width))
+        spans.sort()
+        assert len(spans) == 2 and spans[0][1] <= spans[1][0]
