@@ -237,8 +237,8 @@ def _refuse_inverse(problem: _AllCorners, seen: Sequence[Rigid3], cost: float) -
     found = minimise(start, other.at, _moved, HAND_EYE_DAMPING, HAND_EYE_STOP)
     if np.isfinite(found.problem.cost) and found.problem.cost * INVERSE_FITS_BETTER**2 < cost:
         raise InputError(
-            "hand-eye: the inverse robot poses fit far better: they may be hand_from_base (add --inverse), or the "
-            "board may be on the hand (add --board-on-hand)"
+            "hand-eye: the inverse robot poses fit far better: either --inverse (the poses are hand_from_base) or "
+            "--board-on-hand must change: give it, or leave it out if it is given"
         )
 
 
