@@ -61,9 +61,10 @@ def write_rig(rig: Rig, kind: str, outlines: Outlines | None = None) -> ForeignR
     model of the format fits.
     """
     if kind not in RIG_FORMATS:
-        raise InputError(
-            f"'{kind}' has no rigs; known are {', '.join(RIG_FORMATS)}; or export one camera: --names ONE -o ONE.json"
-        )
+        known = f"known are {', '.join(RIG_FORMATS)}; or export one camera: --names ONE -o ONE.json"
+        if kind == "rigkit":
+            raise InputError(f"a rig needs no export to rigkit: its file is taken wherever a rig is asked for; {known}")
+        raise InputError(f"'{kind}' has no rigs; {known}")
     return RIG_FORMATS[kind].write(rig, outlines or {})
 
 

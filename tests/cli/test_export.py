@@ -161,6 +161,8 @@ def test_a_rig_goes_out_as_a_camchain_and_comes_back(tmp_path: Path, capsys: pyt
     # One of its cameras is taken out as the message says.
     one_out = str(tmp_path / "one.json")
     assert main(["export", str(chain), "-o", one_out]) == 2 and "--names ONE -o ONE.json" in capsys.readouterr().err
+    assert main(["export", str(chain), "--to", "rigkit", "-o", one_out]) == 2
+    assert "a rig needs no export to rigkit" in capsys.readouterr().err
     assert main(["export", str(chain), "--names", "cam1", "-o", one_out]) == 0
     np.testing.assert_allclose(load_camera(one_out).parameters, WIDE.parameters, atol=1e-12)
     # Another tool's rig is taken wherever ours is.
