@@ -38,7 +38,9 @@ def run(args: argparse.Namespace) -> int:
         if args.json:
             print_json(listed)
         for name, one in known.items() if not args.json else ():
-            print(f"{name}: {one.about} ({one.licence}; {len(one.urls)} of {len(one.sha256)} files fetchable)")
+            count, known_count = len(one.sha256), len(one.urls)
+            rest = "" if known_count == count else f"; the addresses of the others are not known: see {one.source}"
+            print(f"{name}: {one.about} ({one.licence}; {known_count} of {count} files fetchable{rest})")
         return ExitCode.WELL
     done, failed = [], False
     for name in args.names:
@@ -58,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
             print(f"{d.described.name}: {len(d.present)} files in {d.folder}, {len(d.fetched)} of them new")
         if d.missing:
             note(
-                f"{d.described.name}: {len(d.missing)} files are not fetchable yet, such as '{d.missing[0]}'; "
+                f"{d.described.name}: {len(d.missing)} files have no known address, such as '{d.missing[0]}'; "
                 f"get them from {d.described.source}"
             )
     if failed:

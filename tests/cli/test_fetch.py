@@ -133,6 +133,8 @@ def test_files_without_an_address_are_reported(
 ) -> None:
     catalogue = described(tmp_path, {"left/01.png": f"{server}/01.png"})
     monkeypatch.setenv("RIGKIT_DATA", str(tmp_path / "elsewhere"))
+    assert main(["fetch", "--catalogue", str(catalogue)]) == ExitCode.WELL
+    assert "the addresses of the others are not known: see " in capsys.readouterr().out
     assert main(["fetch", "small", "--catalogue", str(catalogue), "--json"]) == ExitCode.CHECK_FAILED
     out = capsys.readouterr()
     assert json.loads(out.out)["small"]["missing"] == ["right/01.png"]
