@@ -29,9 +29,10 @@ POINT = ("x", "y", "z")
 NORMAL_COLUMNS = ("nx", "ny", "nz")
 COLOUR = ("red", "green", "blue")
 BOARD_COMMENT = "board "
-SIGMA_COMMENT = "sigmas: noise of the corners and of the relative pose"
+SIGMA_COMMENT = "sigmas: noise of the image points and of the relative pose"
+WITH_CALIBRATIONS = ", and the covariance of the calibrations"
 SIGMAS_COMMENT = {
-    True: f"{SIGMA_COMMENT}, and the covariance of the calibrations",
+    True: f"{SIGMA_COMMENT}{WITH_CALIBRATIONS}",
     False: f"{SIGMA_COMMENT}; the calibrations count as exact",
 }
 """Comment about the sigmas, by `OrientedCloud.calibration_in_sigmas`."""
@@ -159,7 +160,7 @@ def read_ply(path: str | Path) -> OrientedCloud:
             sigma_mm=column("sigma_mm", np.nan).astype(np.float64),
             normal_sigma_rad=np.deg2rad(column("normal_sigma_deg", np.nan).astype(np.float64)),
             board_ids=board_ids,
-            calibration_in_sigmas=f"\ncomment {SIGMAS_COMMENT[True]}\n".encode() in data[:start],
+            calibration_in_sigmas=f"{WITH_CALIBRATIONS}\n".encode() in data[:start],
             from_origin=f"\ncomment {FROM_ORIGIN_COMMENT}\n".encode() in data[:start],
         )
     except InputError as error:
