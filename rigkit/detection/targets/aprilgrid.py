@@ -71,7 +71,8 @@ class AprilGridFinder(Finder):
         if not all(_nearly_whole(item, pixels, grey.shape) for item, pixels in placed):
             coarser = list(levels)
             corners, saddles = find_corners(coarser, corners)
-            placed = list(_placed_by(corners, finest, grey, joined))
+            # Corners of coarser levels may break the lattices of very slanted tags.
+            placed = max(list(_placed_by(corners, finest, grey, joined)), placed, key=_known)
             # Where light or ink spreads, tags and the squares between them touch on coarser levels only.
             for k, level in enumerate(coarser):
                 alone = each_once(saddles.by_level[k:])
@@ -91,6 +92,11 @@ def _placed_by(
         pixels, used = placed_lattices(image, lattices, item)
         lattices = [lattice for n, lattice in enumerate(lattices) if n not in used]
         yield item, pixels
+
+
+def _known(placed: Sequence[tuple[TagBoard, FloatArray]]) -> int:
+    """Return the number of known corners of all boards."""
+    return sum(int(np.count_nonzero(np.isfinite(pixels[..., 0]))) for _, pixels in placed)
 
 
 def _or_lone_tags(image: GreyImage, tags: TagBoard, pixels: FloatArray) -> FloatArray:

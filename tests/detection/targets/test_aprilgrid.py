@@ -134,6 +134,17 @@ def test_two_boards_are_told_apart_by_their_tags(rng: np.random.Generator) -> No
         assert np.abs(errors_by_place(found[str(truth.board_id)], truth)).max() < 0.2
 
 
+def test_coarse_corners_that_break_lattices_of_slanted_tags_do_not_count() -> None:
+    board = Board("s", 12, 12, 88.0, 88.0, pattern=AprilGrid(0.3))
+    turn = cv2.Rodrigues(np.radians([0.0, 70.0, 0.0]))[0]
+    place = Rigid3(turn, np.array([0.0, 0.0, 1550.0]) - turn @ board.points().mean(axis=0))
+    scene = BenchScene("s", (PlacedBoard(board, place),), (), bench_camera("regular"))
+    (found,) = detect_boards(scene.render(noise_levels=2.0, rng=np.random.default_rng(0)), [board])
+    # Of the narrowest column, tags have sides of 7 px.
+    assert found.board_id == "s" and len(found.grid) > 100
+    assert np.sqrt((errors_by_place(found, scene.truth()[0]) ** 2).mean()) < 0.02
+
+
 def test_a_part_keeps_its_numbers(rng: np.random.Generator) -> None:
     scene = facing(KALIBR, 75.0)
     cover = Panel(scene.boards[0].world_from_board @ Rigid3(np.eye(3), np.array([170.0, 90.0, -2.0])), 60.0, 400.0, 0.4)
