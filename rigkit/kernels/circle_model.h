@@ -19,9 +19,9 @@ static const double PLACE_ERROR = 1e-5;
 enum { BLOCK = 32 };
 /* Columns of the normal equations: the parameters, then the residuals. */
 enum { OFF = PARAMETERS, COLUMNS };
-/* Further rows: the derivatives by the radius of this circle alone (E1 to S include those of its neighbours), and by the two
- * parameters of an anisotropic blur. */
-enum { OWN = COLUMNS, Q1, Q2, ROWS };
+/* Further rows: the derivatives by the radius of this circle alone (E1 to S include those of its neighbours), by the two
+ * parameters of an anisotropic blur, and by the gradient of light that is added to the image (glare). */
+enum { OWN = COLUMNS, Q1, Q2, LX, LY, ROWS };
 /* Distance from an edge, in blurs, beyond which the brightness is constant to 1e-12. */
 static const float FAR = 7.0f;
 /* Distance from the centre, px, within which pixels are not used: the direction to the nearest edge depends on the centre there,
@@ -262,8 +262,12 @@ INLINE void differentiate(
         const double level = at->a + at->b * total[k], steep = light * at->b;
         for (int i = X; i <= S; i++)
             rows[i][k] *= steep;
-        for (int i = OWN; i < ROWS && all; i++)
+        for (int i = OWN; i <= Q2 && all; i++)
             rows[i][k] *= steep;
+        if (all) {
+            rows[LX][k] = x;
+            rows[LY][k] = y;
+        }
         rows[A][k] = light;
         rows[B][k] = light * total[k];
         rows[GX][k] = level * x;

@@ -200,6 +200,36 @@ static void unevenness(double sums[ROWS][ROWS], const double *N, double out[5])
     }
 }
 
+/* Write the move (2) of the centre if the gradient of added light were a parameter, too, and its covariance (uu, uv, vv) at noise of
+ * variance 1; `N` is the factor of the normal equations of all others. */
+static void added_light(double sums[ROWS][ROWS], const double *N, double out[5])
+{
+    double solved[2][PARAMETERS], A[3] = {sums[LX][LX], sums[LY][LX], sums[LY][LY]};
+    memcpy(solved[0], sums[LX], sizeof solved[0]);
+    memcpy(solved[1], sums[LY], sizeof solved[1]);
+    cholesky_solve(N, PARAMETERS, solved[0]);
+    cholesky_solve(N, PARAMETERS, solved[1]);
+    for (int i = 0; i < PARAMETERS; i++) {
+        A[0] -= sums[LX][i] * solved[0][i];
+        A[1] -= sums[LX][i] * solved[1][i];
+        A[2] -= sums[LY][i] * solved[1][i];
+    }
+    const double det = A[0] * A[2] - A[1] * A[1];
+    memset(out, 0, 5 * sizeof *out);
+    if (!(det > 1e-9 * A[0] * A[2]))
+        return;
+    const double B[3] = {A[2] / det, -A[1] / det, A[0] / det}, left[2] = {sums[LX][OFF], sums[LY][OFF]};
+    double by[2][2];
+    for (int i = X; i <= Y; i++) {
+        by[i][0] = -solved[0][i] * B[0] - solved[1][i] * B[1];
+        by[i][1] = -solved[0][i] * B[1] - solved[1][i] * B[2];
+        out[i] = by[i][0] * left[0] + by[i][1] * left[1];
+    }
+    out[2] = -by[0][0] * solved[0][X] - by[0][1] * solved[1][X];
+    out[3] = -by[0][0] * solved[0][Y] - by[0][1] * solved[1][Y];
+    out[4] = -by[1][0] * solved[0][Y] - by[1][1] * solved[1][Y];
+}
+
 /* Return the circle of the initial values, with the number of fixed-point steps that PLACE_ERROR needs. */
 static circle_t guessed(const double *pixel, const double *map, const double *bend, double blur, const double q[2])
 {
@@ -249,6 +279,7 @@ static void write_circle(
     for (int n = 0; n < 8; n++)
         result[18 + n] = 2.0 * harmonics[n] / (sums[OWN][OWN] > 1e-12 ? sums[OWN][OWN] : 1e-12);
     unevenness(sums, N, result + 26);
+    added_light(sums, N, result + 31);
 }
 
 /* Return circle `n` with initial values, and those of its neighbours (`beside`) whose light reaches its pixels. */

@@ -52,6 +52,18 @@ def test_a_blur_that_differs_with_the_direction_comes_from_what_fits_leave(name:
     assert fit.valid.all() and np.abs(fit.pixels[0] - centre).max() < WIDE_SERIES_PX
 
 
+@pytest.mark.parametrize("name", CIRCLES)
+def test_the_move_by_added_light_leads_back_to_the_centre(name: str) -> None:
+    matrix, bend = (np.array(part) for part in CIRCLES[name])
+    centre = np.array([31.3, 29.8])
+    image = picture((64, 60), centre, matrix, bend, 0.8, 200.0, -170.0, np.zeros(2))
+    image = (image + (np.arange(64.0) - centre[0])).astype(np.float32)
+    fit = fit_circles(image, centre[None], matrix[None], bend[None], np.array([0.8]), np.array([1.6]))
+    off, after = fit.pixels[0] - centre, fit.pixels[0] + fit.added_light[0] - centre
+    assert np.linalg.norm(off) > 0.01
+    assert np.linalg.norm(after) < 0.2 * np.linalg.norm(off)
+
+
 def test_the_middle_of_the_ellipse_is_not_the_centre() -> None:
     matrix, bend = (np.array(part) for part in CIRCLES["slanted"])
     centre = np.array([31.3, 29.8])

@@ -57,6 +57,8 @@ class CircleFit:
     harmonics : (N, 4, 2) cosine and sine of harmonics 3 to 6 of the edge, in radii.
     uneven : (N, 5) normal equations of a correction of `uneven_px2` from the residuals, over their variance: the
         right-hand side and the matrix (xx, xy, yy).
+    added_light, added_light_covariance : (N, 2) and (N, 2, 2) move of the centre if light added to the image (glare)
+        had a gradient of its own, px, and its covariance for white noise.
     valid : (N,)
     """
 
@@ -72,6 +74,8 @@ class CircleFit:
     count: FloatArray
     harmonics: FloatArray
     uneven: FloatArray
+    added_light: FloatArray
+    added_light_covariance: FloatArray
     valid: BoolArray
 
     @property
@@ -146,7 +150,9 @@ def fit_circles(
         count=rows[:, 13],
         growth_variance=rows[:, 15:18] * (rows[:, 12] ** 2)[:, None],
         harmonics=rows[:, 18:26].reshape(-1, 4, 2),
-        uneven=rows[:, 26:] / np.maximum(rows[:, 12:13], 1e-6) ** 2,
+        uneven=rows[:, 26:31] / np.maximum(rows[:, 12:13], 1e-6) ** 2,
+        added_light=rows[:, 31:33],
+        added_light_covariance=rows[:, [33, 34, 34, 35]].reshape(-1, 2, 2) * (rows[:, 12] ** 2)[:, None, None],
         valid=valid,
     )
 
