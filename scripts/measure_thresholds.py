@@ -205,10 +205,11 @@ def _judged(kind: str, image: str, board: bool, pixels: Grey, boards: list[Float
     least = MIN_BOARD if board else MIN_CORNERS
     size_px = (grey.shape[1], grey.shape[0])
     mine: list[RefinedLattice] = []
-    for seen in _searches(grey):
+    for number, seen in enumerate(_searches(grey)):
         fitted = refine(grey, candidate_lattices(seen, MIN_CORNERS, promising))
         kept = [item for item in fitted if item.lattice.count >= least and is_compact(item.lattice, size_px)]
-        kept = [item for item in kept if not (item.lattice.solid and has_bowed_edges(item.lattice, seen.finest))]
+        if number:
+            kept = [item for item in kept if not (item.lattice.solid and has_bowed_edges(item.lattice, seen.finest))]
         mine += [item for item in kept if not board or any(_of_board(item.lattice, corners) for corners in boards)]
         if board and mine:
             break

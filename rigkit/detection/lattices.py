@@ -89,18 +89,17 @@ def find_lattices(
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
     criteria = BoardCriteria(min_corners, sizes, has_markers)
-    searched, plausible = (
-        SearchedImage.of(grey),
-        _RejectionCounter(_is_plausible if has_markers is None else _plausible_or_marked(has_markers)),
-    )
+    searched = SearchedImage.of(grey)
+    plausible = _RejectionCounter(_is_plausible if has_markers is None else _plausible_or_marked(has_markers))
 
     def search(at: SearchedImage, more_than: int = 0) -> list[RefinedLattice]:
         boards = candidate_lattices(at, min_corners, plausible)
         if sum(item.count for item in boards) <= more_than:
             return []
         out = fit_and_confirm(grey, boards, criteria)
-        if has_markers is None:
+        if has_markers is None and at is not searched:
             # Of discs that nearly touch, coarser levels show corners that hide how far the edges bow between them.
+            # Markers in the squares bow edges, too, but the finest level shows their corners.
             out = [item for item in out if not (item.lattice.solid and has_bowed_edges(item.lattice, searched.finest))]
         plausible.rejected += 0 if out else len(boards)
         return out
