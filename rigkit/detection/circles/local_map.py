@@ -85,8 +85,10 @@ class Radii(NamedTuple):
         """
         with np.errstate(all="ignore"):
             seen = float(np.nanmedian(np.sqrt(np.abs(np.linalg.det(maps) / np.linalg.det(around.first)))))
+        # Clutter has lattices without area; the products of infinity and zero would be warned of.
+        seen = seen if np.isfinite(seen) else np.nan
         used = around.surrounded & np.isfinite(around.first).all(axis=(1, 2)) & np.isfinite(maps).all(axis=(1, 2))
-        if moved or not used.any():
+        if moved or not used.any() or np.isnan(seen):
             return cls(seen, seen)
         directions, distance_px, _ = np.linalg.svd(around.first[used])
         half_px = np.linalg.norm(np.swapaxes(maps[used], 1, 2) @ directions, axis=1)

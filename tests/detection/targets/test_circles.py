@@ -308,6 +308,7 @@ def test_a_grid_of_another_size_is_no_board() -> None:
     assert detect_boards(image, [replace(REGULAR, pattern=Circles(diameter_mm=15.0, inverted=True))]) == ()
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("name", sorted(set(BLANKS) - {"dots", "staggered"}))
 def test_nothing_is_found_where_no_circles_are(name: str) -> None:
     for seed in range(3):
