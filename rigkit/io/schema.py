@@ -13,32 +13,13 @@ from rigkit.io.manifests.manifest import DATASET_FILE
 from rigkit.io.manifests.public_set import PUBLIC_FILE
 from rigkit.io.manifests.session import SESSION_FILE
 from rigkit.io.manifests.study_file import STUDY_FILE
-from rigkit.io.schema_results import (
-    CERTIFICATE_FILE,
-    CROSSCHECK_FILE,
-    HAND_EYE_FILE,
-    HISTORY_FILE,
-    PAGE_FILE,
-    STUDY_RESULT_FILE,
-    TABLES_FILE,
-    VALIDATION_FILE,
-)
+from rigkit.io.schema_results import RESULT_FILES
 
 _OF_PEOPLE = (BOARD_FILE, DATASET_FILE, PUBLIC_FILE, SESSION_FILE, STUDY_FILE)
 _OF_CALIBRATIONS = (BOARD_RIG_FILE, CALIBRATION_FILE, CORNERS_FILE, RIG_FILE)
-_OF_OTHER_RESULTS = (
-    CERTIFICATE_FILE,
-    CROSSCHECK_FILE,
-    HAND_EYE_FILE,
-    HISTORY_FILE,
-    PAGE_FILE,
-    STUDY_RESULT_FILE,
-    TABLES_FILE,
-    VALIDATION_FILE,
-)
 SCHEMAS: dict[str, Schema] = {
     str(schema["properties"]["schema"]["const"]).removeprefix("rigkit.").partition("/")[0]: schema
-    for schema in (*_OF_PEOPLE, *_OF_CALIBRATIONS, *_OF_OTHER_RESULTS)
+    for schema in (*_OF_PEOPLE, *_OF_CALIBRATIONS, *RESULT_FILES)
 }
 """Schemas by name, such as "session" or "calibration"."""
 _KIND_WORDS = {"string": "text", "object": "table", "boolean": "true or false", "integer": "whole number"}

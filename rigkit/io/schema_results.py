@@ -206,3 +206,15 @@ HAND_EYE_FILE = file(
         "left_out_deg?": described(table(NUMBER), "images left out as outliers, and the angle by which they disagree"),
     },
 )
+
+RESULT_FILES = (
+    CERTIFICATE_FILE,
+    CROSSCHECK_FILE,
+    HAND_EYE_FILE,
+    HISTORY_FILE,
+    PAGE_FILE,
+    STUDY_RESULT_FILE,
+    TABLES_FILE,
+    VALIDATION_FILE,
+)
+"""The schemas of all results but calibrations."""
