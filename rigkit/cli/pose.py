@@ -23,7 +23,9 @@ def run(args: argparse.Namespace) -> int:
     sigmas = np.sqrt(np.diag(placed.pose.covariance))
     if args.json:
         figures = {"cam_from_board": pose.matrix()[:3].tolist(), "covariance": placed.pose.covariance.tolist()}
-        print_json({**figures, "rms_px": placed.rms_px, "ambiguous": placed.ambiguous})
+        print_json(
+            {**figures, "rms_px": placed.rms_px, "ambiguous": placed.ambiguous, "board_measured": placed.board_measured}
+        )
         return 0
     centre = pose.inverse().translation_mm
     print(pose_in_words("cam_from_board", pose, sigmas[:3], sigmas[3:]))
@@ -32,6 +34,8 @@ def run(args: argparse.Namespace) -> int:
         f"RMS {placed.rms_px:.3f} px"
         + ("; ambiguous: the board tilted the other way fits as well" if placed.ambiguous else "")
     )
+    if placed.board_measured:
+        print("the board's corners are where the calibration measured them, not flat as declared")
     if not placed.lens_known:
         print("the camera file has no covariance: the intrinsics are treated as exact")
     return 0

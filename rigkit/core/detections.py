@@ -106,6 +106,7 @@ class BoardView:
     grid : (N, 2) int corner indices.
     pixels : (N, 2)
     sigma_px : (N,)
+    points_mm : (N, 3) the corners in the board frame, where a calibration measured them; None: as declared, flat.
     """
 
     image: str
@@ -113,11 +114,14 @@ class BoardView:
     grid: IntArray
     pixels: Pixels
     sigma_px: FloatArray
+    points_mm: Points | None = None
 
     __repr__ = brief
 
     def __post_init__(self) -> None:
         _check_corners(self)
+        if self.points_mm is not None:
+            keep_arrays(self, points_mm=(len(self.grid), 3))
 
     @classmethod
     def from_detection(cls, image: str, detection: BoardDetection, boards: Sequence[Board]) -> BoardView:
@@ -130,7 +134,7 @@ class BoardView:
 
     def points(self) -> Points:
         """Return the corners in the board frame, (N, 3) mm."""
-        return self.board.points(self.grid)
+        return self.board.points(self.grid) if self.points_mm is None else self.points_mm
 
 
 def common_corners(detection1: BoardDetection, detection2: BoardDetection) -> tuple[IntArray, IntArray, IntArray]:

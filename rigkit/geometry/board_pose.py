@@ -1,4 +1,4 @@
-"""Pose of a planar target from unit rays of any central camera, also with a field of view beyond 180 degrees.
+"""Pose of a flat or slightly bowed target from unit rays of any central camera, with any field of view.
 
 The homography from target to rays is found linearly (rows `T_k H x_k = 0`, T_k a tangent basis at ray k), the pose from
 its columns. A distant planar target has a second local optimum with the opposite tilt (planar ambiguity); both are
@@ -21,6 +21,9 @@ MIN_SPREAD = 1e-6
 """Second principal extent over the first, below which points are collinear."""
 MIN_HOMOGRAPHY_GAP = 1e-9
 """Second smallest singular value over the largest, below which the homography is not unique."""
+MAX_BOW = 0.05
+"""Third principal extent over the first, above which a target is not flat enough for a homography to start from. The
+bow of a paper board on cardboard is below 0.01; it is in the refinement."""
 POSE_STEP_TOLERANCE = 1e-12
 """The refinement stops when a step changes the pose by less than this, in radians and relative to the distance."""
 MAX_POSE_STEPS = 50
@@ -52,7 +55,7 @@ def facing_normal(cam_from_board: Rigid3) -> FloatArray:
 def board_pose(rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = None) -> BoardPose:
     """Return the pose of a planar target from rays (N, 3) to its points (N, 3), mm; `sigma_rad` (N,) weights them.
 
-    Raises InputError: wrong shapes, values that are not finite, points that are not coplanar; DegenerateError: fewer
+    Raises InputError: wrong shapes, values that are not finite, points that are far from coplanar; DegenerateError: fewer
     than four points, or points or rays of which all but one are collinear.
     """
     return board_poses(rays, points_mm, sigma_rad)[0]
@@ -175,7 +178,7 @@ def _flatten(points: Points) -> tuple[Rigid3, FloatArray]:
     _, extent, axes = np.linalg.svd(points - centre, full_matrices=False)
     if extent[1] < MIN_SPREAD * extent[0] or extent[0] == 0.0:
         raise DegenerateError("board pose: the corners lie on one line; corners of at least two rows are needed")
-    if extent[2] > 1e-3 * extent[0]:
+    if extent[2] > MAX_BOW * extent[0]:
         raise InputError("board pose: the points do not lie in a plane; a flat target is needed")
     rotation = np.stack([axes[0], axes[1], np.cross(axes[0], axes[1])])
     flat = (points - centre) @ rotation.T

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.certainty.uncertainty import pose_covariance_of_lens
 from rigkit.calibration.hand_eye import HandEye, hand_eye
@@ -15,6 +16,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import board_with_fixed_pupil
 from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.core.arrays import BoolArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, BoardView
 from rigkit.core.errors import CheckFailed, DegenerateError, InputError
@@ -63,6 +65,7 @@ class PlacedCamera:
     rms_px : reprojection error of the corners, rms.
     ambiguous : whether a second pose, with the board tilted the other way, fits almost as well.
     lens_known : whether the calibration has a covariance.
+    board_measured : whether the corners of the board are those that the calibration measured, not those declared.
     """
 
     pose: BoardPose
@@ -70,6 +73,7 @@ class PlacedCamera:
     rms_px: float
     ambiguous: bool
     lens_known: bool
+    board_measured: bool
 
     __repr__ = brief
 
@@ -97,11 +101,12 @@ def calibrate_hand_eye(
             f"board '{board.board_id}' looks the same turned by 180 degrees: take {board.pattern.unambiguous}, or one "
             "with markers"
         )
-    camera = import_near_camera(options.camera)
+    camera, shape = import_near_camera(options.camera), _measured_shape(options.camera, board)
     views, stands, unreadable = [], [], []
     for done, path in enumerate(paths, start=1):
         try:
-            view = _view_of(path, _boards_in(path, board, far_camera(camera), options.camera), board)
+            seen = _boards_in(path, board, far_camera(camera), options.camera)
+            view = _view_of(path, seen, board, shape, camera)
         except InputError as error:
             if len(paths) == 1:
                 raise
@@ -111,7 +116,7 @@ def calibrate_hand_eye(
             progress("board", done, len(paths))
         if view is not None:
             base_from_hand = robot[path.name].inverse() if options.inverse else robot[path.name]
-            views.append(_with_fixed_pupil(camera, view))
+            views.append(view)
             stands.append(base_from_hand if options.board_on_hand else base_from_hand.inverse())
     if not views:
         if unreadable:
@@ -132,7 +137,8 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
     known, near = board_of_words(str(board)), import_near_camera(camera)
     lens = far_camera(near)
     seen = _boards_in(Path(image), known, lens, camera)
-    view = _view_of(Path(image), seen, known)
+    shape = _measured_shape(camera, known)
+    view = _view_of(Path(image), seen, known, shape, near)
     if view is None:
         alike = sum(frozenset((d.columns, d.rows)) == frozenset(known.size) for d in seen)
         if alike > 1:
@@ -142,12 +148,9 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
             )
         why = why_not_detected([Path(image)], [known]) or "check focus and the board's file"
         raise CheckFailed(f"'{image}' does not show board '{known.board_id}'; {why}")
-    view = _with_fixed_pupil(near, view)
-    rays, valid = lens.unproject(view.pixels)
-    unit = np.linalg.norm(lens.ray_jacobian(view.pixels[valid]), axis=(1, 2)) / np.sqrt(2.0)
-    points = view.points()[valid]
     with about(camera, image):
-        found = board_poses(rays[valid], points, view.sigma_px[valid] * unit)
+        found, valid = _poses(lens, view)
+        points = view.points()[valid]
         projected, _ = lens.project(found[0].cam_from_board.apply(points))
         rms = float(np.sqrt(((projected - view.pixels[valid]) ** 2).sum(axis=1).mean()))
         if not np.isfinite(found[0].covariance).all() or not np.isfinite(rms):
@@ -162,7 +165,7 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
         shift = pose.translation_mm * known.square_sigma_mm / np.sqrt(known.square_x_mm * known.square_y_mm)
         covariance[3:, 3:] += np.outer(shift, shift)
     placed = BoardPose(pose, found[0].rms_rad, covariance)
-    return PlacedCamera(placed, Path(image), rms, ambiguous, of_lens is not None)
+    return PlacedCamera(placed, Path(image), rms, ambiguous, of_lens is not None, shape is not None)
 
 
 def _with_fixed_pupil(camera: Camera, view: BoardView) -> BoardView:
@@ -184,9 +187,51 @@ def _boards_in(path: Path, board: Board, camera: Camera, calibration: str | Path
     return detect_boards(read_image_of(path, camera.size_px, calibration), [board], camera=camera)
 
 
-def _view_of(path: Path, seen: Sequence[BoardDetection], board: Board) -> BoardView | None:
+def _view_of(
+    path: Path, seen: Sequence[BoardDetection], board: Board, shape: BoardShape | None, camera: Camera
+) -> BoardView | None:
+    """Return the largest view of the board, as seen with a fixed pupil; its corners are those of `shape` if known.
+
+    A measured board is not as symmetric as a declared one: of its orientations the one that fits best is returned.
+    """
     found = [d for d in seen if d.board_id == board.board_id]
-    return BoardView.from_detection(path.name, max(found, key=lambda d: len(d.grid)), [board]) if found else None
+    if not found:
+        return None
+    largest = max(found, key=lambda d: len(d.grid))
+    view = BoardView.from_detection(path.name, largest, [board])
+    if shape is None:
+        return _with_fixed_pupil(camera, view)
+    turned = [largest.turned(turns) for turns in (0, *board.turns)]
+    views = [
+        replace(view, grid=d.grid, pixels=d.pixels, sigma_px=d.sigma_px, points_mm=shape.at(d.grid)) for d in turned
+    ]
+    views = [_with_fixed_pupil(camera, one) for one in views]
+    return views[0] if len(views) == 1 else min(views, key=lambda one: _poses(far_camera(camera), one)[0][0].rms_rad)
+
+
+def _poses(lens: Camera, view: BoardView) -> tuple[tuple[BoardPose, ...], BoolArray]:
+    """Return the poses of a board, best first, and which corners (N,) bool are in the field of view."""
+    rays, valid = lens.unproject(view.pixels)
+    unit = np.linalg.norm(lens.ray_jacobian(view.pixels[valid]), axis=(1, 2)) / np.sqrt(2.0)
+    return board_poses(rays[valid], view.points()[valid], view.sigma_px[valid] * unit), valid
+
+
+def _measured_shape(camera: str | Path, board: Board) -> BoardShape | None:
+    """Return the shape that a calibration file measured of this board, whatever its name there; None if it has none."""
+    try:
+        shapes = load_calibration(camera).boards
+    except InputError:
+        return None
+    same = [shape for shape in shapes if shape.kind != "flat" and _declared_as(shape, board)]
+    return same[0] if len(same) == 1 else None
+
+
+def _declared_as(shape: BoardShape, board: Board) -> bool:
+    """Return whether a measured board was declared as `board` is, but for name and sigma."""
+    known = shape.declared
+    if known is None:
+        return False
+    return (known.size, known.squares_mm, known.pattern) == (board.size, board.squares_mm, board.pattern)
 
 
 def hand_eye_text(result: HandEye, options: HandEyeOptions) -> str:
