@@ -20,7 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SESSION.toml|FOLDER|VIDEO",
         help="a session file; or one folder of images (or video, or camera:0) per camera",
     )
-    parser.add_argument("-o", "--output", type=Path, help="default: calibration.json (rig.json) beside the session")
+    parser.add_argument(
+        "-o", "--output", type=Path, help="file; default: calibration.json (rig.json) beside the session"
+    )
     parser.add_argument(
         "-r",
         "--report",
@@ -59,7 +61,17 @@ def calibrate_options(args: argparse.Namespace) -> CalibrateOptions:
     """Return the options of outputs, cache and known parameters."""
     cache = Cache.OFF if args.no_cache else Cache.UPDATE
     exports = tuple(dict.fromkeys(args.exports))
-    return options_of(CalibrateOptions, args, cache=cache, exports=exports, known=options_of(Known, args))
+    known = options_of(Known, args)
+    return options_of(CalibrateOptions, args, cache=cache, exports=exports, known=known, output=_output(args.output))
+
+
+def _output(path: Path | None) -> Path | None:
+    """Return the file to write, with the suffix .json if it has none; raises InputError for a folder."""
+    if path is None:
+        return None
+    if path.is_dir():
+        raise InputError(f"calibrate: -o '{path}' is a folder; give a file, such as '{path / 'calibration.json'}'")
+    return path if path.suffix else path.with_name(f"{path.name}.json")
 
 
 def folder_options(args: argparse.Namespace) -> FolderOptions:

@@ -42,3 +42,8 @@ def test_images_instead_of_their_folder(
         assert capsys.readouterr().err.endswith(
             f"'{images[0]}' is an image; give the folder that holds it instead, '{pictures}'\n"
         )
+
+
+def test_a_folder_to_write_is_refused(pictures: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", str(pictures), "--board", "9x6x30", "-o", str(pictures)]) == 2
+    assert capsys.readouterr().err.endswith(f"give a file, such as '{pictures / 'calibration.json'}'\n")
