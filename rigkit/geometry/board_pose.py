@@ -55,7 +55,7 @@ def facing_normal(cam_from_board: Rigid3) -> FloatArray:
 def board_pose(rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = None) -> BoardPose:
     """Return the pose of a planar target from rays (N, 3) to its points (N, 3), mm; `sigma_rad` (N,) weights them.
 
-    Raises InputError: wrong shapes, values that are not finite, points that are far from coplanar; DegenerateError: fewer
+    Raises InputError: wrong shapes, values that are not finite, far from coplanar points; DegenerateError: fewer
     than four points, or points or rays of which all but one are collinear.
     """
     return board_poses(rays, points_mm, sigma_rad)[0]
