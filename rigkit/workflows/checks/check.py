@@ -96,6 +96,7 @@ def check_pictures(
     both = {path for frame in now for path in frame} & {path for frame in before for path in frame}
     if both:
         raise InputError(f"check: '{min(both)}' is given both as a new image and with --before")
+    _refuse_own_images(source, now)
     goals = [] if options.length is None else length_goals(monitored.cameras, monitored.cam_from_rig, options.length)
     boards = _replaced_by_known(options.boards, known) or known
     pictures = _Pictures(source=source, monitored=monitored, boards=boards, known=known, progress=progress)
@@ -123,6 +124,22 @@ def check_pictures(
     )
 
 
+def _refuse_own_images(source: Path, frames: Sequence[Sequence[Path]]) -> None:
+    """Raise InputError for the images, all of one camera, that the calibration in `source` was made from."""
+    known = json.loads(source.read_text(encoding="utf-8")).get("made", {}).get("inputs", {}).values()
+    for camera in zip(*frames, strict=True):
+        if _digest_alone(camera) in known:
+            raise InputError(
+                f"check: '{source}' was made from these very images, which fit it even if the camera has changed since; "
+                "give new ones"
+            )
+
+
+def _digest_alone(images: Sequence[Path]) -> str:
+    """Return the digest of images without the words on how it was computed; "" if none is readable."""
+    return (digest_of_images(images) or "").rpartition(": ")[2]
+
+
 def _files(source: Path, check: CalibrationCheck, options: CheckOptions) -> dict[Path, str | bytes]:
     """Return the contents of the files to write, by path: the corrected calibration, and the page."""
     files: dict[Path, str | bytes] = {}
@@ -139,8 +156,7 @@ def _files(source: Path, check: CalibrationCheck, options: CheckOptions) -> dict
 def _register(
     register: Path, source: Path, check: CalibrationCheck, before: Sequence[Sequence[Path]], temperature_c: float | None
 ) -> None:
-    # Only the digest, without the words on how it was computed.
-    since = (digest_of_images([image for frame in before for image in frame]) or "").rpartition(": ")[2]
+    since = _digest_alone([image for frame in before for image in frame])
     place = path_from_register(register, source)
     entry = HistoryEntry.of_check(check, place, digest=digest_of(source), baseline=since, temperature_c=temperature_c)
     add_entry(register, entry)
