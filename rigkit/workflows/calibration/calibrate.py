@@ -20,11 +20,9 @@ from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.io.manifests.session import Session, files_of_session, load_session
 from rigkit.workflows.calibration.session_page import session_page
-from rigkit.workflows.inputs.black_borders import black_borders
 from rigkit.workflows.inputs.corners import SessionCorners, given_corners, named_images, session_corners, session_views
 from rigkit.workflows.inputs.identify_board import why_misplaced
-from rigkit.workflows.inputs.interlaced import interlaced
-from rigkit.workflows.inputs.wrong_print import wrong_print
+from rigkit.workflows.inputs.image_faults import black_borders, interlaced, wrong_print
 from rigkit.workflows.options.cameras import CalibrateOptions
 from rigkit.workflows.outputs.calibration_paths import calibration_paths
 from rigkit.workflows.outputs.export_camera import foreign_files

@@ -29,8 +29,8 @@ from rigkit.workflows.calibration.rigid_boards import named_as_listed, named_by_
 from rigkit.workflows.calibration.session_page import rig_page
 from rigkit.workflows.inputs.corners import SessionCorners, named_images, session_corners, session_views
 from rigkit.workflows.inputs.identify_board import why_misplaced
+from rigkit.workflows.inputs.image_faults import wrong_print
 from rigkit.workflows.inputs.known_cameras import known_cameras, known_cameras_first, with_known
-from rigkit.workflows.inputs.wrong_print import wrong_print
 from rigkit.workflows.options.cameras import CalibrateOptions
 from rigkit.workflows.outputs.calibration_paths import boards_path, calibration_paths, camera_exports, camera_path
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_rig_files

@@ -18,7 +18,7 @@ from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.synthetic.render import Optics
-from rigkit.workflows.inputs.wrong_print import wrong_print
+from rigkit.workflows.inputs.image_faults import wrong_print
 
 BORDER = "the tags of board 'b' have a border of {} in the images, {} is declared"
 MARKER = "the markers of board 'b' have 0.{} of a square's side in the images, 0.{} is declared"

@@ -13,7 +13,7 @@ from helpers.calibration_scenes import random_views
 from rigkit.calibration.calibrate import calibrate
 from rigkit.cameras.brown import Brown
 from rigkit.io.media.images import Image
-from rigkit.workflows.inputs.black_borders import black_borders
+from rigkit.workflows.inputs.image_faults import black_borders
 
 SIZE = (640, 480)
 CAMERA = Brown(SIZE, np.array([540.0, 540.0, 320.0, 240.0, -0.2, 0.1, 0.0, 0.0, 0.0]))

@@ -13,7 +13,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.cameras.brown import Brown
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.fields import shift_between_fields
-from rigkit.workflows.inputs.interlaced import interlaced
+from rigkit.workflows.inputs.image_faults import interlaced
 
 SIZE = (640, 480)
 CAMERA = Brown(SIZE, np.array([540.0, 540.0, 320.0, 240.0, -0.2, 0.1, 0.0, 0.0, 0.0]))
