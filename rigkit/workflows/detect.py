@@ -36,7 +36,7 @@ from rigkit.io.media.images import (
 from rigkit.io.media.video import is_video, videos_inside
 from rigkit.report.pictures.overlay import draw_boards
 from rigkit.workflows.inputs.camera_files import import_camera
-from rigkit.workflows.inputs.frames import VideoFrames, frames_folder, frames_of_videos
+from rigkit.workflows.inputs.frames import frames_folder, frames_of_videos
 from rigkit.workflows.inputs.identify_board import suggestion, why_not_detected
 from rigkit.workflows.options.cameras import DetectOptions
 
@@ -93,9 +93,7 @@ def detect_in_images(
     if bad and len(given) == len(bad) == 1:
         raise next(iter(bad.values()))
     stills = [path for path in given if str(path) not in bad]
-    images = list(
-        images_in([image for path in stills for image in (videos[path].images[""] if path in videos else (path,))])
-    )
+    images = list(images_in([image for path in stills for image in videos.get(path, (path,))]))
     if options.camera is not None and not boards:
         raise InputError("--camera needs boards of known size; give them, such as --board a9x6.toml")
     camera = None if options.camera is None else import_camera(options.camera)
@@ -132,12 +130,12 @@ def _nothing_found(images: Sequence[Path], boards: Sequence[Board], doubtful: Ma
 
 def _frames_of(
     videos: Sequence[Path], boards: Sequence[Board], progress: Progress
-) -> tuple[dict[Path, VideoFrames], dict[str, InputError]]:
+) -> tuple[dict[Path, tuple[Path, ...]], dict[str, InputError]]:
     """Return the frames kept of each video, and the errors of videos that give none."""
     kept, bad = {}, {}
     for path in videos:
         try:
-            kept[path] = frames_of_videos({"": path}, frames_folder([path]), boards, progress=progress)
+            kept[path] = frames_of_videos({"": path}, frames_folder([path]), boards, progress=progress)[""]
         except InputError as error:
             bad[str(path)] = error
     return kept, bad

@@ -124,6 +124,6 @@ def write_media(folder: Path) -> None:
     (folder / "history.jsonl").write_text("".join(json.dumps(entry | {"date": date}) + "\n" for date in dates))
     record = {
         "schema": "rigkit.frames/1", "asked": {"cameras": {"": "film.avi"}, "files": {}, "boards": "", "most": 40},
-        "images": {"": ["000001.png"]}, "looked_at": 8, "with_boards": 8, "near_copies": 7,
+        "images": {"": ["000001.png"]},
     }  # fmt: skip
     (folder / "frames.json").write_text(json.dumps(record))

@@ -97,9 +97,9 @@ def test_frames_go_over_no_other_files(place: Path) -> None:
         frames_of_videos({"": Path("film.avi")}, folder, [BOARD])
     assert (folder / "000001.png").read_bytes() == b"mine"
     (folder / "000001.png").unlink()
-    first = frames_of_videos({"": Path("film.avi")}, folder, [BOARD]).images
+    first = frames_of_videos({"": Path("film.avi")}, folder, [BOARD])
     (folder / "frames.json").write_text("[" * 100_000)
-    assert frames_of_videos({"": Path("film.avi")}, folder, [BOARD]).images == first
+    assert frames_of_videos({"": Path("film.avi")}, folder, [BOARD]) == first
 
 
 def test_the_coach(place: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture) -> None:

@@ -9,7 +9,6 @@ from concurrent.futures import Executor
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -39,7 +38,7 @@ from rigkit.workflows.calibration.calibrate import SessionCalibration
 from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.folder_session import session_of_future_images
-from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos, timestamps_next_to
+from rigkit.workflows.inputs.frames import moments_of_videos, numbers_of_moments, timestamps_next_to
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions
 from rigkit.workflows.options.coach import CoachOptions
 
@@ -147,11 +146,9 @@ def coach_recording(
         coach.say(f"{what.capitalize()}: {done} of {total}")
         progress(what, done, total)
 
-    with TemporaryDirectory(prefix="rigkit-coach-") as place:
-        kept = frames_of_videos(sources, Path(place) / "frames", boards, timestamps=times, progress=report)
-    numbers = {int(path.stem) for paths in kept.images.values() for path in paths}
-    frames = [[moment[name] for name in sources] for moment in moments_of_videos(sources, numbers, times)]
-    coach.choose(frames, show)
+    numbers = numbers_of_moments(sources, boards, times, report)
+    moments = [frames for _, frames in moments_of_videos(sources, numbers, times)]
+    coach.choose([[frames[name] for name in sources] for frames in moments if len(frames) == len(sources)], show)
     guide = coach.guide
     if not guide.frames:
         return ""

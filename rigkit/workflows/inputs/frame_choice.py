@@ -54,44 +54,35 @@ class FrameChoice:
 
     def __init__(self, max_frames: int) -> None:
         self.kept: dict[int, KeptFrame] = {}
-        self.near_copies = 0
         self._max_frames, self._radius = max_frames, SAME_VIEW
 
-    def offer(self, frame: KeptFrame) -> tuple[bool, list[int]]:
-        """Return whether `frame` is kept, and the numbers of the frames that are removed."""
+    def offer(self, frame: KeptFrame) -> None:
+        """Keep `frame`, and remove others for it, unless it repeats one that is about as sharp."""
         near = [k for k, other in self.kept.items() if _frame_distance(frame, other) < self._radius]
-        self.near_copies += bool(near)
         if near and frame.sigma_px > CLEARLY_SHARPER * min(self.kept[k].sigma_px for k in near):
-            return False, []
+            return
         for k in near:
             del self.kept[k]
         self.kept[frame.number] = frame
-        gone = list(near)
         while len(self.kept) > 2 * self._max_frames:
             self._radius *= GROWTH
-            gone += self._thin()
-        return frame.number in self.kept, gone
+            self._thin()
 
-    def finish(self) -> list[int]:
-        """Remove blurred frames, then the most similar ones; return the numbers of the removed frames."""
-        before = set(self.kept)
+    def finish(self) -> None:
+        """Remove blurred frames, then the most similar ones."""
         if self.kept:
             limit = BLURRED * float(np.median([frame.sigma_px for frame in self.kept.values()]))
             self.kept = {k: frame for k, frame in self.kept.items() if frame.sigma_px <= limit}
         if len(self.kept) > self._max_frames:
             self.kept = {k: self.kept[k] for k in sorted(self._farthest_first())}
-        return sorted(before - set(self.kept))
 
-    def _thin(self) -> list[int]:
-        """Remove frames that are similar to a sharper one; return their numbers."""
-        ordered = sorted(self.kept.values(), key=lambda frame: frame.sigma_px)
+    def _thin(self) -> None:
+        """Remove frames that are similar to a sharper one."""
         rest: list[KeptFrame] = []
-        for frame in ordered:
+        for frame in sorted(self.kept.values(), key=lambda frame: frame.sigma_px):
             if all(_frame_distance(frame, other) >= self._radius for other in rest):
                 rest.append(frame)
-        gone = set(self.kept) - {frame.number for frame in rest}
         self.kept = {frame.number: frame for frame in sorted(rest, key=lambda frame: frame.number)}
-        return sorted(gone)
 
     def _farthest_first(self) -> list[int]:
         """Return the numbers of `max_frames` frames by farthest-first traversal (Gonzalez 1985).

@@ -8,9 +8,9 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -46,25 +46,6 @@ RECORD, FRAMES_SCHEMA = "frames.json", "rigkit.frames/1"
 PNG_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class VideoFrames:
-    """The frames kept of videos.
-
-    Attributes
-    ----------
-    folder : folder of the images; several cameras have a folder each in it.
-    images : images by camera, "" for a single one.
-    looked_at, with_boards, near_copies : numbers of moments searched, of those that show a board, and of those whose
-        view repeats another.
-    """
-
-    folder: Path
-    images: Mapping[str, tuple[Path, ...]]
-    looked_at: int
-    with_boards: int
-    near_copies: int
-
-
 def frames_folder(sources: Sequence[Path]) -> Path:
     """Return the default folder for the frames of videos, beside the first video."""
     first = sources[0]
@@ -88,8 +69,9 @@ def frames_of_videos(
     timestamps: Path | None = None,
     max_frames: int = MAX_FRAMES,
     progress: Progress = silent,
-) -> VideoFrames:
-    """Write selected frames of one video (named ""), or selected moments of several cameras' videos, as PNG files.
+) -> dict[str, tuple[Path, ...]]:
+    """Write selected frames of one video (named ""), or selected moments of several cameras' videos, as PNG files, and
+    return these by camera; several cameras have a folder each in `folder`.
 
     A source is a video, a numbered sequence, or a live camera, which is read until `max_frames` or Ctrl-C. Frames that
     an earlier call kept of the same videos for the same boards are used again. `timestamps` is a file that assigns
@@ -98,47 +80,68 @@ def frames_of_videos(
     Raises InputError: unreadable video, no frame with a board, `folder` not writable or with other files in it.
     """
     asked = _request(sources, boards, timestamps, max_frames)
-    kept = _kept_before(folder, asked)
-    if kept is not None:
+    if (kept := _kept_before(folder, asked)) is not None:
         return kept
-    keeper = _FrameFolder(folder, FrameChoice(max_frames))
-    looked_at = with_boards = 0
     with _opened(sources, timestamps) as (videos, moments):
         live = any(video.live for video in videos.values())
-        _claim_folder(folder, live)
-        if moments is None:
-            _warn_of_clocks(videos)
-        total = min((v.count for v in videos.values() if v.count), default=0) if moments is None else len(moments)
-        # Ctrl-C ends the capture of a live camera.
-        with suppress(*((KeyboardInterrupt,) if live else ())):
-            for number, pictures in _moments(videos, moments):
-                looked_at += 1
-                progress(SEARCHING, looked_at, max(total, looked_at))
-                frame = _described(number, pictures, boards)
-                if frame is not None:
-                    with_boards += 1
-                    keeper.offer(frame, {name: pictures[name] for name in frame.views})
-                if live and len(keeper.choice.kept) >= max_frames:
-                    break
-        # Moments of the timestamps that have no frame are not searched.
-        progress(SEARCHING, looked_at, looked_at)
-    images = keeper.finish()
-    if not images:
+        _claim_folder(folder, sources, live)
+        chosen, shots = _chosen_moments(sources, videos, moments, boards, max_frames, progress)
+    images: dict[str, tuple[Path, ...]] = dict.fromkeys(sources, ())
+    for number, pictures in shots.items() if live else moments_of_videos(sources, list(chosen), timestamps):
+        for name in chosen[number].views:
+            path = folder / name / f"{number:06d}.png"
+            write_atomic(path, np.asarray(cv2.imencode(".png", pictures[name], PNG_FAST)[1]).tobytes(), force=True)
+            images[name] += (path,)
+    if not live:
+        stored = {name: [path.relative_to(folder).as_posix() for path in paths] for name, paths in images.items()}
+        record = json.dumps({"schema": FRAMES_SCHEMA, "asked": asked, "images": stored}, indent=1)
+        write_atomic(folder / RECORD, record + "\n", force=True)
+    return images
+
+
+def numbers_of_moments(
+    sources: Mapping[str, Path], boards: Sequence[Board], timestamps: Path | None = None, progress: Progress = silent
+) -> list[int]:
+    """Return the numbers of the moments that `frames_of_videos` selects; raises as it does for videos."""
+    with _opened(sources, timestamps) as (videos, moments):
+        return list(_chosen_moments(sources, videos, moments, boards, MAX_FRAMES, progress)[0])
+
+
+def _chosen_moments(
+    sources: Mapping[str, Path],
+    videos: Mapping[str, Video],
+    moments: Mapping[int, Mapping[str, int]] | None,
+    boards: Sequence[Board],
+    max_frames: int,
+    progress: Progress,
+) -> tuple[dict[int, KeptFrame], dict[int, dict[str, Image]]]:
+    """Return the selected moments by number, and of live cameras, which cannot be read again, their pictures."""
+    choice, looked_at, shots = FrameChoice(max_frames), 0, dict[int, dict[str, Image]]()
+    live = any(video.live for video in videos.values())
+    if moments is None:
+        _warn_of_clocks(videos)
+    total = min((v.count for v in videos.values() if v.count), default=0) if moments is None else len(moments)
+    # Ctrl-C ends the capture of a live camera.
+    with suppress(*((KeyboardInterrupt,) if live else ())):
+        for number, pictures in _moments(videos, moments):
+            looked_at += 1
+            progress(SEARCHING, looked_at, max(total, looked_at))
+            if (frame := _described(number, pictures, boards)) is not None:
+                choice.offer(frame)
+                if live:
+                    shots = {k: shot for k, shot in (*shots.items(), (number, pictures)) if k in choice.kept}
+            if live and len(choice.kept) >= max_frames:
+                break
+    # Moments of the timestamps that have no frame are not searched.
+    progress(SEARCHING, looked_at, looked_at)
+    choice.finish()
+    if not choice.kept:
         names = ", ".join(f"'{path}'" for path in sources.values())
         shown = None if live or not boards else why_not_detected(list(sources.values()), boards, progress)
         raise InputError(
             f"{names}: no board in {looked_at} frames; {shown or 'check focus, light and the size of the board'}"
         )
-    done = VideoFrames(
-        folder=folder,
-        images={name: images.get(name, ()) for name in sources},
-        looked_at=looked_at,
-        with_boards=with_boards,
-        near_copies=keeper.choice.near_copies,
-    )
-    if not live:
-        _record(done, asked)
-    return done
+    return choice.kept, {number: shots[number] for number in choice.kept if live}
 
 
 def _warn_of_clocks(videos: Mapping[str, Video]) -> None:
@@ -184,13 +187,12 @@ def _opened(
 
 
 def moments_of_videos(
-    sources: Mapping[str, Path], numbers: Collection[int], timestamps: Path | None = None
-) -> Iterator[dict[str, Image]]:
-    """Yield the frames by camera of the moments `numbers`; moments that lack a camera are skipped."""
+    sources: Mapping[str, Path], numbers: Sequence[int], timestamps: Path | None = None
+) -> Iterator[tuple[int, dict[str, Image]]]:
+    """Yield the number and the frames by camera of the moments `numbers`, in rising order."""
     with _opened(sources, timestamps) as (videos, moments):
-        for number, pictures in _moments(videos, moments):
-            if number in numbers and len(pictures) == len(sources):
-                yield pictures
+        table = {k: dict.fromkeys(videos, k) for k in numbers} if moments is None else moments
+        yield from ((number, pictures) for number, pictures in _moments(videos, table) if number in numbers)
 
 
 def _described(number: int, pictures: Mapping[str, Image], boards: Sequence[Board]) -> KeptFrame | None:
@@ -231,57 +233,13 @@ def with_frames(session: Session | RigSession, progress: Progress = silent) -> S
     if any(len(paths) > 1 for paths in videos.values()):
         raise InputError(f"{session.path}: several videos of one camera; keep one")
     boards = next(iter(own.values())).boards
-    done = frames_of_videos(
-        sources, place, boards, timestamps=timestamps_next_to(list(sources.values())), progress=progress
-    )
+    times = timestamps_next_to(list(sources.values()))
+    frames = frames_of_videos(sources, place, boards, timestamps=times, progress=progress)
     cameras: dict[str, Session] = {}
     for name, camera in own.items():
         still = [path for path in camera.images if path not in videos[name]]
-        cameras[name] = replace(camera, images=(*still, *done.images.get(name, ())))
+        cameras[name] = replace(camera, images=(*still, *frames.get(name, ())))
     return replace(session, cameras=cameras) if isinstance(session, RigSession) else cameras[""]
-
-
-class _FrameFolder:
-    """Writes the frames that the choice keeps, the newest with a delay: a sharper one of the same view may follow."""
-
-    def __init__(self, folder: Path, choice: FrameChoice) -> None:
-        self.choice = choice
-        self._folder = folder
-        self._written: dict[int, dict[str, Path]] = {}
-        self._held: tuple[int, dict[str, Image]] | None = None
-
-    def offer(self, frame: KeptFrame, pictures: dict[str, Image]) -> None:
-        kept, gone = self.choice.offer(frame)
-        self._forget(gone)
-        if kept:
-            self._write_held()
-            self._held = frame.number, pictures
-
-    def finish(self) -> dict[str, tuple[Path, ...]]:
-        """Return the images by camera."""
-        self._write_held()
-        self._forget(self.choice.finish())
-        out: dict[str, list[Path]] = {}
-        for number in sorted(self._written):
-            for name, path in self._written[number].items():
-                out.setdefault(name, []).append(path)
-        return {name: tuple(paths) for name, paths in out.items()}
-
-    def _write_held(self) -> None:
-        if self._held is None:
-            return
-        number, pictures = self._held
-        self._held = None
-        self._written[number] = paths = {name: self._folder / name / f"{number:06d}.png" for name in pictures}
-        for name, path in paths.items():
-            write_atomic(path, np.asarray(cv2.imencode(".png", pictures[name], PNG_FAST)[1]).tobytes(), force=True)
-
-    def _forget(self, numbers: Sequence[int]) -> None:
-        for number in numbers:
-            if self._held is not None and self._held[0] == number:
-                self._held = None
-            for path in self._written.pop(number, {}).values():
-                path.unlink(missing_ok=True)
 
 
 def _request(
@@ -299,38 +257,31 @@ def _request(
     }
 
 
-def _claim_folder(folder: Path, live: bool) -> None:
-    """Mark the folder as one of kept frames.
+def _claim_folder(folder: Path, sources: Iterable[str], live: bool) -> None:
+    """Mark the folder as one of frames of videos, which can be taken again, unlike those of a `live` camera.
 
-    Raises InputError if it holds anything else, or frames of a live camera, which cannot be taken again.
+    Raises InputError if it holds anything else.
     """
     ensure_folder_writable(folder)
     own = (folder / RECORD).is_file()
     if folder.is_dir() and any(folder.iterdir()) and (live or not own):
-        what = "frames of an earlier capture" if own else "other files than frames kept of a video"
+        what = "frames of videos" if own else "other files than frames kept of a video"
         raise InputError(f"'{folder}' holds {what}, which stay as they are; rename or remove that folder")
-    if not own:
+    # Those of an earlier choice would be taken for images of this one.
+    for earlier in (path for name in sources for path in (folder / name).glob("[0-9]" * 6 + ".png")):
+        earlier.unlink()
+    if not own and not live:
         write_atomic(folder / RECORD, json.dumps({"schema": FRAMES_SCHEMA, "asked": None}) + "\n")
 
 
-def _record(done: VideoFrames, asked: Mapping[str, object]) -> None:
-    images = {name: [p.relative_to(done.folder).as_posix() for p in paths] for name, paths in done.images.items()}
-    counts = {"looked_at": done.looked_at, "with_boards": done.with_boards, "near_copies": done.near_copies}
-    text = json.dumps({"schema": FRAMES_SCHEMA, "asked": asked, "images": images, **counts}, indent=1)
-    write_atomic(done.folder / RECORD, text + "\n", force=True)
-
-
-def _kept_before(folder: Path, asked: Mapping[str, object]) -> VideoFrames | None:
+def _kept_before(folder: Path, asked: Mapping[str, object]) -> dict[str, tuple[Path, ...]] | None:
     """Return the frames that an earlier call for the same `asked` kept in `folder`, or None."""
     if not (folder / RECORD).is_file():
         return None
     try:
         stored = json.loads(read_text(folder / RECORD, "record"))
         images = {name: tuple(folder / p for p in paths) for name, paths in stored["images"].items()}
-        counts = {key: int(stored[key]) for key in ("looked_at", "with_boards", "near_copies")}
         same = stored["schema"] == FRAMES_SCHEMA and stored["asked"] == json.loads(json.dumps(asked))
     except (InputError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return None
-    if not same or not all(path.is_file() for paths in images.values() for path in paths):
-        return None
-    return VideoFrames(folder=folder, images=images, **counts)
+    return images if same and all(path.is_file() for paths in images.values() for path in paths) else None

@@ -26,7 +26,7 @@ from rigkit.workflows.calibration.calibrate_any import calibrate_folders
 from rigkit.workflows.detect import detect_in_images
 from rigkit.workflows.inputs.folder_session import boards_seen
 from rigkit.workflows.inputs.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
-from rigkit.workflows.inputs.frames import _FrameFolder, frames_of_videos
+from rigkit.workflows.inputs.frames import frames_of_videos
 from rigkit.workflows.inputs.identify_board import identify_board
 from rigkit.workflows.options.cameras import CalibrateOptions, FolderOptions
 
@@ -64,15 +64,14 @@ def test_each_view_is_kept_once_and_sharp(tmp_path: Path) -> None:
     for k, pose in enumerate(poses):
         frames += [picture(*pose, blur_px=0.7 if shot == k % 3 else 2.5) for shot in range(3)]
     done = frames_of_videos({"": video(tmp_path / "a.avi", frames)}, tmp_path / "out", [BOARD])
-    assert (done.looked_at, done.with_boards, done.near_copies) == (13, 12, 8)
-    assert [path.stem for path in done.images[""]] == ["000001", "000005", "000009", "000010"]
-    kept = read_image(done.images[""][1])
+    assert [path.stem for path in done[""]] == ["000001", "000005", "000009", "000010"]
+    kept = read_image(done[""][1])
     assert np.array_equal(kept, cv2.cvtColor(cv2.cvtColor(frames[5], cv2.COLOR_GRAY2BGR), cv2.COLOR_BGR2GRAY))
     # Nothing else is left behind, and the second time nothing is decoded.
-    assert sorted(p.name for p in (tmp_path / "out").iterdir())[:-1] == [p.name for p in done.images[""]]
+    assert sorted(p.name for p in (tmp_path / "out").iterdir())[:-1] == [p.name for p in done[""]]
     stamp = (tmp_path / "out" / "frames.json").stat().st_mtime_ns
     again = frames_of_videos({"": tmp_path / "a.avi"}, tmp_path / "out", [BOARD])
-    assert again.images == done.images
+    assert again == done
     assert (tmp_path / "out" / "frames.json").stat().st_mtime_ns == stamp
     with pytest.raises(InputError, match="no board in 2 frames"):
         frames_of_videos({"": video(tmp_path / "b.avi", [empty, empty])}, tmp_path / "other")
@@ -86,8 +85,8 @@ def test_videos_of_two_cameras_give_frames_of_one_moment(tmp_path: Path, caplog:
     rows = [(10 + k, 0, 5 + k) for k in range(4)] + [(11 + k, 1, 8 + k) for k in range(3)]
     stamps.write_text("sync_index,cam_id,frame_index\n" + "".join(f"{a},{b},{c}\n" for a, b, c in rows))
     done = frames_of_videos({"cam_0": one, "cam_1": two}, tmp_path / "frames", [BOARD], timestamps=stamps)
-    assert [p.stem for p in done.images["cam_0"]] == ["000010", "000011", "000012", "000013"]
-    assert [p.stem for p in done.images["cam_1"]] == ["000012", "000013"]
+    assert [p.stem for p in done["cam_0"]] == ["000010", "000011", "000012", "000013"]
+    assert [p.stem for p in done["cam_1"]] == ["000012", "000013"]
     # Without the table frames are counted, which videos of other lengths speak against.
     assert "differ" not in caplog.text
     frames_of_videos({"cam_0": one, "cam_1": two}, tmp_path / "counted", [BOARD])
@@ -125,7 +124,8 @@ def test_blurred_frames_are_left_out() -> None:
     choice = FrameChoice(10)
     for number in range(6):
         choice.offer(frame(number, 1.0 + 0.1 * number * DIRECTIONS[:, 0], 0.5 if number == 3 else 0.05))
-    assert choice.finish() == [3]
+    choice.finish()
+    assert sorted(choice.kept) == [0, 1, 2, 4, 5]
 
 
 def test_a_folder_of_videos_is_a_camera_each(tmp_path: Path) -> None:
@@ -156,11 +156,17 @@ def test_the_board_of_a_video_is_identified(tmp_path: Path) -> None:
         calibrate_folders([path], FolderOptions(), CalibrateOptions())
 
 
-def test_a_frame_that_is_not_kept_is_not_written(tmp_path: Path) -> None:
-    """A view that is there already, and is no sharper, leaves what is there."""
-    folder, place = _FrameFolder(tmp_path, FrameChoice(10)), {"": np.arange(8.0)}
-    for number, sigma_px in ((3, 0.05), (7, 0.2)):
-        folder.offer(KeptFrame(number, place, sigma_px), {"": np.full((4, 6), number, dtype=np.uint8)})
-    assert len(folder.finish()[""]) == 1
-    (written,) = tmp_path.iterdir()
-    assert (read_image(written) == 3).all()
+def test_a_view_that_is_there_already_is_kept_only_if_it_is_sharper() -> None:
+    choice, place = FrameChoice(10), {"": np.arange(8.0)}
+    for number, sigma_px in ((3, 0.05), (7, 0.2), (9, 0.01)):
+        choice.offer(KeptFrame(number, place, sigma_px))
+        assert list(choice.kept) == [9 if number == 9 else 3]
+
+
+def test_frames_of_an_earlier_choice_are_removed(tmp_path: Path) -> None:
+    """As after the board was corrected: all images of the folder are those of the camera."""
+    shots = [picture((0.0, 0.3 * k, 0.0), 0.0) for k in range(2)]
+    first = frames_of_videos({"": video(tmp_path / "a.avi", shots)}, tmp_path / "out", [BOARD])
+    again = frames_of_videos({"": video(tmp_path / "a.avi", shots[:1])}, tmp_path / "out", [BOARD])
+    assert len(first[""]) == 2 and again[""] == first[""][:1]
+    assert sorted((tmp_path / "out").glob("*.png")) == list(again[""])
