@@ -13,8 +13,7 @@ from helpers.schemas import faults
 from helpers.stereo_pictures import of_one_camera
 
 from rigkit.cli.main import main
-from rigkit.report.pages.page import build_page, validation_facts
-from rigkit.report.pages.validation_page import pair_section, summary_table
+from rigkit.report.pages.validation_page import build_page, pair_section, summary_table, validation_facts
 from rigkit.report.pages.validation_verdict import verdict_of
 from rigkit.validation.diagnose import diagnose
 

@@ -10,8 +10,7 @@ import pytest
 
 from helpers.reconstructions import make_reconstruction
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
-from rigkit.report.pages.page import build_page
-from rigkit.report.pages.validation_page import pair_section, summary_table
+from rigkit.report.pages.validation_page import build_page, pair_section, summary_table
 from rigkit.report.pages.validation_verdict import verdict_of
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.diagnose import diagnose

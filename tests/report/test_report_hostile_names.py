@@ -12,8 +12,7 @@ from helpers.reconstructions import make_reconstruction
 
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.core.truth import MeasuredAngle, PairTruth
-from rigkit.report.pages.page import build_page
-from rigkit.report.pages.validation_page import pair_section, summary_table
+from rigkit.report.pages.validation_page import build_page, pair_section, summary_table
 from rigkit.report.pages.validation_verdict import verdict_of
 from rigkit.report.tables import tables_to_csv, tables_to_markdown, tables_to_text
 from rigkit.validation.checks import validate

@@ -23,9 +23,8 @@ from rigkit.reconstruction.calibration_shifts import CalibrationShifts, with_cal
 from rigkit.reconstruction.geometry import PairGeometry
 from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.reconstruction.reconstruct import Reconstruction, on_planes, reconstruct_from
-from rigkit.report.pages.page import PairSection
 from rigkit.report.pages.page_facts import PageFacts
-from rigkit.report.pages.validation_page import crosscheck_table, pair_section
+from rigkit.report.pages.validation_page import PairSection, crosscheck_table, pair_section
 from rigkit.report.pictures.drawings import normal_errors_svg, residuals_svg
 from rigkit.report.pictures.figures import pair_jpeg, pair_pictures
 from rigkit.validation.checks import ValidationReport, validate_each

@@ -8,14 +8,16 @@ from dataclasses import dataclass, replace
 from rigkit.calibration.result import Calibration
 from rigkit.core.printing import brief
 from rigkit.io.manifests.manifest import Dataset
-from rigkit.report.pages.page import PairSection, build_page, validation_facts
 from rigkit.report.pages.page_facts import PageFacts
 from rigkit.report.pages.validation_page import (
     SUMMARY_WORDS,
+    PairSection,
+    build_page,
     camera_remarks,
     camera_table,
     crosscheck_table,
     summary_table,
+    validation_facts,
 )
 from rigkit.report.pages.validation_verdict import verdict_of
 from rigkit.report.tables import TABLE_WRITERS, table_files

@@ -10,8 +10,7 @@ from helpers.browser import MIN_FONT_PX, WIDTHS, probed_at_widths
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.core.truth import MeasuredAngle, PairTruth
-from rigkit.report.pages.page import build_page
-from rigkit.report.pages.validation_page import pair_section, summary_table
+from rigkit.report.pages.validation_page import build_page, pair_section, summary_table
 from rigkit.report.pages.validation_verdict import verdict_of
 from rigkit.report.pictures.figures import as_png, cloud_figure
 from rigkit.validation.checks import validate
