@@ -70,12 +70,12 @@ from rigkit.validation.checks import ValidationReport as ValidationReport
 from rigkit.validation.checks import validate as validate
 from rigkit.validation.crosscheck import CrossCheckReport as CrossCheckReport
 from rigkit.validation.crosscheck import crosscheck as crosscheck
+from rigkit.workflows.calibration.calibrate import RigSessionCalibration as RigSessionCalibration
 from rigkit.workflows.calibration.calibrate import SessionCalibration as SessionCalibration
+from rigkit.workflows.calibration.calibrate import calibrate_rig_session as calibrate_rig_session
 from rigkit.workflows.calibration.calibrate import calibrate_session as calibrate_session
 from rigkit.workflows.calibration.calibrate_any import calibrate_folders as calibrate_folders
 from rigkit.workflows.calibration.calibrate_any import calibrate_session_file as calibrate_session_file
-from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration as RigSessionCalibration
-from rigkit.workflows.calibration.calibrate_rig import calibrate_rig_session as calibrate_rig_session
 from rigkit.workflows.capture.coach import run_coach as run_coach
 from rigkit.workflows.capture.plan import LensOptions as LensOptions
 from rigkit.workflows.capture.plan import PlannedSession as PlannedSession

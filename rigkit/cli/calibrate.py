@@ -13,8 +13,7 @@ from rigkit.cli.calibrate_arguments import calibrate_options, folder_options
 from rigkit.core.errors import ExitCode, InputError, RigkitError
 
 if TYPE_CHECKING:
-    from rigkit.workflows.calibration.calibrate import SessionCalibration
-    from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration
+    from rigkit.workflows.calibration.calibrate import RigSessionCalibration, SessionCalibration
 
 
 def run(args: argparse.Namespace) -> int:
@@ -80,17 +79,13 @@ def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCali
 
 def _summary(done: SessionCalibration | RigSessionCalibration, *, json: bool) -> tuple[dict[str, Any], str, bool]:
     """Return the figures for `json` programs, the words for a person, and whether everything measured agrees."""
-    from rigkit.cli import calibration_output, rig_output
+    from rigkit.cli.calibration_output import describe, describe_rig, rig_summary, summary
     from rigkit.workflows.calibration.calibrate import SessionCalibration
 
     if isinstance(done, SessionCalibration):
-        words = calibration_output.describe(done.calibration)
-        if not json:
-            return {}, words, True
-        page = calibration_output.page(done.calibration, done.session.boards)
-        return calibration_output.summary(done.calibration) | {"page": page.to_dict()}, words, True
-    words = rig_output.describe(done.rig, done.checks)
-    if not json:
-        return {}, words, done.passed
-    page = rig_output.page(done.rig, done.checks, done.session)
-    return rig_output.summary(done.rig, done.checks) | {"page": page.to_dict()}, words, done.passed
+        words, passed = describe(done.calibration), True
+        figures = summary(done.calibration) if json else {}
+    else:
+        words, passed = describe_rig(done.rig, done.checks), done.passed
+        figures = rig_summary(done.rig, done.checks) if json else {}
+    return (figures | {"page": done.page.to_dict()} if json else {}), words, passed

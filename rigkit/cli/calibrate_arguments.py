@@ -62,7 +62,8 @@ def calibrate_options(args: argparse.Namespace) -> CalibrateOptions:
     cache = Cache.OFF if args.no_cache else Cache.UPDATE
     exports = tuple(dict.fromkeys(args.exports))
     known = options_of(Known, args)
-    return options_of(CalibrateOptions, args, cache=cache, exports=exports, known=known, output=_output(args.output))
+    output = _output(args.output)
+    return options_of(CalibrateOptions, args, cache=cache, exports=exports, known=known, output=output, plan=args.json)
 
 
 def _output(path: Path | None) -> Path | None:

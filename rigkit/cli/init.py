@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rigkit.cli.aim_arguments import add_board_argument
-from rigkit.cli.manifest_answers import POSE_TYPES
+from rigkit.cli.init_manifest import POSE_TYPES, parse_length, run_manifest
 from rigkit.core.errors import ExitCode, InputError
 
 
@@ -66,16 +66,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.session:
-        return _session(args)
-    from rigkit.cli.init_manifest import run_manifest
-
-    return run_manifest(args)
+    return _session(args) if args.session else run_manifest(args)
 
 
 def _session(args: argparse.Namespace) -> int:
     from rigkit.cli.console import progress_on_stderr
-    from rigkit.cli.manifest_answers import parse_length
     from rigkit.io.boards.board_words import board_files
     from rigkit.io.disk.writing import ensure_writable, write_together
     from rigkit.io.media.images import images_below, require_folder

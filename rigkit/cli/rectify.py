@@ -6,18 +6,21 @@ import argparse
 from pathlib import Path
 
 from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr, size_of_words
-from rigkit.cli.rectification_output import grouped_by_description, image_to_dict
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.workflows.options.cameras import RectifyOptions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+from typing import TYPE_CHECKING, Any
     parser.add_argument("image", metavar="IMAGE|FOLDER|VIDEO", help="image as captured, a folder of images, or a video")
     parser.add_argument(
         "image2",
         metavar="IMAGE2|FOLDER2|VIDEO2",
         nargs="?",
         help="taken at the same time by another camera of the rig: rectifies a stereo pair",
+if TYPE_CHECKING:
+    from rigkit.workflows.rectify import RectifiedImage
+
     )
     parser.add_argument("--camera", metavar="CALIB", help="the camera's calibration.json")
     add_options(parser, RectifyOptions, output="-o OUT", maps="FILE.npz", force="")
@@ -58,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         if args.camera is None:
             raise InputError("rectify: --camera is missing; give the camera's calibration.json")
         done = rectify_image(args.image, args.camera, options, progress=progress_on_stderr())
-        found = [image_to_dict(one, args.projection) for one in done.images]
+        found = [_figures(one, args.projection) for one in done.images]
         result = {"images": found} if holds_several(args.image) else found[0]
     elif args.rig is None or (args.image2 is None and not Path(args.image).is_dir()):
         raise InputError("rectify: a stereo pair needs two images, or a folder of both cameras', and --rig RIG.json")
@@ -66,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
         names = None if args.names is None else tuple(args.names)
         both = args.image if args.image2 is None else (args.image, args.image2)
         done = rectify_stereo_images(both, args.rig, options, names, progress=progress_on_stderr())
-        result = {"images": [image_to_dict(one, args.projection) for one in done.images]}
+        result = {"images": [_figures(one, args.projection) for one in done.images]}
         if done.pair is not None:
             result["rect2_from_rect1_mm"] = done.pair.rect2_from_rect1.translation_mm.tolist()
     for error in done.failures.values():
@@ -74,9 +77,35 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(result)
     else:
-        for words, images in grouped_by_description(done.images, args.projection):
-            place = images[0] if len(images) == 1 else f"{images[0].parent}, {len(images)} images"
+        alike: dict[tuple[Path, str], list[Path]] = {}
+        for one in done.images:
+            alike.setdefault((one.path.parent, _words(one, args.projection)), []).append(one.path)
+        for (folder, words), images in alike.items():
+            place = images[0] if len(images) == 1 else f"{folder}, {len(images)} images"
             print(f"{place}: {words}")
         if done.pair is not None:
             print(f"baseline {abs(done.pair.rect2_from_rect1.translation_mm[0]):.3f} mm along the rows")
     return ExitCode.BAD_INPUT if done.failures else ExitCode.WELL
+
+
+def _figures(one: RectifiedImage, projection: str) -> dict[str, Any]:
+    """Return a rectified image as JSON values."""
+    from rigkit.io.calibrations.calibration_file import camera_to_json
+
+    target = one.map.target
+    return {
+        "image": str(one.path),
+        "projection": projection,
+        **camera_to_json(target),
+        "target_from_cam": one.map.target_from_cam.tolist(),
+        "covered": one.covered,
+    }
+
+
+def _words(one: RectifiedImage, projection: str) -> str:
+    target = one.map.target
+    (width, height), focal = target.size_px, target.named(target.parameters)["fx"]
+    return (
+        f"{projection}, {width} x {height} px, focal length {focal:.2f} px, "
+        f"{100.0 * one.covered:.1f} % of it seen by the camera"
+    )

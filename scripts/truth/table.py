@@ -15,8 +15,12 @@ from rigkit.core.boards import Board
 from rigkit.io.manifests.public_set import PublicMeasurement
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.io.manifests.session import Session
-from rigkit.workflows.calibration.calibrate import SessionCalibration, calibrate_session
-from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration, calibrate_rig_session
+from rigkit.workflows.calibration.calibrate import (
+    RigSessionCalibration,
+    SessionCalibration,
+    calibrate_rig_session,
+    calibrate_session,
+)
 from rigkit.workflows.inputs.frames import with_frames
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions
 from rigkit.workflows.truth import FetchedSet

@@ -19,7 +19,7 @@ from rigkit.io.calibrations.calibration_file import load_calibration
 from rigkit.io.calibrations.rig_file import load_board_rigs, load_rig
 from rigkit.io.corners.corner_cache import CornerCache, FoundCorners
 from rigkit.io.manifests.rig_session import load_rig_session
-from rigkit.workflows.calibration.calibrate_rig import calibrate_camera
+from rigkit.workflows.calibration.calibrate import calibrate_camera
 
 NAMES = ("reg", "wide")
 SIGMAS = 4.0
@@ -184,7 +184,7 @@ def test_images_without_common_names_are_refused_before_the_search(
     session: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     searched: list[object] = []
-    monkeypatch.setattr("rigkit.workflows.calibration.calibrate_rig.corners_of", searched.append)
+    monkeypatch.setattr("rigkit.workflows.calibration.calibrate.corners_of", searched.append)
     for name in ("reg_a", "wide_b"):
         (session.parent / f"{name}.png").write_bytes(b"")
     assert main(["calibrate", str(session)]) == 2

@@ -27,7 +27,7 @@ from rigkit.core.measurement_task import Quantity, Task
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import Knowledge
-from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration
+from rigkit.workflows.calibration.calibrate import RigSessionCalibration
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.capture.coach import finished_words
 

@@ -18,8 +18,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.core.progress import silent
 from rigkit.report.notebook import notebook_progress
-from rigkit.workflows.calibration.calibrate import SessionCalibration
-from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration
+from rigkit.workflows.calibration.calibrate import RigSessionCalibration, SessionCalibration
 
 MAX_HTML = 60_000
 """A notebook keeps what it shows."""

@@ -21,11 +21,12 @@ from rigkit.io.manifests.session import SESSION_NAME, Session, beside_session, l
 from rigkit.io.media.images import IMAGE_ENDINGS
 from rigkit.io.media.video import is_video, videos_inside
 from rigkit.workflows.calibration.calibrate import (
+    RigSessionCalibration,
     SessionCalibration,
+    calibrate_rig_session,
     calibrate_session,
     session_inputs,
 )
-from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration, calibrate_rig_session
 from rigkit.workflows.inputs.corners import keep_corners
 from rigkit.workflows.inputs.folder_session import (
     FolderSession,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.io.manifests.session import Session
 from rigkit.io.media.images import read_image
+from rigkit.planning.plan import Plan
 from rigkit.report.pages.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
 from rigkit.validation.check import Check
 from rigkit.workflows.calibration.next_pictures import next_views
@@ -24,10 +26,21 @@ MAX_PICTURES = 240
 """A thumbnail has 20 kB: with 3000 of them the page had 64 MB."""
 
 
-def session_page(session: Session, calibration: Calibration, corners: SessionCorners, files: Mapping[Path, str]) -> str:
+def plans_of(sessions: Mapping[str, Session], shown: Mapping[str, Calibration]) -> dict[str, Plan]:
+    """Return the images to take next of each camera for which there is a plan."""
+    plans = {}
+    for name, calibration in shown.items():
+        with suppress(InputError, DegenerateError):
+            plans[name] = next_views(calibration, sessions[name].boards)
+    return plans
+
+
+def session_page(
+    session: Session, calibration: Calibration, plan: Plan | None, corners: SessionCorners, files: Mapping[Path, str]
+) -> str:
     """Return the page of a session's calibration; `files` (path -> content) are the results written with it."""
     name = session.path.resolve().parent.name
-    section = _section(name, session, calibration)
+    section = CalibrationSection(name, calibration, _thumbnails(session, calibration), plan)
     lead = f"{session.path.name} with {_boards_in_words(session.boards)}"
     facts = _facts(session.path, files, {"images": session.images}, {"corners": corners.source})
     return build_calibration_page(f"rigkit calibration: {name}", lead, [section], facts)
@@ -37,13 +50,17 @@ def rig_page(
     session: RigSession,
     rig: RigCalibration,
     shown: Mapping[str, Calibration],
+    plans: Mapping[str, Plan],
     checks: Sequence[Check],
     corners: Mapping[str, SessionCorners],
     files: Mapping[Path, str],
 ) -> str:
-    """Return the page of a rig, with the calibration `shown` of each camera; `files` as for `session_page`."""
+    """Return the page of a rig, with the calibration `shown` of each camera and its plan; `files` as for
+    `session_page`."""
     name = session.path.resolve().parent.name
-    sections = [_section(own, session.cameras[own], c) for own, c in shown.items()]
+    sections = [
+        CalibrationSection(own, c, _thumbnails(session.cameras[own], c), plans.get(own)) for own, c in shown.items()
+    ]
     boards = _boards_in_words(next(iter(session.cameras.values())).boards)
     then = "then every camera as calibrated alone" if len(rig.cameras) > 1 else "then the camera"
     lead = f"{session.path.name} with {boards}: the rig first, {then}"
@@ -51,15 +68,6 @@ def rig_page(
     sources = {f"corners of {own}": found.source for own, found in corners.items()}
     facts = _facts(session.path, files, images, sources)
     return build_calibration_page(f"rigkit rig calibration: {name}", lead, sections, facts, rig, checks)
-
-
-def _section(name: str, session: Session, calibration: Calibration) -> CalibrationSection:
-    """Return the section of one camera, with thumbnails and, if a plan exists, the pictures to take next."""
-    try:
-        plan = next_views(calibration, session.boards)
-    except (InputError, DegenerateError):
-        plan = None
-    return CalibrationSection(name, calibration, _thumbnails(session, calibration), plan)
 
 
 def _boards_in_words(boards: Sequence[Board]) -> str:

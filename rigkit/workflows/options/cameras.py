@@ -70,6 +70,7 @@ class CalibrateOptions(WrittenFiles):
     pupil : entrance pupil fixed (a central camera), or moving with the angle of view (default: auto, moving where
         images show it).
     exports : formats of other tools to write as well, beside the output (`rigkit.workflows.inputs.formats`).
+    plan : propose the images to take next, as the report does.
     """
 
     output: Path | None = None
@@ -79,6 +80,7 @@ class CalibrateOptions(WrittenFiles):
     known: Known = field(default_factory=Known)
     pupil: Literal["auto", "central", "moving"] = "auto"
     exports: tuple[str, ...] = ()
+    plan: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,7 +26,7 @@ from rigkit.core.progress import Progress, silent
 from rigkit.io.calibrations.calibration_file import calibration_text, load_calibration_or_camera
 from rigkit.io.disk.reading import about
 from rigkit.io.manifests.manifest import CameraEntry, Dataset, Pair, load_dataset
-from rigkit.workflows.calibration.calibrate_rig import calibrate_camera
+from rigkit.workflows.calibration.calibrate import calibrate_camera
 from rigkit.workflows.inputs.camera_files import warn_if_bad
 from rigkit.workflows.options.clouds import DatasetOptions
 from rigkit.workflows.outputs.results import CALIBRATIONS, require_folder, write_results

@@ -29,7 +29,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Finding, Severity, worst
 from rigkit.io.manifests.session import Session
-from rigkit.workflows.calibration.calibrate_rig import with_new_verdicts
+from rigkit.workflows.calibration.calibrate import with_new_verdicts
 
 
 def printed(result: Calibration, words: str) -> bool:

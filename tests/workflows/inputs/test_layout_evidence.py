@@ -21,8 +21,8 @@ from rigkit.detection.detect import detect_boards
 from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.manifests.rig_session import frames_of_images, load_rig_session
 from rigkit.io.media.images import Image, read_image
+from rigkit.workflows.calibration.calibrate import RigSessionCalibration
 from rigkit.workflows.calibration.calibrate_any import calibrate_sources
-from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration
 from rigkit.workflows.inputs.corners import named_images
 from rigkit.workflows.inputs.folder_session import session_of_folders
 from rigkit.workflows.inputs.layout_evidence import cameras_seen
