@@ -1,4 +1,12 @@
-"""`rigkit board`: print a calibration target true to scale (PDF, SVG), then record the measured size of the print."""
+"""`rigkit board`: print a calibration target true to scale (PDF, SVG), then record the measured size of the print.
+
+examples:
+  rigkit board 9x6 --square-mm 25 -o board                      a chessboard of 9 by 6 inner corners
+  rigkit board 8x11 --square-mm 15 --charuco DICT_5X5_100 -o charuco
+  rigkit board aprilgrid:6x6x25,spacing=0.3 -o grid
+  rigkit board board.toml --ruler-x-mm 250.4 --ruler-y-mm 170.2 --sigma-mm 0.2      as measured on the print
+  rigkit board identify photos                                  which board the images show
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,14 @@
-"""`rigkit calibrate`: calibrate one camera, or a rig, from a session file or folders of images of boards."""
+"""`rigkit calibrate`: calibrate one camera, or a rig, from a session file or folders of images of boards.
+
+examples:
+  rigkit calibrate photos --board 9x6x25 -r          one camera; 9x6 inner corners, 25 mm squares; with a report
+  rigkit calibrate photos --square-mm 25 -r          the same; the board is identified from the images
+  rigkit calibrate left right --board board.toml     a rig, one folder per camera (or one folder: left01, right01, ...)
+  rigkit calibrate photos --board 9x6x25 --export opencv ros
+  rigkit calibrate left right --board 9x6x25 --only-extrinsics left.json right.json -o rig.json
+  rigkit calibrate left right top --board 9x6x25 --add-camera rig.json -o rig3.json
+  rigkit calibrate session.toml --force              repeat it from the session file
+"""
 
 from __future__ import annotations
 

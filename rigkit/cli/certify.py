@@ -1,6 +1,11 @@
 """`rigkit certify`: bound the error of a length, depth, plane or angle measured with a calibration or rig.
 
 Exit code 1 where the bound exceeds --limit, or the calibration's verdict is bad.
+
+examples:
+  rigkit certify rig.json --length 800 --distance 1500 -r certificate.html
+  rigkit certify rig.json --depth 100 --distance 2000 --limit 5 --pdf certificate.pdf      exit 1 above 5 mm
+  rigkit certify calibration.json --length 50 --distance 400 --distance-sigma 1
 """
 
 from __future__ import annotations

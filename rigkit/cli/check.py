@@ -1,6 +1,13 @@
 """`rigkit check`: test a calibration or rig with one or a few new images: it still holds, or what changed by how much.
 
 Exit code 1 if it does not hold, 2 if it holds, but an image could not be read.
+
+examples:
+  rigkit check calibration.json fresh/*.png                 one to three images of the board
+  rigkit check rig.json fresh/left fresh/right --board 9x6x25 --fix rig-fixed.json
+  rigkit check rig.json left1.png right1.png --scene         any textured scene instead of a board
+  rigkit check rig.json left right --scene --before old/left old/right      changes since the old images only
+  rigkit check calibration.json fresh -r check.html --register calib/history/cam.jsonl --temperature 21.5
 """
 
 from __future__ import annotations

@@ -1,4 +1,10 @@
-"""`rigkit coach`: guide a capture live on a local web page: what to take next, and when there is enough."""
+"""`rigkit coach`: guide a capture live on a local web page: what to take next, and when there is enough.
+
+examples:
+  rigkit coach capture --board 9x6x25                     a camera of the browser
+  rigkit coach capture --board 9x6x25 --device 0 --goal 0.05
+  rigkit coach capture --board 9x6x25 --watch incoming    images that another program writes
+"""
 
 from __future__ import annotations
 

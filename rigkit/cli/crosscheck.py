@@ -1,6 +1,10 @@
 """`rigkit crosscheck`: compare pairs with pycolmap, planar PnP and the other chain (raw or rectified pixels).
 
 Exit code 1 if they disagree.
+
+examples:
+  rigkit crosscheck lab
+  rigkit crosscheck lab -p first --json
 """
 
 from __future__ import annotations

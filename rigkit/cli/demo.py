@@ -1,4 +1,9 @@
-"""`rigkit demo`: render a small fisheye capture with ground truth and run every step on it; needs no data."""
+"""`rigkit demo`: render a small fisheye capture with ground truth and run every step on it; needs no data.
+
+examples:
+  rigkit demo                          renders, calibrates, reconstructs, validates: rigkit-demo/out/report.html
+  rigkit demo -o demo-7 --seed 7       another random scene
+"""
 
 from __future__ import annotations
 

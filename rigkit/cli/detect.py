@@ -1,4 +1,10 @@
-"""`rigkit detect`: detect the corners of all boards in images."""
+"""`rigkit detect`: detect the corners of all boards in images.
+
+examples:
+  rigkit detect photos                                        chessboards of any size
+  rigkit detect photos --board 9x6x25 -o corners.csv --overlay seen     to a file, with pictures of the corners
+  rigkit detect film.mp4 --board board.toml --camera calibration.json -o corners.csv
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""`rigkit diff`: compare two calibrations, two rigs, or two mounts of boards, within their uncertainties."""
+"""`rigkit diff`: compare two calibrations, two rigs, or two mounts of boards, within their uncertainties.
+
+examples:
+  rigkit diff monday.json friday.json -r diff.html      a report with the map of the difference
+  rigkit diff rig.json rig-new.json                     intrinsics and extrinsics
+  rigkit diff calibration.json camchain.yaml            a file of another tool: no covariance, so no verdict
+"""
 
 from __future__ import annotations
 

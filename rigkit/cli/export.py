@@ -1,4 +1,12 @@
-"""`rigkit export`: convert cameras and rigs between formats; clouds to PLY, LAS, of a data set also to npz, COLMAP."""
+"""`rigkit export`: convert cameras and rigs between formats; clouds to PLY, LAS, of a data set also to npz, COLMAP.
+
+examples:
+  rigkit export calibration.json -o camera.yaml --to opencv
+  rigkit export rig.json -o camchain.yaml --to kalibr
+  rigkit export rig.json -o rig --to ros --names left right
+  rigkit export camchain.yaml -o camera.json --to rigkit      import the file of another tool
+  rigkit export lab -p first -o cloud.ply
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""`rigkit fetch`: download public captures with measured ground truth, or list them."""
+"""`rigkit fetch`: download public captures with measured ground truth, or list them.
+
+examples:
+  rigkit fetch                          list the captures
+  rigkit fetch caliper-board -o data
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""`rigkit handeye`: hand-eye calibration: a camera on a robot hand, or fixed beside the robot, from board images."""
+"""`rigkit handeye`: hand-eye calibration: a camera on a robot hand, or fixed beside the robot, from board images.
+
+examples:
+  rigkit handeye poses.csv images --camera calibration.json --board board.toml -o hand-eye.json
+  rigkit handeye poses.csv images --camera calibration.json --board board.toml --board-on-hand
+"""
 
 from __future__ import annotations
 

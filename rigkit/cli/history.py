@@ -1,4 +1,9 @@
-"""`rigkit history`: plot a register of checks as drift over time, with control limits."""
+"""`rigkit history`: plot a register of checks as drift over time, with control limits.
+
+examples:
+  rigkit history calib/history/cam.jsonl -r history.html
+  rigkit history cam.jsonl --add new.json --to calibration.json      the change from an old calibration to a new one
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,14 @@
-"""`rigkit init`: write a data set manifest or a session for a folder of images, asking for what images cannot show."""
+r"""`rigkit init`: write a data set manifest or a session for a folder of images, asking for what images cannot show.
+
+examples:
+  rigkit init lab --square-mm 50 --calibration camera.json --pose-type general --baseline-mm first=300+-2 \
+      --angle-deg 90+-0.3                            as measured by ruler and set square
+  rigkit init lab --square-mm 50 --calibration left.json --calibration right.json --pose-type standard
+  rigkit init lab --square-mm 50 --calibration wide=w.json --calibration tele=t.json \
+      --cameras 'w-*=wide,wide' --cameras 't-*=tele,tele' --pose-type 'w-*=forward' --pose-type general
+  rigkit init lab --board aprilgrid:6x6x88,spacing=0.3 --calibration camera.json --pose-type general
+  rigkit init photos --session --board 9x6x25        a session for rigkit calibrate
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """The `rigkit` program: finds the verb, runs it, turns errors into one line and an exit code.
 
-A verb is a module of its name in this package with `add_arguments(parser)` and `run(args) -> int`, one line in `VERBS`
-and its examples in `rigkit.cli.examples`. Verb modules import nothing heavy at module level: `rigkit --help` must
-answer at once.
+A verb is a module of its name in this package with `add_arguments(parser)` and `run(args) -> int`, and one line in
+`VERBS`. Its docstring is the description and the examples of its help. Verb modules import nothing heavy at module
+level: `rigkit --help` must answer at once.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import traceback
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from rigkit.cli.examples import EXAMPLES, FIRST_STEPS
 from rigkit.cli.log import add_log_arguments, logged_run, logging_to
 from rigkit.cli.operating_system import SYSTEM_ERRORS, Terminated, flush_stderr, open_streams, say, signals_interrupt
 from rigkit.core.errors import ExitCode, InputError, RigkitError, interruption, printable
@@ -45,7 +44,20 @@ VERBS: dict[str, str] = {
     "fetch": "download public captures with measured ground truth",
     "schema": "list the keys of every file format, as JSON Schema or a table",
 }
-"""Verb -> summary; `rigkit VERB --help` begins with the docstring of its module."""
+"""Verb -> summary."""
+
+EXAMPLES = "\n\nexamples:\n"
+"""Separates them from the description in the docstring of a verb."""
+
+FIRST_STEPS = """first steps:
+  rigkit board 9x6 --square-mm 25 -o board           print a board, glue it to something flat
+  rigkit calibrate photos --board 9x6x25 -r          calibrate from a dozen images of it, with a report
+  rigkit rectify photos --camera photos/calibration.json -o straight
+  rigkit demo                                        every step once, on rendered images
+  rigkit VERB --help                                 options and examples of a verb
+
+Exit codes: 0 success; 1 a check failed; 2 bad input; 3 degenerate geometry; 70 a bug in rigkit.
+"""
 
 
 class _Version(argparse.Action):
@@ -106,8 +118,8 @@ def build_parser(verb: str | None) -> argparse.ArgumentParser:
         return parser
     sub = verbs.add_parser(verb)
     module = importlib.import_module(f"rigkit.cli.{verb}")
-    sub.description = (module.__doc__ or VERBS[verb]).partition(": ")[2]
-    sub.formatter_class, sub.epilog = argparse.RawDescriptionHelpFormatter, f"examples:\n{EXAMPLES[verb]}"
+    sub.description, _, examples = (module.__doc__ or VERBS[verb]).partition(": ")[2].partition(EXAMPLES)
+    sub.formatter_class, sub.epilog = argparse.RawDescriptionHelpFormatter, f"{EXAMPLES.strip()}\n{examples}"
     module.add_arguments(sub)
     add_log_arguments(sub)
     sub.set_defaults(run=module.run)

@@ -1,4 +1,9 @@
-"""`rigkit mesh`: mesh an oriented point cloud by screened Poisson reconstruction."""
+"""`rigkit mesh`: mesh an oriented point cloud by screened Poisson reconstruction.
+
+examples:
+  rigkit mesh scene/scene.ply
+  rigkit mesh scene/scene.ply -o surface.ply --depth 10 --cut 0.05
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,12 @@
-"""`rigkit plan`: suggest the next images to take, or predict the accuracy of a lens, a board and a number of images."""
+"""`rigkit plan`: suggest the next images to take, or predict the accuracy of a lens, a board and a number of images.
+
+examples:
+  rigkit plan calibration.json -r next.html               the three images that would help most, drawn
+  rigkit plan rig.json                                    the same for a rig, of all cameras at once
+  rigkit plan calibration.json --check                    the three best images for rigkit check
+  rigkit plan session.toml -n 5 --length 800 --distance 1500
+  rigkit plan --lens 120 --size 1280x960 --board 9x6x30 --views 12
+"""
 
 from __future__ import annotations
 

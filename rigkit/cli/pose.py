@@ -1,4 +1,9 @@
-"""`rigkit pose`: pose of a camera relative to one board in its image."""
+"""`rigkit pose`: pose of a camera relative to one board in its image.
+
+examples:
+  rigkit pose floor.jpg --camera calibration.json --board 9x6x25
+  rigkit pose floor.jpg --camera camera.yaml --board board.toml --json
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""`rigkit reconstruct`: oriented point clouds of the pairs of a data set, or of one scene; needs no ground truth."""
+"""`rigkit reconstruct`: oriented point clouds of the pairs of a data set, or of one scene; needs no ground truth.
+
+examples:
+  rigkit reconstruct lab                          the pairs of lab/dataset.toml (rigkit init writes one)
+  rigkit reconstruct lab -p first --planes lattice
+  rigkit reconstruct --images left.png right.png --rig rig.json -o scene
+  rigkit reconstruct --images a.png b.png --camera calibration.json --baseline-mm 250 -o scene
+"""
 
 from __future__ import annotations
 

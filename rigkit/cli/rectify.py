@@ -1,26 +1,34 @@
-"""`rigkit rectify`: undistort images to perspective, cylindrical or equirectangular views, or rectify a stereo pair."""
+"""`rigkit rectify`: undistort images to perspective, cylindrical or equirectangular views, or rectify a stereo pair.
+
+examples:
+  rigkit rectify photo.jpg --camera calibration.json -o straight.png
+  rigkit rectify photos --camera calibration.json -o straight --crop      a whole folder
+  rigkit rectify left right --rig rig.json -o rectified --maps maps.npz       rectified stereo pairs; K, P, Q, maps
+  rigkit rectify photos --rig rig.json -o rectified          one folder of left01, right01, ...
+  rigkit rectify fisheye.jpg --camera fisheye.json -o round.png --projection equirectangular
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr, size_of_words
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.workflows.options.cameras import RectifyOptions
 
+if TYPE_CHECKING:
+    from rigkit.workflows.rectify import RectifiedImage
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-from typing import TYPE_CHECKING, Any
     parser.add_argument("image", metavar="IMAGE|FOLDER|VIDEO", help="image as captured, a folder of images, or a video")
     parser.add_argument(
         "image2",
         metavar="IMAGE2|FOLDER2|VIDEO2",
         nargs="?",
         help="taken at the same time by another camera of the rig: rectifies a stereo pair",
-if TYPE_CHECKING:
-    from rigkit.workflows.rectify import RectifiedImage
-
     )
     parser.add_argument("--camera", metavar="CALIB", help="the camera's calibration.json")
     add_options(parser, RectifyOptions, output="-o OUT", maps="FILE.npz", force="")

@@ -1,4 +1,10 @@
-"""`rigkit schema`: list the keys of every file format, as JSON Schema for editors and programs, or as a table."""
+"""`rigkit schema`: list the keys of every file format, as JSON Schema for editors and programs, or as a table.
+
+examples:
+  rigkit schema                          list the file formats
+  rigkit schema session --keys           every key of a session file with its meaning
+  rigkit schema session -o session.json  for editors: first line of the session #:schema ./session.json
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""`rigkit simulate`: run synthetic studies: from a study file to tables and box plots."""
+"""`rigkit simulate`: run synthetic studies: from a study file to tables and box plots.
+
+examples:
+  rigkit simulate study.toml -o results
+  rigkit simulate study.toml --trials 20 --format pdf      fewer trials; vector graphics
+"""
 
 from __future__ import annotations
 

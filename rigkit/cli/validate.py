@@ -1,6 +1,12 @@
 """`rigkit validate`: validate reconstructed pairs against measured ground truth: report, tables, clouds.
 
 Exit code 1 if a check fails.
+
+examples:
+  rigkit validate lab                             report, tables and clouds in out/lab
+  rigkit validate lab -p first -o results --force
+  rigkit validate monday tuesday wednesday        several data sets, one table
+  rigkit validate lab --paper                     the paper's own pipeline, beside its printed tables
 """
 
 from __future__ import annotations
