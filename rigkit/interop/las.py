@@ -17,22 +17,34 @@ LEVELS_OF_16_BITS = 257
 """16-bit levels for one 8-bit level."""
 NORMALS = ("NormalX", "NormalY", "NormalZ")
 """CloudCompare's names."""
+WKT = (
+    'LOCAL_CS["rigkit: x right, y down, z forward",LOCAL_DATUM["camera",0],UNIT["millimetre",0.001],'
+    'AXIS["x",OTHER],AXIS["y",OTHER],AXIS["z",OTHER]]'
+)
+"""Local coordinate system (OGC 01-009) in mm; LAS 1.4 states units in such a record."""
 
 
-def las_bytes(cloud: OrientedCloud) -> bytes:
+def las_bytes(cloud: OrientedCloud, unit: str = "mm") -> bytes:
     """Return the content of the LAS file, with normals and `sigma_mm` as extra columns; lengths are those of the cloud.
+
+    Lengths in mm are stated in the file's coordinate system; those in another `unit` (baselines, of unknown length) as
+    its system identifier only.
 
     Raises InputError for an empty cloud, InstallationError if laspy is not installed.
     """
     try:
         import laspy
+        from laspy.vlrs.known import WktCoordinateSystemVlr
     except ImportError as error:
         raise InstallationError('LAS files need laspy; install it with `pip install "rigkit[las]"`') from error
     if not len(cloud):
         raise InputError("LAS: the cloud has no points")
     size = float(np.ptp(cloud.points_mm, axis=0).max())
     header = laspy.LasHeader(point_format=POINT_FORMAT, version="1.4")
-    header.generating_software = "rigkit"
+    header.generating_software, header.system_identifier = "rigkit", f"units {unit}"
+    if unit == "mm":
+        header.vlrs.append(WktCoordinateSystemVlr(WKT))
+        header.global_encoding.wkt = True
     header.offsets = cloud.points_mm.min(axis=0)
     header.scales = np.full(3, (size or 1.0) / LAS_STEPS)
     columns = dict(zip((*NORMALS, "sigma_mm"), np.column_stack([cloud.normals, cloud.sigma_mm]).T, strict=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,20 @@ def test_a_ply_becomes_las(tmp_path: Path, rng: np.random.Generator, capsys: pyt
     np.testing.assert_allclose(las["sigma_mm"], given.sigma_mm, rtol=1e-6)
     assert main(["export", str(source), "-o", str(out)]) == 2
     assert "--force" in capsys.readouterr().err
+
+
+def test_the_file_states_its_unit(rng: np.random.Generator) -> None:
+    header = laspy.open(io.BytesIO(las_bytes(cloud(3, rng)))).header
+    assert header.global_encoding.wkt and header.system_identifier == "units mm"
+    (record,) = header.vlrs.get("WktCoordinateSystemVlr")
+    # PROJ reads it as a system of three axes in this unit.
+    assert record.string.startswith("LOCAL_CS[") and 'UNIT["millimetre",0.001]' in record.string
+
+
+def test_baselines_of_unknown_length_have_no_unit(rng: np.random.Generator) -> None:
+    header = laspy.open(io.BytesIO(las_bytes(cloud(3, rng), "baselines"))).header
+    assert header.system_identifier == "units baselines"
+    assert not header.global_encoding.wkt and not header.vlrs.get("WktCoordinateSystemVlr")
 
 
 def test_what_cannot_be_is_said(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:

@@ -107,5 +107,5 @@ def _cloud_npz(reconstruction: Reconstruction) -> bytes:
 
 def _cloud_bytes(cloud: OrientedCloud, options: ExportCloudOptions, unit: str = "mm") -> bytes:
     if options.kind == "las":
-        return las_bytes(cloud)
+        return las_bytes(cloud, unit)
     return ply_bytes(cloud, single_precision=options.single_precision, unit=unit)
