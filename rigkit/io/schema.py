@@ -161,6 +161,7 @@ CERTIFICATE_FILE = file(
         "worst": _VALUE,
         "median?": _VALUE,
         "in_view?": described(NUMBER, "share of the image that sees all of it"),
+        "coarse?": described(NUMBER, "share of that in which no bound is certified"),
         "shares_where_worst?": described(table(NUMBER), "of the variance, by cause"),
         "findings?": array(TEXT),
         "u_px?": described(array(NUMBER), "columns of the grid"),

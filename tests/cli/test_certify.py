@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.browser import pages_printed
 
 from rigkit.cameras.registry import camera_model
 from rigkit.cli.main import main
@@ -20,7 +21,12 @@ SIGMAS = [0.3, 0.3, 0.3, 0.3, 1e-4, 1e-4, 1e-4, 1e-4]
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Path:
-    camera = camera_model("kannala_brandt")((1280, 960), np.array([390.0, 391.0, 641.0, 478.0, 0.02, 0.0, 0.0, 0.0]))
+    return rig_of(tmp_path, focal_px=900.0)
+
+
+def rig_of(tmp_path: Path, focal_px: float) -> Path:
+    scale = [focal_px, focal_px + 1.0]
+    camera = camera_model("kannala_brandt")((1280, 960), np.array([*scale, 641.0, 478.0, 0.02, 0.0, 0.0, 0.0]))
     poses = {"left": Rigid3.identity(), "right": Rigid3(exp_so3(np.array([0.0, -0.1, 0.0])), [-200.0, 0.0, 0.0])}
     covariance = np.diag([*SIGMAS, *SIGMAS, 1e-4, 1e-4, 1e-4, 0.1, 0.1, 0.1]) ** 2
     data: dict[str, Any] = {
@@ -56,6 +62,45 @@ def test_a_length_with_page_sheet_and_limit(rig: Path, capsys: pytest.CaptureFix
     assert "above the limit" in capsys.readouterr().out
 
 
+@pytest.mark.thorough
+def test_the_page_prints_on_one_sheet(rig: Path) -> None:
+    """Also with every sentence that a certificate may have: of a bad calibration, uncertain somewhere."""
+    data = json.loads(rig.read_text())
+    bad = "held-out RMS 0.1 px, but the focal length differs between the first and the second half of the images"
+    data |= {"scale_sigma": 0.0, "verdicts": [{"severity": "bad", "message": bad, "remedy": "hold the lens"}]}
+    rig.write_text(json.dumps(data))
+    page, sizes = rig.with_suffix(".html"), ["--length", "27", "--distance", "3000"]
+    main(["certify", str(rig), *sizes, "--limit", "100", "--report", str(page)])
+    words = page.read_text()
+    assert "not to be trusted" in words and "of the view no bound is certified" in words
+    assert pages_printed(page) == 1
+
+
+@pytest.mark.parametrize(
+    ("focal_px", "size", "distance", "share"),
+    # Wide lenses see along the baseline, where nothing has a distance.
+    [(900.0, "8", "3000", "100 %"), (390.0, "300", "1200", "less than 1 %")],
+)
+def test_a_bound_that_is_not_certified_passes_no_limit(
+    focal_px: float, size: str, distance: str, share: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """However large the limit is: the bound is within it, but nobody knows what it is worth."""
+    path = rig_of(tmp_path, focal_px)
+    page, asked = tmp_path / "c.html", ["certify", str(path), "--length", size, "--distance", distance]
+    assert main([*asked, "--limit", "100000", "--report", str(page)]) == 1
+    words = capsys.readouterr().out
+    assert f"n {share} of the view no bound is certified: points are uncertain" in words
+    assert "everywhere in view" not in words
+    assert "not certified</span>" in page.read_text()
+    everywhere = share == "100 %"
+    assert ("no bound is certified" in words.splitlines()[0]) == everywhere
+    # Without a limit there is still something to certify elsewhere.
+    assert main([*asked, "--json"]) == everywhere
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["passed"] is (False if everywhere else None)
+    assert reported["coarse"] == 1.0 if everywhere else 0.0 < reported["coarse"] < 0.01
+
+
 @pytest.mark.parametrize(("severity", "code"), [("look", 0), ("bad", 1)])
 def test_a_bad_calibration_gets_no_certificate(
     severity: str, code: int, rig: Path, capsys: pytest.CaptureFixture[str]
@@ -86,7 +131,7 @@ def test_json_has_the_certificate(quantity: str, rig: Path, capsys: pytest.Captu
     assert reported["passed"] is None
     bounds = [value for row in reported["bound"] for value in row if value is not None]
     assert max(bounds) == reported["worst"]
-    assert main([*command, "--sigma-px", "0.5"]) == 0
+    assert main([*command, "--sigma-px", "0.1"]) == 0
     assert json.loads(capsys.readouterr().out)["median"] > reported["median"]
 
 

@@ -43,6 +43,14 @@ def loaded(page: Path, *options: str, seconds: float = 120.0) -> str:
     return done.stdout
 
 
+def pages_printed(page: Path) -> int:
+    """Return how many sheets of paper Chromium prints a page on."""
+    sheets = page.with_suffix(".printed.pdf")
+    command = [chromium(), *QUIET, f"--user-data-dir={page.with_suffix('.profile')}", f"--print-to-pdf={sheets}"]
+    subprocess.run([*command, page.as_uri()], capture_output=True, timeout=120.0, check=True)
+    return len(re.findall(rb"/Type /Page\s", sheets.read_bytes()))
+
+
 def probed(text: str, folder: Path) -> list[str]:
     """Return the results of the probe in `document.body.dataset.probe`, split at its bars."""
     page = folder / "page.html"

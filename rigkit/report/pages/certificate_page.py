@@ -43,34 +43,53 @@ MAP_HEIGHT, SIGNATURE_TOP = 0.34, 0.075
 
 
 def certificate_facts(certificate: Certificate, limit: float | None = None) -> PageFacts:
-    """Return the facts of a certificate, compared with `limit` (in the task's unit) if given.
-
-    A certificate of a calibration with a verdict BAD never passes.
-    """
-    task, unit = certificate.task, certificate.task.unit
-    what = WHAT[task.quantity].format(size=f"{task.size_mm:g}") + f", {task.distance_mm:g} mm away"
-    percent = f"{100.0 * task.confidence:g} %"
-    headline = f"{what}: {percent} of errors within {certificate.worst:.3g} {unit} everywhere in view"
+    """Return the facts of a certificate, compared with `limit` (in the task's unit) if given."""
+    unit = certificate.task.unit
+    place = ", ".join(f"{x:.0f}" for x in certificate.pixels[certificate.worst_place])
     sentences = [
-        f"The bound is {certificate.median:.3g} {unit} in half of the view, and largest at pixel "
-        f"({', '.join(f'{x:.0f}' for x in certificate.pixels[certificate.worst_place])}).",
+        f"The bound is {certificate.median:.3g} {unit} in half of the view, and largest at pixel ({place}).",
         f"{100.0 * float(certificate.in_view.mean()):.0f} % of the image of camera '{certificate.instrument.names[0]}' "
         "have the whole object in view" + (" of both cameras." if certificate.instrument.is_rig else "."),
     ]
-    passed = None
-    if limit is not None:
-        passed = certificate.worst <= limit
-        share = certificate.share_within(limit)
-        sentences.insert(0, f"The bound is within the limit of {limit:g} {unit} in {100.0 * share:.0f} % of the view.")
-    badge = {None: "no limit given", True: "within the limit", False: "above the limit"}[passed]
+    if certificate.coarse_share == 1.0:
+        del sentences[0]
+    elif limit is not None:
+        share = _percent(certificate.share_within(limit))
+        sentences.insert(0, f"The bound is within the limit of {limit:g} {unit} in {share} of the view.")
     bad = [finding for finding in certificate.findings if finding.severity is Severity.BAD]
     others = [finding for finding in certificate.findings if finding.severity is not Severity.BAD]
-    if bad:
-        passed, badge = False, "not to be trusted"
-    sentences = [*map(_sentence, bad), *sentences, *map(_sentence, others)]
     return PageFacts(
-        headline=headline, badge=badge, passed=passed, sentences=tuple(sentences), tables=(causes_table(certificate),)
+        headline=_headline(certificate),
+        badge=_badge(certificate, limit),
+        passed=certificate.passes(limit),
+        sentences=(*map(_sentence, bad), *sentences, *map(_sentence, others)),
+        tables=(causes_table(certificate),),
     )
+
+
+def _headline(certificate: Certificate) -> str:
+    task, coarse = certificate.task, certificate.coarse_share
+    what = WHAT[task.quantity].format(size=f"{task.size_mm:g}") + f", {task.distance_mm:g} mm away"
+    if coarse == 1.0:
+        return f"{what}: no bound is certified"
+    where = f"in {_percent(1.0 - coarse)} of the view; elsewhere none is certified"
+    return (
+        f"{what}: {100.0 * task.confidence:g} % of errors within {certificate.worst_certified:.3g} {task.unit} "
+        f"{where if coarse else 'everywhere in view'}"
+    )
+
+
+def _badge(certificate: Certificate, limit: float | None) -> str:
+    if certificate.coarse_share < 1.0 and certificate.is_bad:
+        return "not to be trusted"
+    if certificate.is_bad or (limit is not None and not certificate.passes(limit) and certificate.worst <= limit):
+        return "not certified"
+    return {None: "no limit given", True: "within the limit", False: "above the limit"}[certificate.passes(limit)]
+
+
+def _percent(share: float) -> str:
+    """Return a share in words that are 0 or 100 % of nothing or all alone."""
+    return f"{100.0 * share:.0f} %" if share in (0.0, 1.0) else f"{min(max(100.0 * share, 1.0), 99.0):.0f} %"
 
 
 def _sentence(finding: Finding) -> str:
@@ -129,8 +148,7 @@ def basis(certificate: Certificate) -> dict[str, str]:
     percent = f"{100.0 * certificate.task.confidence:g} %"
     freedom = f", {i.freedom:.3g} degrees of freedom of the calibration" if np.isfinite(i.freedom) else ""
     facts["bound"] = f"{percent}, Student's quantile of the root of the summed variances{freedom}; to first order"
-    remarks = [f.text for f in certificate.findings if f.severity is not Severity.GOOD]
-    return facts | ({"remarks": "; ".join(remarks)} if remarks else {})
+    return facts
 
 
 def bound_figure(certificate: Certificate) -> Figure:

@@ -33,9 +33,10 @@ from rigkit.validation.monitoring.evidence import Monitored
 
 MAP_CELLS = (33, 25)
 """Columns and rows of the grid on which the bound is evaluated."""
-MAX_SHARE = 0.1
-"""Largest bound, and uncertainty of points, relative to the measured size (for angles to a radian), for which the
-first-order propagation holds; beyond, it is too small."""
+MAX_SHARE = 0.3
+"""Largest bound, and uncertainty of points, relative to the measured size (for angles to a radian), at which the bound
+is relied upon. SIMULATED corner noise, lengths, depths, planes and angles: up to 0.5 94 to 96 % of the errors lie
+within a bound of 95 %, beyond 1 97 to 100 % (2026-11-29). The calibration's errors are propagated linearly."""
 AS_NORMAL = 1e6
 """Degrees of freedom from which Student's distribution counts as normal."""
 
@@ -108,14 +109,16 @@ def _findings(certificate: Certificate) -> list[Finding]:
     """Return the causes that the bound does not include, and how to halve the worst bound."""
     instrument, task = certificate.instrument, certificate.task
     found = []
-    coarse = float(np.mean(certificate.coarse[certificate.in_view]))
-    if coarse > 0.0:
+    if coarse := certificate.coarse_share:
         share = "less than 1" if coarse < 0.01 else f"{100.0 * coarse:.0f}"
+        kind = Finding.bad if coarse == 1.0 else Finding.look
         found.append(
-            Finding.look(
-                f"in {share} % of the view the bound is too low: rays are nearly parallel there, and points are "
-                "uncertain by more than a tenth of what is measured",
-                "measure elsewhere in the image, nearer, or with a longer baseline",
+            kind(
+                f"in {share} % of the view no bound is certified: points are uncertain there by more than "
+                f"{100.0 * MAX_SHARE:g} % of what is measured",
+                "measure elsewhere in the image, nearer, or with a longer baseline"
+                if instrument.is_rig
+                else "come nearer, or calibrate with more images",
             )
         )
     if instrument.is_rig and instrument.scale_sigma == 0.0 and OF_SCALE in certificate.sigma:

@@ -11,7 +11,7 @@ import numpy as np
 from rigkit.cameras.uncertain import UncertainRig
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, without_nan
 from rigkit.core.errors import InputError
-from rigkit.core.findings import Finding
+from rigkit.core.findings import Finding, Severity
 from rigkit.core.measurement_task import Task
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.validation.monitoring.evidence import Monitored
@@ -53,8 +53,8 @@ class Certificate:
     bound : (R, C) the error that is exceeded with probability 1 - confidence, in `task.unit`; NaN out of view. It
         includes the uncertainty of the calibration's covariance.
     sigma : (R, C) standard deviation by each cause, in `task.unit`; their squares add up to the variance.
-    coarse : (R, C) mask of the places where the bound is only a lower one: the error, or the uncertainty of the points
-        along the lines of sight, is too large for first-order propagation.
+    coarse : (R, C) mask of the places where the bound is not certified: the error, or the uncertainty of the points
+        along the lines of sight, is too large for its propagation.
     findings : causes that are not included, and how to halve the worst bound.
     """
 
@@ -83,9 +83,33 @@ class Certificate:
         row, column = np.unravel_index(int(np.nanargmax(self.bound)), self.bound.shape)
         return int(row), int(column)
 
+    @property
+    def coarse_share(self) -> float:
+        """The fraction of the view in which the bound is not certified."""
+        return float(np.mean(self.coarse[self.in_view]))
+
+    @property
+    def is_bad(self) -> bool:
+        """Whether a finding says that the bound must not be trusted."""
+        return any(finding.severity is Severity.BAD for finding in self.findings)
+
+    @property
+    def worst_certified(self) -> float:
+        """The largest bound in view where it is certified; NaN if there is no such place."""
+        return float(np.max(self.bound[self.in_view & ~self.coarse])) if self.coarse_share < 1.0 else np.nan
+
     def share_within(self, limit: float) -> float:
-        """Return the fraction of the view whose bound is at most `limit`."""
-        return float(np.mean(self.bound[self.in_view] <= limit))
+        """Return the fraction of the view with a certified bound of at most `limit`."""
+        return float(np.mean(((self.bound <= limit) & ~self.coarse)[self.in_view]))
+
+    def passes(self, limit: float | None) -> bool | None:
+        """Return whether the bound is at most `limit` everywhere in view; None without a limit.
+
+        False, too, if it is not certified somewhere in view, or a finding is BAD.
+        """
+        if self.is_bad:
+            return False
+        return None if limit is None else self.share_within(limit) == 1.0
 
     def shares(self) -> dict[str, float]:
         """Return the fraction of the variance by each cause at the worst place."""
@@ -108,6 +132,7 @@ class Certificate:
             "worst": self.worst,
             "median": self.median,
             "in_view": float(self.in_view.mean()),
+            "coarse": self.coarse_share,
             "shares_where_worst": self.shares(),
             "findings": [str(finding) for finding in self.findings],
             "u_px": self.pixels[0, :, 0].tolist(),
