@@ -8,11 +8,12 @@ image, due to slant and lens. H comes from the circle's neighbours; c, M, blur a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.detection.circles.blobs import scaled_up
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS
 from rigkit.kernels import circles as kernel
@@ -77,6 +78,18 @@ class CircleFit:
     added_light: FloatArray
     added_light_covariance: FloatArray
     valid: BoolArray
+
+    def enlarged(self, scale: int) -> CircleFit:
+        """Return the circles in an image that is `scale` times as large."""
+        return replace(
+            self,
+            pixels=scaled_up(self.pixels, scale),
+            maps=scale * self.maps,
+            covariance=scale**2 * self.covariance,
+            blur_px=scale * self.blur_px,
+            added_light=scale * self.added_light,
+            added_light_covariance=scale**2 * self.added_light_covariance,
+        )
 
     @property
     def share(self) -> FloatArray:

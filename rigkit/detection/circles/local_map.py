@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.detection.circles.blobs import scaled_up
 from rigkit.detection.tags.surface import SmoothMap, wide_perspective
 from rigkit.kernels.circles import BESIDE
 
@@ -63,6 +64,10 @@ class PlaneMap:
     surrounded: BoolArray
     gain: FloatArray
     slope_gain: FloatArray
+
+    def enlarged(self, scale: int) -> PlaneMap:
+        """Return the map in an image that is `scale` times as large."""
+        return replace(self, pixels=scaled_up(self.pixels, scale), first=scale * self.first, second=scale * self.second)
 
 
 class Radii(NamedTuple):

@@ -16,7 +16,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, grid_turned
 from rigkit.core.patterns.circles import Circles
-from rigkit.detection.circles.find import CircleGrid
+from rigkit.detection.circles.grid import CircleGrid
 
 MAX_EMPTY_DIFFERENCE = 2
 """A place on a board is preferred to another one that leaves more than this number of further places empty."""

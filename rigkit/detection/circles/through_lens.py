@@ -20,10 +20,10 @@ from rigkit.detection.circles.find import (
     MAX_CIRCLE_RESIDUAL,
     MIN_TYPICAL_CIRCLE,
     OFF_PLACE,
-    CircleGrid,
     like_contrast,
 )
 from rigkit.detection.circles.fit import CircleFit, edge_reach, fit_circles
+from rigkit.detection.circles.grid import CircleGrid
 from rigkit.detection.circles.local_map import NEXT
 from rigkit.detection.circles.rows import rows_of
 from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS

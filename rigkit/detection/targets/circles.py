@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
+from rigkit.detection.circles.blobs import COARSE_PIXELS
 from rigkit.detection.circles.find import find_grids
 from rigkit.detection.circles.place import boards_meant, lone_part
 from rigkit.detection.circles.through_lens import seen_through
@@ -17,16 +18,21 @@ class CirclesFinder(Finder):
     """A grid is identified if its place on one board is unique, and no other board and no other grid fits."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
-        """Return the detections. A quick search may miss faint circles: if it finds no board, a full one follows."""
+        """Return the detections. In a large image, a search for large circles that finds all boards whole is enough.
+        A quick search may miss faint circles: if it finds no board, a full one follows."""
+        if search.grey.size > COARSE_PIXELS:
+            found = self._seen(search, boards, quick=search.quick, coarse=True)
+            if {item.board_id for item in found if item.complete} >= {board.board_id for board in boards}:
+                return found
         found = self._seen(search, boards, quick=True) if search.quick else []
         return found or self._seen(search, boards, quick=False)
 
     @staticmethod
-    def _seen(search: Search, boards: Sequence[Board], *, quick: bool) -> list[BoardDetection]:
+    def _seen(search: Search, boards: Sequence[Board], *, quick: bool, coarse: bool = False) -> list[BoardDetection]:
         fewest = min([search.min_corners, *(board.corner_count for board in boards)])
         out: list[BoardDetection] = []
         names: list[str | None] = []
-        for grid in find_grids(search.grey, fewest, quick=quick):
+        for grid in find_grids(search.grey, fewest, quick=quick, coarse=coarse):
             fits = boards_meant(grid, boards)
             if fits:
                 board, placed = fits[0]
