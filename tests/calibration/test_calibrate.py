@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -18,8 +20,9 @@ from helpers.calibration_scenes import (
 )
 from helpers.session_scenes import disturbed
 
-from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.calibrate import _largest_size_chosen, calibrate
 from rigkit.calibration.certainty.uncertainty import FarProjection
+from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.solving.fit import fit_model, robust_sigma
 from rigkit.calibration.solving.initialise import initialise
 from rigkit.calibration.solving.poses import find_poses
@@ -27,6 +30,7 @@ from rigkit.calibration.solving.state import State, evaluate
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.double_sphere import DoubleSphere
 from rigkit.cameras.registry import MODELS
+from rigkit.cameras.scaramuzza import Scaramuzza
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
@@ -101,6 +105,16 @@ def test_a_lens_of_220_degrees_takes_the_largest_degree_and_is_told_so(rng: np.r
     assert off < 0.5 * before
     assert any("scaramuzza 10, the largest size of this model" in verdict.message for verdict in result.verdicts)
     assert not any("the largest size" in verdict.message for verdict in eight.verdicts)
+
+
+@pytest.mark.parametrize("chosen", [False, True])
+def test_the_largest_size_of_a_model_is_named_where_it_is_chosen(chosen: bool) -> None:
+    beyond = [("scaramuzza 8", Scaramuzza, 8), ("scaramuzza 10", Scaramuzza, 10)]
+    tried = Candidate("scaramuzza 10", 14, 0.1, 0.1, chosen, "")
+    result = cast(Calibration, SimpleNamespace(candidates=(tried,)))
+    said = [finding.message for finding in _largest_size_chosen(beyond, result, ())]
+    assert ["scaramuzza 10, the largest size of this model" in words for words in said] == [True] * chosen
+    assert not [*_largest_size_chosen(beyond, result, ("model",)), *_largest_size_chosen([], result, ())]
 
 
 def test_rational_brown_converges(rng: np.random.Generator) -> None:

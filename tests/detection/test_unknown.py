@@ -342,6 +342,9 @@ def test_faults_of_an_identified_board_are_reported() -> None:
     old, new = (board(8, 5, Charuco("DICT_4X4_50", 20.0, legacy=legacy)) for legacy in (True, False))
     assert difference(old, new) == "this is the legacy pattern: set legacy_pattern = true"
     assert difference(new, new) is None
+    white = board(8, 5, Charuco("DICT_4X4_50", 20.0, inverted=True))
+    assert difference(new, white) == "black and white are not exchanged: set inverted = false"
+    assert difference(white, new) == "black and white are exchanged: set inverted = true"
     assert difference(board(9, 6, Chessboard()), board(8, 6, Chessboard())) == (
         "9 x 6 inner corners are seen, 8 x 6 are declared"
     )

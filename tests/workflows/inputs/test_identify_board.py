@@ -181,6 +181,20 @@ def test_every_second_image_shows_the_board(monkeypatch: pytest.MonkeyPatch, tmp
     assert identify_board.suggestion(paths[::2]).words is None
 
 
+@pytest.mark.parametrize("sizes", [(), ((9, 6),)], ids=["whole", "cut"])
+def test_another_board_in_the_other_images_is_named_where_its_size_is_known(
+    sizes: tuple[tuple[int, int], ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    paths = [tmp_path / f"{k}.png" for k in range(4)]
+    for k, path in enumerate(paths):
+        cv2.imwrite(str(path), np.full((40, 40), 100 * (k % 2), np.uint8))
+    first = BoardGuess(board=Board("b", 8, 5, 1.0, 1.0), images=(0, 2))
+    other = BoardGuess(board=Board("b", 9, 6, 1.0, 1.0), images=(0, 1), sizes=sizes)
+    monkeypatch.setattr(identify_board, "guess_board", lambda images, *_: first if len(images) == 4 else other)
+    found = identify_board.identify_board(paths)
+    assert found.elsewhere == (None if sizes else ("9x6xMM", ("1.png", "3.png")))
+
+
 def test_boards_of_one_session_have_no_tag_in_common(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A second grid of tags is on the rig, or in pictures of something else: then it has tags of the first."""
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((40, 40), np.uint8))

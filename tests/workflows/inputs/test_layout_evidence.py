@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,9 @@ from rigkit.io.media.images import Image, read_image
 from rigkit.workflows.calibration.calibrate import RigSessionCalibration
 from rigkit.workflows.calibration.calibrate_any import calibrate_sources
 from rigkit.workflows.inputs.corners import named_images
-from rigkit.workflows.inputs.folder_session import session_of_folders
+from rigkit.workflows.inputs.folder_session import images_of_layout, session_of_folders
 from rigkit.workflows.inputs.layout_evidence import cameras_seen
+from rigkit.workflows.inputs.layouts import CameraLayout
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions, FolderOptions
 
 BOARD = board_of_words("9x6x30")
@@ -97,6 +99,34 @@ def test_boards_of_one_camera_do_not(pictures: Path, tmp_path: Path, form: str) 
         return
     with pytest.raises(InputError, match=r"--cameras 1; .* 2 cameras .*\(--cameras 2\), but boards do not move alike"):
         cameras_seen([folder], [BOARD], folder / "session.toml", silent)
+
+
+def test_images_beside_those_of_another_camera_are_chosen_by_a_part_of_their_names(tmp_path: Path) -> None:
+    paths = {side: [tmp_path / f"frame{k:02d}_{side}.jpg" for k in range(3)] for side in "AB"}
+    for path in (*paths["A"], *paths["B"]):
+        path.touch()
+    cameras = {side: {str(k): path for k, path in enumerate(own)} for side, own in paths.items()}
+    found = images_of_layout(CameraLayout(cameras, ("0", "1", "2")))
+    assert {side: sorted(f for _, form in own for f in tmp_path.glob(form)) for side, own in found.items()} == paths
+    assert all(len(own) == 1 for own in found.values())
+
+
+@pytest.mark.parametrize("form", ["{k}/{side}.jpg", "{side}_{k}.jpg"])
+def test_boards_that_do_not_move_alike_make_no_rig(
+    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("rigkit.workflows.inputs.layout_evidence.on_one_mount", lambda *_: False)
+    for k, side in product(range(3), ("day1", "day2")):
+        path = tmp_path / form.format(k=k, side=side)
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    if form == "{side}_{k}.jpg":
+        with caplog.at_level("INFO"):
+            assert list(cameras_seen([tmp_path], [BOARD], tmp_path / "session.toml", silent)[0]) == [""]
+        assert "by the boards they are one camera's" in caplog.text
+        return
+    with pytest.raises(InputError, match=r"--cameras 1; .* 2 cameras .*\(--cameras 2\), but boards do not move alike"):
+        cameras_seen([tmp_path], [BOARD], tmp_path / "session.toml", silent)
 
 
 @pytest.mark.parametrize("turned", [False, True], ids=["twice", "rotated"])
