@@ -57,6 +57,15 @@ def test_a_file_of_correspondences(files: tuple[Path, Rigid3], capsys: pytest.Ca
     assert b"units baselines" in (folder / "out" / "scene.ply").read_bytes()[:300]
 
 
+def test_a_pose_that_the_images_contradict(files: tuple[Path, Rigid3], capsys: pytest.CaptureFixture[str]) -> None:
+    folder, pose = files
+    wrong = Rigid3(exp_so3(np.array([0.0, 0.0, 0.1])) @ pose.rotation, pose.translation_mm)
+    np.savetxt(folder / "wrong.txt", wrong.matrix())
+    given = ("--correspondences", str(folder / "found.csv"), "--no-pictures")
+    assert run(folder, *given, "--pose", str(folder / "wrong.txt")) == 3
+    assert "of 60 correspondences agree with the measured pose" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("layout", ["npz", "extractor"])
 def test_other_layouts_of_the_file(files: tuple[Path, Rigid3], layout: str, capsys: pytest.CaptureFixture[str]) -> None:
     folder, _ = files

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,12 +12,15 @@ from helpers.calibration_scenes import BOARD
 from helpers.rig_scenes import MODELS, NOISE_PX, SIGMAS, mounts, rig_views, sizes
 
 from rigkit.calibration.certainty.covariance import GlobalCovariance
-from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.calibrate import _mispaired, calibrate_rig
 from rigkit.calibration.rig.certainty.uncertainty import transfer_covariance, transfer_uncertainty
+from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.exposure_times import ExposureTimes
 from rigkit.calibration.rig.solving.pose_jacobians import pose_jacobians
 from rigkit.calibration.rig.solving.solver import rig_normal
 from rigkit.calibration.rig.solving.state import RigObservations, RigState
+from rigkit.calibration.rig.verdicts import _not_converged
+from rigkit.calibration.rig.views.observations import RigViews
 from rigkit.calibration.solving.camera_prior import camera_prior
 from rigkit.calibration.solving.clustered import Clustered
 from rigkit.calibration.solving.normal_equations import SchurStep
@@ -25,6 +30,7 @@ from rigkit.calibration.views.observations import Observations
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
+from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 
@@ -351,3 +357,19 @@ def test_overdispersion_is_one_for_noise_and_more_for_errors_in_common() -> None
         z.append((length - np.linalg.norm(mounts()["wide"][1].translation_mm)) / sigma)
     assert np.mean(clean) < 1.1 and np.mean(bumpy) > 1.15
     assert np.sqrt(np.mean(np.square(z))) < 1.6
+
+
+def test_a_mixup_of_all_frames_is_looked_for_where_most_of_them_disagree(monkeypatch: pytest.MonkeyPatch) -> None:
+    cause = Finding.bad("the images of 'right' are mirrored", "use the image files as the camera wrote them")
+    monkeypatch.setattr("rigkit.calibration.rig.calibrate.mixup_of_all_frames", lambda views: cause)
+    rig, views = cast(RigCalibration, SimpleNamespace(cameras=(), left_out=())), RigViews([], [], (), {})
+    assert _mispaired(rig, views, 1e3) == [cause]
+    assert _mispaired(rig, views, 1.0) == []
+
+
+@pytest.mark.parametrize("converged", [False, True])
+def test_a_solution_that_did_not_converge_is_bad(converged: bool) -> None:
+    rig = cast(RigCalibration, SimpleNamespace(convergence=SimpleNamespace(converged=converged, reason="50 rounds")))
+    found = list(_not_converged(rig))
+    assert [one.severity for one in found] == [Severity.BAD] * (not converged)
+    assert converged or "did not converge (50 rounds)" in found[0].message
