@@ -130,7 +130,7 @@ def _refuse_own_images(source: Path, frames: Sequence[Sequence[Path]]) -> None:
     for camera in zip(*frames, strict=True):
         if _digest_alone(camera) in known:
             raise InputError(
-                f"check: '{source}' was made from these very images, which fit it even if the camera has changed since; "
+                f"check: '{source}' was made from these very images, which fit it even if the camera has changed; "
                 "give new ones"
             )
 
