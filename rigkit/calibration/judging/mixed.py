@@ -51,7 +51,8 @@ def two_cameras(calibration: Calibration, number: IntArray) -> Iterator[Finding]
         yield Finding.bad(
             f"images of two cameras are mixed: the board moves in the same way between '{images[start[0]]}' and "
             f"'{images[end[0]]}' and in {alike - 1} other pairs of images, as in stereo pairs",
-            "calibrate each camera from its own images, or both as a rig with [[cameras]]",
+            "calibrate each camera from its own images, or both as a rig with [[cameras]]; leave out images "
+            "that a program made from others",
         )
 
 

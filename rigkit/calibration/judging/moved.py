@@ -82,13 +82,17 @@ def moved_lens(observations: Observations, fit: Fit, *, tests: int = 1) -> tuple
                 f"images of two cameras are mixed: the lenses of those named like '{one}' and like '{other}' differ "
                 f"({distance:.0f} standard deviations)"
             )
-            return (Finding.bad(message, "calibrate each camera from its own images"),)
+            remedy = (
+                "calibrate each camera from its own images, and images that a program changed apart from the others"
+            )
+            return (Finding.bad(message, remedy),)
     distance = difference_sigmas(later)
     if distance is None or (chance := tests * scores.chance(observations.clusters(), number, tests)) > CHANCE:
         return ()
     message = (
         f"the lens (or the board) changed at image '{images[first]}' ({distance:.0f} standard deviations, p <= "
-        f"{chance:.2g} for a split at any image): another camera, focus, zoom or mount; {SIGMAS_DO_NOT_HOLD}"
+        f"{chance:.2g} for a split at any image): another camera, focus, zoom or mount, or images that a program "
+        f"changed; {SIGMAS_DO_NOT_HOLD}"
     )
     return (Finding.bad(message, "calibrate the images before it and those from it on separately, or retake all"),)
 
