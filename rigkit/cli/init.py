@@ -101,8 +101,8 @@ def _session(args: argparse.Namespace) -> int:
         boards=tuple(args.board), square_mm=args.square_mm, model=args.model, cameras=_number_of_cameras(args.cameras)
     )
     made = new_session(args.folder, options, path, progress=progress_on_stderr())
-    write_together(dict(made.files), force=args.force)
-    for written in made.files:
+    write_together(made, force=args.force)
+    for written in made:
         print(written)
     return ExitCode.WELL
 

@@ -329,9 +329,9 @@ def test_known_cameras_are_written_to_the_session(
     ]
     known.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": cameras}))
     wanted = session_of_folders([pictures], ["9x6x30"], tmp_path / "session.toml", known=Known(rig=known))
-    for path, text in wanted.files.items():
+    for path, text in wanted.items():
         path.write_text(text)
-    session = load_rig_session(wanted.path)
+    session = load_rig_session(tmp_path / "session.toml")
     assert session.known_rig == known and list(session.cameras) == ["left", "right"]
     # Of the rig's file nobody knows how sure it is, nor of another tool's lens.
     reported = known_cameras(replace(session, lenses={"right": lens}))

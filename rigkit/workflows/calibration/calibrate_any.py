@@ -29,7 +29,6 @@ from rigkit.workflows.calibration.calibrate import (
 )
 from rigkit.workflows.inputs.corners import keep_corners
 from rigkit.workflows.inputs.folder_session import (
-    FolderSession,
     ImagesByCamera,
     boards_seen,
     cameras_in,
@@ -132,16 +131,16 @@ def calibrate_folders(
     if videos:
         _choose_frames(videos, boards, folder_options.timestamps, progress)
     wanted, cameras, corners = _session(places, boards, session, folder_options, options, progress)
-    new = {path: text for path, text in wanted.files.items() if not _has_content(path, text)}
+    new = {path: text for path, text in wanted.items() if not _has_content(path, text)}
     results = _results(cameras, session, options)
-    ensure_writable([*new, *results], force=options.force, inputs=[*(set(wanted.files) - set(new)), *declared])
+    ensure_writable([*new, *results], force=options.force, inputs=[*(set(wanted) - set(new)), *declared])
     before = {path: read_bytes(path, "session") for path in new if path.exists()}
-    write_together(dict(new), force=options.force)
+    write_together(new, force=options.force)
     try:
-        with _errors_about(folders, wanted.path):
+        with _errors_about(folders, session):
             if corners and options.cache is Cache.UPDATE and options.corners is None:
-                _keep_corners(wanted.path, corners)
-            return calibrate_session_file(wanted.path, options, progress=progress)
+                _keep_corners(session, corners)
+            return calibrate_session_file(session, options, progress=progress)
     except BaseException:
         if before:
             write_together(before, force=True)
@@ -153,8 +152,8 @@ def calibrate_folders(
 
 def new_session(
     folder: Path, folder_options: FolderOptions, path: Path, *, progress: Progress = silent
-) -> FolderSession:
-    """Return the session, to be written to `path`, with which `calibrate_folders` calibrates a folder of images.
+) -> dict[Path, str]:
+    """Return the files of the session, in `path`, with which `calibrate_folders` calibrates a folder of images.
 
     Raises as `calibrate_folders` for boards and cameras.
     """
@@ -171,8 +170,8 @@ def _session(
     folder_options: FolderOptions,
     options: CalibrateOptions,
     progress: Progress,
-) -> tuple[FolderSession, list[str], Mapping[Path, FoundCorners]]:
-    """Return the session of folders, the names of its cameras, and the corners that were found to tell the cameras."""
+) -> tuple[dict[Path, str], list[str], Mapping[Path, FoundCorners]]:
+    """Return the files of the session of folders, the names of its cameras, and the corners found to tell these."""
     cameras: ImagesByCamera | None = None
     corners: Mapping[Path, FoundCorners] = {}
     if boards and folder_options.cameras is not None:

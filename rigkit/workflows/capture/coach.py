@@ -63,7 +63,7 @@ def open_coach(
     names = _names(options)
     patterns = {name: f"{folder_of(name, len(names))}/*.png" for name in names}
     wanted = session_of_future_images(patterns, options.boards, options.folder)
-    keeper = Keeper(options.folder, dict(wanted.files), names)
+    keeper = Keeper(options.folder, wanted, names)
     guide, length = options.guide, options.length
     if length is not None:
 

@@ -6,7 +6,6 @@ import glob
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -53,14 +52,6 @@ ImagesByCamera = Mapping[str, Sequence[tuple[Path, str]]]
 """(folder, pattern) pairs of the images of each camera; a single camera is called ""."""
 
 
-@dataclass(frozen=True, slots=True)
-class FolderSession:
-    """The path of a session file, and the content of that file and of its board files (path -> text)."""
-
-    path: Path
-    files: Mapping[Path, str]
-
-
 def session_of_folders(
     folders: Sequence[Path],
     boards: Sequence[str],
@@ -70,8 +61,8 @@ def session_of_folders(
     output: Path | None = None,
     known: Known | None = None,
     cameras: ImagesByCamera | None = None,
-) -> FolderSession:
-    """Return the session, to be written to `path`, of one folder of images, or of one folder for each camera.
+) -> dict[Path, str]:
+    """Return the session file `path` of one folder of images, or of one folder for each camera, and its board files.
 
     Raises InputError: no board, a folder without images, or names that a session cannot hold.
 
@@ -112,8 +103,7 @@ def session_of_folders(
         lines.append(f"images = {_patterns_toml(cameras[''], place)}")
     else:
         lines += _cameras_in_words(cameras, place, known or Known())
-    files[path] = "\n".join(lines).rstrip() + "\n"
-    return FolderSession(path, files)
+    return files | {path: "\n".join(lines).rstrip() + "\n"}
 
 
 def _cameras_in_words(cameras: ImagesByCamera, place: Path, known: Known) -> list[str]:
@@ -141,8 +131,8 @@ def _cameras_in_words(cameras: ImagesByCamera, place: Path, known: Known) -> lis
     return lines
 
 
-def session_of_future_images(patterns: Mapping[str, str], boards: Sequence[str], place: Path) -> FolderSession:
-    """Return the session in folder `place` for images still to be taken, which will match `patterns` (by camera).
+def session_of_future_images(patterns: Mapping[str, str], boards: Sequence[str], place: Path) -> dict[Path, str]:
+    """Return the session in folder `place` for images to be taken, which will match `patterns` (by camera), as files.
 
     Images of one moment will have the same name. Boards and errors are as for `session_of_folders`.
     """
@@ -156,9 +146,7 @@ def session_of_future_images(patterns: Mapping[str, str], boards: Sequence[str],
         for name, pattern in patterns.items():
             check_identifier(name, "camera")
             lines += ["", "[[cameras]]", f"id = {toml_text(name)}", f"images = {toml_text(pattern)}"]
-    path = place / SESSION_NAME
-    files[path] = "\n".join(lines) + "\n"
-    return FolderSession(path, files)
+    return files | {place / SESSION_NAME: "\n".join(lines) + "\n"}
 
 
 def boards_seen(places: Sequence[Path], side_mm: float, progress: Progress = silent) -> tuple[str, ...]:

@@ -207,7 +207,7 @@ def test_boards_of_one_session_have_no_tag_in_common(monkeypatch: pytest.MonkeyP
     words = identify_board.suggestion([tmp_path / "0.png"]).words
     assert words == "aprilgrid:6x6xMM,spacing=0.3 --board aprilgrid:6x6xMM,spacing=0.3,first_tag=36"
     declared = with_length(words, 88.0).split(" --board ")
-    made = session_of_folders([tmp_path], declared, tmp_path / "session.toml")
-    for path, text in made.files.items():
+    session = tmp_path / "session.toml"
+    for path, text in session_of_folders([tmp_path], declared, session).items():
         path.write_text(text)
-    assert [board.pattern for board in load_session(made.path).boards] == [first.pattern, second.pattern]
+    assert [board.pattern for board in load_session(session).boards] == [first.pattern, second.pattern]

@@ -55,7 +55,7 @@ def arranged(pictures: Path, folder: Path, form: str, sides: tuple[str, str]) ->
 def test_boards_that_move_alike_make_a_rig(pictures: Path, tmp_path: Path, form: str, sides: tuple[str, str]) -> None:
     folder = arranged(pictures, tmp_path / "photos", form, sides)
     cameras, _ = cameras_seen([folder], [BOARD], folder / "session.toml", silent)
-    for path, text in session_of_folders([folder], ["9x6x30"], folder / "session.toml", cameras=cameras).files.items():
+    for path, text in session_of_folders([folder], ["9x6x30"], folder / "session.toml", cameras=cameras).items():
         path.write_text(text)
     session = load_rig_session(folder / "session.toml")
     assert list(session.cameras) == list(sides)
