@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ from rigkit.io.manifests.session import load_session
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import place_board, sees_paper
+from rigkit.workflows.calibration import next_pictures
 from rigkit.workflows.inputs.corners import first_camera
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "calibration" / "fisheye"
@@ -61,7 +63,9 @@ def session(halves: Path, tmp_path: Path) -> Path:
 
 
 def test_from_images_to_file_and_again_without_images(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["calibrate", str(session), "--json", "--report"]) == 0
+    with patch.object(next_pictures, "plan_views", wraps=next_pictures.plan_views) as planned:
+        assert main(["calibrate", str(session), "--json", "--report"]) == 0
+    assert planned.call_count == 1  # For the page and the JSON.
     reported = json.loads(capsys.readouterr().out)
     assert (session.parent / "calibration.html").read_text().count("data:image/jpeg") == 5
     result = load_calibration(session.parent / "calibration.json")
