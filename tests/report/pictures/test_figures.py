@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import re
 
+import cv2
 import numpy as np
 import pytest
 from helpers.calibration_scenes import lens, random_views
@@ -14,7 +15,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.report.pages.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
 from rigkit.report.pages.calibration_drawings import coverage_svg, pattern_svg, residuals_svg
-from rigkit.report.pictures.figures import as_pdf, cloud_figure, corners_figure
+from rigkit.report.pictures.figures import as_pdf, as_png, cloud_figure, corners_figure, in_dark_colours, new_figure
 from rigkit.report.render import asset, data_uri
 
 
@@ -29,6 +30,20 @@ def test_a_pdf_has_vectors_real_fonts_and_no_date() -> None:
     assert b"CreationDate" not in first
     # The cloud has no photograph in it: all of it is lines and text.
     assert b"/Subtype /Image" not in as_pdf(cloud_figure(reconstruction))
+
+
+def test_pictures_of_dark_pages_are_dark_and_the_next_one_is_light_again() -> None:
+    def drawn() -> bytes:
+        figure = new_figure(1.0, 1.0, dpi=20)
+        figure.subplots()
+        return as_png(figure)
+
+    light, dark, again = drawn(), in_dark_colours(drawn), drawn()
+    ground, dark_ground = (
+        int(np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE))[0, 0]) for png in (light, dark)
+    )
+    assert ground == 255 and dark_ground < 40
+    assert again == light
 
 
 @pytest.mark.parametrize("baseline_mm", [(300.0, 0.0, 0.0), (0.0, 0.0, 900.0), (0.0, 1500.0, 0.0)])
