@@ -26,7 +26,7 @@ from rigkit.workflows.calibration.calibrate_any import calibrate_folders
 from rigkit.workflows.detect import detect_in_images
 from rigkit.workflows.inputs.folder_session import boards_seen
 from rigkit.workflows.inputs.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
-from rigkit.workflows.inputs.frames import frames_of_videos
+from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos
 from rigkit.workflows.inputs.identify_board import identify_board
 from rigkit.workflows.options.cameras import CalibrateOptions, FolderOptions
 
@@ -134,6 +134,12 @@ def test_a_folder_of_videos_is_a_camera_each(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("of two cameras")
     with pytest.raises(InputError, match=r"left\.avi', '.*right\.avi': no board in 2 frames"):
         calibrate_folders([tmp_path], FolderOptions(boards=("7x5x20",)), CalibrateOptions())
+
+
+def test_moments_of_videos_are_chosen_by_number(tmp_path: Path) -> None:
+    path = video(tmp_path / "a.avi", [np.full((240, 320), 60 * k, np.uint8) for k in range(4)])
+    found = [int(pictures[""].mean()) for pictures in moments_of_videos({"": path}, (1, 3))]
+    assert np.abs(np.array(found) - [60, 180]).max() <= 2
 
 
 def test_a_video_tells_its_board_and_why_another_is_not_seen(tmp_path: Path) -> None:
