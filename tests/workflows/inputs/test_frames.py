@@ -138,7 +138,7 @@ def test_a_folder_of_videos_is_a_camera_each(tmp_path: Path) -> None:
 
 def test_moments_of_videos_are_chosen_by_number(tmp_path: Path) -> None:
     path = video(tmp_path / "a.avi", [np.full((240, 320), 60 * k, np.uint8) for k in range(4)])
-    found = [int(pictures[""].mean()) for pictures in moments_of_videos({"": path}, (1, 3))]
+    found = [int(pictures[""].mean()) for _, pictures in moments_of_videos({"": path}, (1, 3))]
     assert np.abs(np.array(found) - [60, 180]).max() <= 2
 
 
