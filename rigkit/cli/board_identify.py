@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 from rigkit.core.errors import ExitCode, InputError
+from rigkit.core.patterns.circles import Circles
 
 
 def identify(args: argparse.Namespace) -> int:
@@ -49,6 +50,11 @@ def identify(args: argparse.Namespace) -> int:
         note(
             "the pattern of OpenCV before 4.6 and the one of today differ in one column, which no image shows "
             "clearly: if OpenCV made the board, set legacy_pattern by its version"
+        )
+    if isinstance(board.pattern, Circles) and board.pattern.stagger == "left":
+        note(
+            'stagger = "left": every second row begins half a step further left, which is rare; '
+            "are the images mirrored, as by the driver of a webcam?"
         )
     for error in found.unreadable:
         note(f"left out: {error}")

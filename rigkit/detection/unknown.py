@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
@@ -248,19 +250,27 @@ def difference(guess: Board, declared: Board) -> str | None:
         if seen.dictionary.rpartition("_")[0] != declared_pattern.dictionary.rpartition("_")[0]:
             return f'the markers are of {seen.dictionary}: set dictionary = "{seen.dictionary}"'
     if isinstance(seen, Circles) and isinstance(declared_pattern, Circles):
-        for name in ("layout", "inverted"):
-            if getattr(seen, name) != getattr(declared_pattern, name):
-                shown, determined = (str(getattr(pattern, name)).lower() for pattern in (seen, declared_pattern))
-                return f"{name} is {determined} in the board file, {shown} in the images"
+        layout = _first_difference(("layout", "inverted"), seen, declared_pattern)
+        if layout is not None:
+            return layout
     if set(guess.size) != set(declared.size) or (seen.identified and guess.size != declared.size):
         per = declared_pattern.points_per_count
         return f"{size} are seen, {declared.columns // per} x {declared.rows // per} are declared"
     if seen.identified:
         # Lengths cannot be determined from images.
-        own, other = seen.key_values(), declared_pattern.key_values()
-        for name in own:
-            if not name.endswith("_mm") and name != "dictionary" and _differs(own[name], other[name]):
-                return f"{name} is {other[name]} in the board file, {own[name]} in the images"
+        names = [name for name in seen.key_values() if not name.endswith("_mm") and name != "dictionary"]
+        return _first_difference(names, seen, declared_pattern)
+    return None
+
+
+def _first_difference(names: Iterable[str], seen: Pattern, declared: Pattern) -> str | None:
+    """Return in words the first of the keys `names` in which two patterns of one type differ; None if there is none."""
+    own, other = seen.key_values(), declared.key_values()
+    for name in names:
+        if _differs(own[name], other[name]):
+            # JSON writes these values as TOML does.
+            value = json.dumps(own[name])
+            return f"{name} is {json.dumps(other[name])} in the board file, {value} in the images: set {name} = {value}"
     return None
 
 

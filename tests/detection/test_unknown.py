@@ -349,8 +349,8 @@ def test_faults_of_an_identified_board_are_reported() -> None:
         "9 x 6 inner corners are seen, 8 x 6 are declared"
     )
     dark, bright = (board(9, 7, Circles(inverted=inverted)) for inverted in (False, True))
-    assert difference(dark, bright) == "inverted is true in the board file, false in the images"
+    assert difference(dark, bright) == "inverted is true in the board file, false in the images: set inverted = false"
     assert difference(dark, dark) is None
     grids = [board(12, 10, AprilGrid(spacing)) for spacing in (0.3, 0.2)]
-    assert difference(*grids) == "spacing is 0.2 in the board file, 0.3 in the images"
+    assert difference(*grids) == "spacing is 0.2 in the board file, 0.3 in the images: set spacing = 0.3"
     assert difference(grids[0], new) == 'an aprilgrid board of 6 x 5 tags is seen; set type = "aprilgrid"'

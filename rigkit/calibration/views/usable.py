@@ -118,7 +118,11 @@ def other_size(
     without = [own for own in found if not any(frozenset(seen.size) in listed for seen in own)]
     counts = Counter((max(s.size), min(s.size)) for own in without for s in own if s.whole)
     size, count = counts.most_common(1)[0] if counts else ((0, 0), 0)
-    words = f"{size[0]} x {size[1]} inner corners are seen in {count} of {len(found)} images, {sizes} are declared"
+    # As many columns as rows, or more, unless all declared boards have fewer.
+    columns, rows = size if any(board.columns >= board.rows for board in boards) else size[::-1]
+    circles = all(board.pattern.point_word == "circles" for board in boards)
+    seen_words = f"{columns} x {rows} {'circles' if circles else 'inner corners'} are seen"
+    words = f"{seen_words} in {count} of {len(found)} images, {sizes} are declared"
     if count < (1 if any(frozenset(size) == frozenset(board.size) for board in about) else OFTEN):
         return None
     reaching = [own for own in found if any(frozenset(seen.reach) in listed for seen in own)]

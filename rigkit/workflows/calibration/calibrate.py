@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -13,6 +13,8 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_ties import suggest_rigid_boards
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.printing import brief
@@ -38,6 +40,10 @@ from rigkit.workflows.options.cameras import CalibrateOptions
 from rigkit.workflows.outputs.calibration_paths import boards_path, calibration_paths, camera_exports, camera_path
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_rig_files
 from rigkit.workflows.outputs.provenance import provenance_of
+
+MOST_CORNERS = 0.8
+"""Share of a board's corners that some image of a session nearly always shows. If the first mark is numbered one too
+low, 7 of 10 corners at most get a place (7 x 7 corners, RENDERED); then the board is identified once more."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -152,7 +158,16 @@ def calibration_from(
         if shown is not None:
             # It names the print, too.
             verdicts = (verdicts[0], Finding.bad(shown), *(one for one in verdicts[1:] if one not in prints))
+    elif any(board.identified and _mostly_hidden(board, views) for board in session.boards):
+        shown = why_misplaced(session.images, session.boards, progress)
+        verdicts = (*verdicts, *(() if shown is None else (Finding.look(shown),)))
     return replace(result, dropped=(*dropped, *result.dropped), verdicts=verdicts)
+
+
+def _mostly_hidden(board: Board, views: Sequence[BoardView]) -> bool:
+    """Return whether no view of a board shows most of its corners, as if its marks were numbered otherwise."""
+    seen = [len(view.grid) for view in views if view.board.board_id == board.board_id]
+    return bool(seen) and max(seen) < MOST_CORNERS * board.corner_count
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -9,7 +9,9 @@ from pathlib import Path
 from rigkit.core.boards import Board
 from rigkit.core.errors import CheckFailed, DegenerateError, InputError
 from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.core.patterns.circles import STAGGERS, Circles
 from rigkit.core.printing import brief, counted
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
@@ -128,7 +130,7 @@ def _other_board(rest: Sequence[tuple[str, GreyImage]]) -> tuple[str, tuple[str,
 
 def why_not_detected(paths: Sequence[Path], boards: Sequence[Board], progress: Progress = silent) -> str | None:
     """Return in words why images do not show the declared boards; None if unknown."""
-    mirrored = _mirrored(paths, [board for board in boards if board.identified])
+    mirrored = _mirrored(paths, [board for board in boards if board.identified or _handed(board)])
     if mirrored is not None:
         return mirrored
     guess, *_ = _guess(paths, progress)
@@ -167,26 +169,35 @@ def _duplicate_board(paths: Sequence[Path], boards: Sequence[Board]) -> str | No
     return None
 
 
+def _handed(board: Board) -> bool:
+    """Return whether a mirrored grid of circles is another grid: with an odd number of staggered rows it is the same,
+    rotated by 180 degrees."""
+    return isinstance(board.pattern, Circles) and board.pattern.staggered and board.rows % 2 == 0
+
+
 def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
-    """Return a message if boards with marks are only seen in flipped images, else None.
+    """Return a message if boards with marks, or handed grids, are only seen in flipped images, else None.
 
     A mirrored chessboard is a chessboard: it does not show.
     """
     if not boards:
         return None
-    names = []
+    seen: list[tuple[str, str]] = []
     for name, image in _pictures(paths, EXPLAINING_IMAGES):
         if isinstance(image, InputError):
             continue
         straight, flipped = (
-            any(found.board_id is not None for found in detect_boards(seen, boards))
-            for seen in (image, _flipped(image))
+            [found.board_id for found in detect_boards(one, boards) if found.board_id is not None]
+            for one in (image, _flipped(image))
         )
         if straight:
             return None
-        if flipped:
-            names.append(name)
-    return _mirror_message(names[0]) if names else None
+        seen += [(name, board_id) for board_id in flipped]
+    if not seen:
+        return None
+    name, board_id = seen[0]
+    (board,) = (board for board in boards if board.board_id == board_id)
+    return _mirror_message(name, board.pattern)
 
 
 def _mirrored_where_doubtful(guess: BoardGuess | None, pictures: Sequence[tuple[str, GreyImage]]) -> str | None:
@@ -202,7 +213,7 @@ def _mirrored_where_doubtful(guess: BoardGuess | None, pictures: Sequence[tuple[
     some = pictures[:: max(1, -(-len(pictures) // EXPLAINING_IMAGES))]
     marks = guess_board([_flipped(image) for _, image in some])
     if marks is not None and marks.board.identified and len(marks.images) >= MIN_SHARE_OF_IMAGES * len(some):
-        return _mirror_message(some[marks.images[0]][0])
+        return _mirror_message(some[marks.images[0]][0], marks.board.pattern)
     return None
 
 
@@ -219,11 +230,12 @@ def _flipped(image: GreyImage) -> GreyImage:
     return image[:, ::-1].copy()
 
 
-def _mirror_message(name: str) -> str:
-    return (
-        f"the images are mirrored: '{Path(name).name}' shows its board only when it is flipped left to right; "
-        "switch off mirroring in the camera or the program that writes them, or flip all of them"
-    )
+def _mirror_message(name: str, pattern: Pattern) -> str:
+    words = f"the images are mirrored: '{Path(name).name}' shows its board only when it is flipped left to right; "
+    if isinstance(pattern, Circles):
+        (other,) = {*STAGGERS} - {pattern.stagger}
+        words = f'{words}if the board itself is printed so, set stagger = "{other}"; otherwise '
+    return f"{words}switch off mirroring in the camera or the program that writes them, or flip all of them"
 
 
 @dataclass(frozen=True, slots=True)

@@ -65,5 +65,5 @@ def test_a_border_is_told_once(tmp_path: Path, rng: np.random.Generator, capsys:
     words = "aprilgrid:4x3x60,spacing=0.3,border=1"
     main(["calibrate", str(tmp_path), "--board", words, "--model", "pinhole", "-o", str(tmp_path / "camera.json")])
     printed = "".join(capsys.readouterr())
-    assert "border is 1 in the board file, 2 in the images" in printed
+    assert "border is 1 in the board file, 2 in the images: set border = 2" in printed
     assert "have a border of" not in printed
