@@ -164,4 +164,23 @@ EXPORT void sweep_rivals(
     ARRAY(const float, samples1, claims.rows, claims.columns), SCRATCH(uint16_t, memory, sweep_levels(claims.levels)),
     RESULT(float, found, claims.count, 2));
 
+/* sweep_planes.c */
+
+/* The surface of a sweep: its levels, where it is seen, and the brightness of image 1; some samples (row, column), around which
+ * planes are fitted over `reach` samples. A weight falls with the distance, in units of `radius` samples, and with the difference
+ * of brightness, in units of `alike`. */
+typedef struct {
+    ARRAY(const double, winners, rows, columns);
+    ARRAY(const uint8_t, seen, rows, columns);
+    ARRAY(const float, brightness, rows, columns);
+    ARRAY(const int32_t, samples, count, 2);
+    int64_t rows, columns, count, reach;
+    double radius, alike;
+} level_grid_t;
+
+EXPORT int64_t level_fit_memory(int64_t reach);
+EXPORT void fit_level_planes(
+    const level_grid_t *grid, SCRATCH(float, memory, level_fit_memory(grid.reach)), RESULT(double, planes, grid.count, 3),
+    RESULT(double, normals, grid.count, 3, 3), RESULT(double, agreement, grid.count, 2));
+
 #endif

@@ -1,11 +1,13 @@
-"""Calls of the kernels in sweep.c: matching costs of a sweep over ranges, and surfaces of minimal cost."""
+"""Calls of the kernels in sweep.c and sweep_planes.c: a sweep over ranges, its surface of minimal cost, its planes."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import make_struct
 from rigkit.kernels.declarations import header
@@ -73,3 +75,43 @@ def swept_rivals(
         alike=alike,
     )
     return np.asarray(kernels().sweep_rivals(claims, costs, samples1))
+
+
+class LevelPlanes(NamedTuple):
+    """Planes (N, 3): the level, its change per row and per column; normal matrices of their fits (N, 3, 3), share (N,)
+    of the samples around that agree, and the variance (N,) of their levels about the plane."""
+
+    planes: FloatArray
+    normals: FloatArray
+    agree: FloatArray
+    variance: FloatArray
+
+
+def fitted_level_planes(
+    winners: FloatArray,
+    seen: BoolArray,
+    brightness: NDArray[np.float32],
+    samples: IntArray,
+    *,
+    reach: int,
+    radius: float,
+    alike: float,
+) -> LevelPlanes:
+    """Return the planes of the surface `winners` (R, C), in levels, around `samples` (N, 2), row and column.
+
+    Only the samples `seen` (R, C) count, with weights that decrease with their distance (Gaussian, `radius` samples, up
+    to `reach`), with the difference of their `brightness` (R, C; by a factor of e for `alike` grey levels), and with
+    their distance from the plane (Geman and McClure, one level; four in the first round).
+    """
+    grid = make_struct(
+        "level_grid_t",
+        winners=winners,
+        seen=seen.view(np.uint8),
+        brightness=brightness,
+        samples=np.ascontiguousarray(samples, np.int32),
+        reach=reach,
+        radius=radius,
+        alike=alike,
+    )
+    planes, normals, agreement = kernels().fit_level_planes(grid)
+    return LevelPlanes(planes, normals, agreement[:, 0], agreement[:, 1])

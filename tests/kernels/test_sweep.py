@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from kernels.reference import sweep as reference
 
-from rigkit.kernels.sweep import swept_costs, swept_rivals, swept_surfaces
+from rigkit.kernels.sweep import fitted_level_planes, swept_costs, swept_rivals, swept_surfaces
 
 SPACING = 8
 RULES: dict[str, Any] = {"bend": 4, "jump": 48, "even": 8.0}
@@ -80,3 +80,28 @@ def test_rivals_are_as_defined(rng: np.random.Generator) -> None:
     own, other = swept_rivals(costs, levels, samples1, samples[right], flat, **rules).T
     assert len(right) > 20
     assert np.mean(own < 0.5 * other) > 0.95
+
+
+def test_planes_of_levels_are_as_defined(rng: np.random.Generator) -> None:
+    rows, columns, count = 40, 50, 90
+    r, c = np.indices((rows, columns))
+    near = np.hypot(r - 20, c - 25) < 12
+    winners = np.where(near, 30.0, 12.0 + 0.2 * r - 0.1 * c) + 0.3 * rng.normal(size=r.shape)
+    brightness = (np.where(near, 150.0, 90.0) + rng.normal(size=r.shape)).astype(np.float32)
+    seen = rng.random(r.shape) < 0.9
+    samples = np.stack([rng.integers(0, n, count) for n in (rows, columns)], axis=1)
+    samples = samples[seen[samples[:, 0], samples[:, 1]]]
+    rules: dict[str, Any] = {"reach": 8, "radius": 7.0, "alike": 10.0}
+    ours = fitted_level_planes(winners, seen, brightness, samples, **rules)
+    theirs = reference.level_planes(winners, seen, brightness, samples, **rules)
+    assert len(samples) > 60
+    # The table of weights has 16 steps to a factor e.
+    np.testing.assert_allclose(ours.planes[:, 0], theirs[0][:, 0], atol=0.03)
+    np.testing.assert_allclose(ours.planes[:, 1:], theirs[0][:, 1:], atol=0.01)
+    np.testing.assert_allclose(np.linalg.inv(ours.normals), np.linalg.inv(theirs[1]), rtol=0.15, atol=1e-4)
+    np.testing.assert_allclose(ours.agree, theirs[2], atol=0.03)
+    np.testing.assert_allclose(ours.variance, theirs[3], rtol=0.1)
+    # Beside the edge each surface keeps its own plane.
+    on_card = near[samples[:, 0], samples[:, 1]]
+    assert on_card.sum() > 3
+    np.testing.assert_allclose(ours.planes[on_card, 0], 30.0, atol=0.4)

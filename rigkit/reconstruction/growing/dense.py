@@ -26,6 +26,7 @@ from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
 from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.curvature import correct_curvature
+from rigkit.reconstruction.growing.fill import at_best_depth, fill_holes
 from rigkit.reconstruction.growing.grow import (
     EpipolarConstraint,
     GrowingView,
@@ -33,7 +34,6 @@ from rigkit.reconstruction.growing.grow import (
     grow,
     grow_in_both_directions,
 )
-from rigkit.reconstruction.growing.propagate import at_best_depth, propagate_planes
 from rigkit.reconstruction.growing.surface import WINDOW_AREA_PX, GrownSurface, PairRays, fit_surface
 from rigkit.reconstruction.growing.sweep import fill_by_sweep
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_lens_errors
@@ -151,7 +151,7 @@ def grow_scene(
     surface = fit_surface(measured, step, even.pose.epipolar_rms_px)
     if sweep is not None:
         surface = surface.where(at_best_depth(surface, grown, measured.slope, sweep, view1))
-        surface, grown = propagate_planes(surface, grown, measured.slope, sweep, view1, view2, pose)
+        surface, grown = fill_holes(surface, grown, sweep, view1, view2, pose, even.pose.epipolar_rms_px)
         rays = PairRays.of(grown, r.camera1, r.camera2)
     by_pose = _planes_by_pose(rays, pose, covariance)
     moves = _moved_by_calibration(even, r, moved, pose_is_known=pose_is_known)

@@ -85,6 +85,7 @@ class Sweep:
     costs : (R, C, K or more) differing bits of the census.
     winners : (R, C) levels of the surface of least cost.
     seen : (R, C) mask of the samples whose surface is visible in image 2, and not hidden by another.
+    reliable : (R, C) mask of those `seen` whose surface has contrast, and is no chance.
     """
 
     inverse: FloatArray
@@ -95,6 +96,7 @@ class Sweep:
     costs: NDArray[np.uint8]
     winners: FloatArray
     seen: BoolArray
+    reliable: BoolArray
 
     def nearest(self, pixels1: Pixels) -> tuple[IntArray, IntArray]:
         """Return row and column (...) of the samples nearest to pixels (..., 2), except the last row and column."""
@@ -187,7 +189,8 @@ def fill_by_sweep(
     at = sweep.nearest(grown.pixels1)
     grown = grown.where(grown.valid & (sweep.near_winner(at_nodes, at, measured.slope) | ~good[at]))
     inverse = np.where(good, sweep.inverse[0] + spacing * level, np.nan)[::SAMPLES_A_NODE, ::SAMPLES_A_NODE]
-    return _with_swept_pairs(grown, inverse, residual * spacing, view1, view2, cam2_from_cam1), sweep
+    grown = _with_swept_pairs(grown, inverse, residual * spacing, view1, view2, cam2_from_cam1)
+    return grown, replace(sweep, reliable=good)
 
 
 def _sweep(
@@ -206,7 +209,7 @@ def _sweep(
     shape = int((height - 1) // step) + 1, int((width - 1) // step) + 1
     coarse = [np.arange(0, n + TABLE_SPACING, TABLE_SPACING) * step for n in reversed(shape)]
     rays, seen = view1.camera.unproject(np.stack(np.meshgrid(*coarse), axis=-1))
-    places, valid = view2.camera.project(_directions_in_cam2(rays, levels[:, None, None], cam2_from_cam1))
+    places, valid = view2.camera.project(directions_in_cam2(rays, levels[:, None, None], cam2_from_cam1))
     table = np.where((valid & seen)[..., None], places, np.nan).astype(np.float32)
     fine = np.stack(np.meshgrid(*(step * np.arange(n) for n in reversed(shape))), axis=-1)
     rays1, seen1 = view1.camera.unproject(fine)
@@ -221,10 +224,11 @@ def _sweep(
         costs=swept_costs(_smooth(view2, step), samples1, table, TABLE_SPACING),
         winners=np.full(shape, np.nan),
         seen=np.zeros(shape, dtype=bool),
+        reliable=np.zeros(shape, dtype=bool),
     )
 
 
-def _directions_in_cam2(rays: FloatArray, inverse: FloatArray, cam2_from_cam1: Rigid3) -> FloatArray:
+def directions_in_cam2(rays: FloatArray, inverse: FloatArray, cam2_from_cam1: Rigid3) -> FloatArray:
     """Return the directions, in the frame of camera 2, of points at inverse ranges on rays (..., 3)."""
     return np.asarray(rays @ cam2_from_cam1.rotation.T + inverse[..., None] * cam2_from_cam1.translation_mm)
 
@@ -269,7 +273,7 @@ def _winners(
     level = np.asarray(np.clip(inner + part, 0.0, count - 1.0), np.float64)
     # At the first and last level the surface may be beyond the sweep.
     inside = (best > 0) & (best < count - 1)
-    place, seen = view2.camera.project(_directions_in_cam2(sweep.rays1, sweep.inverse[best], cam2_from_cam1))
+    place, seen = view2.camera.project(directions_in_cam2(sweep.rays1, sweep.inverse[best], cam2_from_cam1))
     inside &= seen
     width, height = view2.size_px
     with np.errstate(invalid="ignore"):

@@ -95,3 +95,37 @@ def rivals(
         if own.any() and other.any() and weights > 0.0:
             out[n] = total[own].min() / weights, total[other].min() / weights
     return out
+
+
+def level_planes(
+    winners: np.ndarray,
+    seen: np.ndarray,
+    brightness: np.ndarray,
+    samples: np.ndarray,
+    *,
+    reach: int,
+    radius: float,
+    alike: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return planes (N, 3), normal matrices (N, 3, 3), and the share of samples that agree and their variance, (N,)."""
+    planes, normals, agree, variance = [], [], [], []
+    for row, column in samples:
+        r, c = np.indices(winners.shape)
+        near = seen & (abs(r - row) <= reach) & (abs(c - column) <= reach)
+        y, x, level = (r - row)[near], (c - column)[near], winners[near]
+        unlike = np.abs(brightness[near] - brightness[row, column]) / alike
+        weight = np.exp(-unlike - 0.5 * (x * x + y * y) / radius**2)
+        X, plane = np.stack([np.ones(len(x)), y, x], axis=1), np.array([winners[row, column], 0.0, 0.0])
+        for loss in (4.0, 2.0, 1.0, 1.0, None):
+            off = level - X @ plane
+            w = weight / (1.0 + (off / (loss or 1.0)) ** 2) ** 2
+            normal = X.T @ (w[:, None] * X) + np.diag([1e-6, 1e-2, 1e-2])
+            if loss is not None:
+                # Relative to the level of the middle, as its slants are pulled to a flat surface.
+                plane = np.linalg.solve(normal, X.T @ (w * (level - winners[row, column])))
+                plane[0] += winners[row, column]
+        planes.append(plane)
+        normals.append(normal)
+        agree.append(w.sum() / weight.sum())
+        variance.append(np.sum(w * off**2) / w.sum())
+    return np.array(planes), np.array(normals), np.array(agree), np.array(variance)

@@ -216,6 +216,7 @@ def test_two_images_that_have_nothing_in_common_show_no_surface(seed: int) -> No
         costs=costs,
         winners=best.astype(np.float64),
         seen=np.ones(shape, dtype=bool),
+        reliable=np.ones(shape, dtype=bool),
     )
     inside = (best > 0) & (best < levels - 1)
     agreed = np.where(np.arange(shape[1]) < 20, sweep.winners, np.nan)

@@ -1,4 +1,4 @@
-"""Holes of a surface take the planes of neighbours, where the pixels agree with them."""
+"""Holes of a surface get planes of the sweep, or those of neighbours that agree with it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from rigkit.affine.features import match_affine_features
 from rigkit.core.arrays import BoolArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.growing import dense as dense_module
-from rigkit.reconstruction.growing import propagate
+from rigkit.reconstruction.growing import fill
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
+from rigkit.reconstruction.growing.surface import GrownSurface
 from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 
@@ -34,7 +35,7 @@ def corner() -> tuple[Corner, DenseScene, DenseScene]:
     whole = grow_scene(sparse, seeds, *images, pose_is_known=True)
 
     def with_holes(*args: Any) -> BoolArray:
-        return np.asarray(propagate.at_best_depth(*args) & ~HOLES)
+        return np.asarray(fill.at_best_depth(*args) & ~HOLES)
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(dense_module, "at_best_depth", with_holes)
@@ -66,20 +67,45 @@ def test_filled_points_have_pairs_normals_and_sigmas_as_others_have(
     assert np.mean(off < 2.0 * r.cloud.sigma_mm[new]) > 0.9
 
 
-def test_nothing_is_filled_where_no_pixels_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    plane, slope = np.full((9, 9, 3), [0.0, 0.0, 0.001]), np.ones((9, 9))
-    around = propagate._neighbours(np.array([40]), (9, 9))
+def test_a_hole_gets_the_plane_of_a_neighbour_only_if_the_sweep_agrees_with_it() -> None:
+    shape = (9, 9)
+    around = fill._neighbours(np.array([40]), shape)
     assert around.shape == (1, 24) and (around >= 0).all()
-    assert (propagate._neighbours(np.array([0]), (9, 9)) < 0).sum() == 15
+    assert (fill._neighbours(np.array([0]), shape) < 0).sum() == 15
+    plane = np.full((*shape, 3), np.nan)
+    plane.reshape(-1, 3)[around[0, :3]] = [[0.0, 0.0, 0.0013], [0.0, 0.0, 0.00102], [0.0, 0.0, 0.00104]]
+    known: dict[str, Any] = dict.fromkeys(("points", "normals", "plane", "covariance", "support"), plane)
+    surface = GrownSurface(**known)
+    ray, slope = np.array([[0.0, 0.0, 1.0]]), np.array([10000.0])
+    swept = fill._SweptPlanes(
+        nodes=np.array([40]),
+        pixels1=np.zeros((1, 2)),
+        rays=ray,
+        plane=0.001 * ray,
+        covariance=np.zeros((1, 3, 3)),
+        slope=slope,
+        agree=np.ones(1),
+    )
+    choice = fill._agreeing_neighbours(surface, swept)
+    assert choice.source.tolist() == [around[0, 1]]
+    # By the one other neighbour that lies within half a pixel of it.
+    np.testing.assert_allclose(choice.scatter, 0.5 * 0.00002**2)
+    apart = fill._agreeing_neighbours(surface, swept._replace(plane=0.0009 * ray))
+    assert apart.source.tolist() == [-1]
 
-    class AllAlike:
-        def cost_over_rivals(self, *_: Any) -> np.ndarray:
-            return np.full(24, 2.0)
 
-    rays, pixels = np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 2))
-    alike: Any = AllAlike()
-    assert propagate._best(alike, pixels, rays, plane, slope, around).source.tolist() == [-1]
-    monkeypatch.setattr(AllAlike, "cost_over_rivals", lambda *_: np.where(np.arange(24) == 7, 0.5, 2.0))
-    best = propagate._best(alike, pixels, rays, plane, slope, around)
-    assert best.source.tolist() == [around[0, 7]]
-    assert best.agree.tolist() == [1.0] and best.scatter.tolist() == [0.0]
+def test_the_sigma_of_the_sweep_comes_from_its_differences_to_patches(rng: np.random.Generator) -> None:
+    count, sigma = 4000, 1e-5
+    rays = np.tile([0.0, 0.0, 1.0], (count, 1))
+    planes = fill._SweptPlanes(
+        nodes=np.arange(count),
+        pixels1=np.zeros((count, 2)),
+        rays=rays,
+        plane=0.001 * rays,
+        covariance=np.tile(sigma**2 * np.eye(3), (count, 1, 1)),
+        slope=np.ones(count),
+        agree=np.ones(count),
+    )
+    of_patches = planes.plane + 3.0 * sigma * rng.normal(size=(count, 3))
+    assert fill._noise_over_scatter(planes, of_patches) == pytest.approx(3.0, rel=0.1)
+    assert fill._noise_over_scatter(planes, planes.plane) == 1.0
