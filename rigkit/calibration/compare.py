@@ -16,6 +16,7 @@ import numpy as np
 from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.certainty.uncertainty import projection_design
 from rigkit.calibration.choosing.between_models import same_model
+from rigkit.calibration.judging.pupil import changes_with
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.clustered import NULL_DRAWS, drawn_errors
 from rigkit.cameras.base import Camera, image_center
@@ -95,7 +96,7 @@ def compare_calibrations(
     The null distribution of the difference is sampled: errors of both calibrations are drawn from their covariances
     (Student's t with their degrees of freedom) and propagated by the projection's derivatives. Models of different kind
     or size differ for one lens, which no covariance includes: that difference is computed by refitting each camera with
-    the model of the other, and added to the null.
+    the model of the other, and added to the null. So is what a central lens would change with the pupil of the other.
     """
     pixels = grid_pixels(a.camera.size_px, grid)
     both = covered_by_boards(a, pixels) & covered_by_boards(b, pixels)
@@ -105,7 +106,7 @@ def compare_calibrations(
     designs = [_design(a, rays), _design(b, rays @ difference.b_from_a.T)]
     # The rotation that the comparison fits, at first order. In two calibrations of one camera both are the same.
     turn = np.linalg.qr(designs[0][:, -3:])[0]
-    by_model = _model_difference(a, b, difference, turn)[:, None]
+    by_model = _model_difference(a, b, difference, turn) + _without(_pupil_difference(a, b, designs), turn)
     p = a.camera.parameters.size
     rng = np.random.default_rng(seed)
     drawn = np.concatenate(
@@ -118,7 +119,7 @@ def compare_calibrations(
     covariance = np.zeros((len(drawn), len(drawn)))
     covariance[:p, :p], covariance[p:-1, p:-1] = a.covariance, b.covariance
     covariance[-1, -1] = 1.0 + REFIT_SIGMA**2
-    columns = [*(design[:, :-3] for design in designs), by_model]
+    columns = [*(design[:, :-3] for design in designs), by_model[:, None]]
     found = _Modes.of(
         _without(difference.difference_px[difference.covered].reshape(-1), turn),
         np.concatenate([_without(column, turn) for column in columns], axis=1),
@@ -238,6 +239,17 @@ def _model_difference(a: Calibration, b: Calibration, difference: CameraDifferen
         # The residual of a model that the other cannot represent is in one of the two refits.
         out += sign * min(tried, key=lambda off: float(off @ off))
     return out
+
+
+def _pupil_difference(a: Calibration, b: Calibration, designs: Sequence[FloatArray]) -> FloatArray:
+    """Return the difference (2 M,) px between a lens with a moving pupil and the central one that was fitted to it near
+    the camera, from the `designs` of both; zero where both or neither have one. Few images do not show a pupil."""
+    for sign, central, other, design in ((1.0, a, b, designs[0]), (-1.0, b, a, designs[1])):
+        if central.pupil is None and other.pupil is not None:
+            changes = changes_with(central, other.pupil)
+            if changes is not None:
+                return np.asarray(sign * design[:, :-3] @ changes)
+    return np.zeros(len(designs[0]))
 
 
 def _design(calibration: Calibration, rays: Rays) -> FloatArray:

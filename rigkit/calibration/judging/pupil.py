@@ -35,6 +35,7 @@ from rigkit.calibration.judging.view_evidence import (
     rows_of,
     without_pose,
 )
+from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.solving.clustered import MIN_LEFT
 from rigkit.core.arrays import FloatArray, IntArray
@@ -139,6 +140,16 @@ class MovingPupil:
             np.append(self.parameter_changes, -far.compensation @ (self.parameter_changes / safe)),
         )
         return float(np.sqrt((moved**2).sum(axis=0).mean()))
+
+
+def changes_with(calibration: Calibration, pupil: SolvedPupil) -> FloatArray | None:
+    """Return the change of a central lens's parameters (P,) if the movement `pupil`, solved for from other images, were
+    modelled; None where its images do not determine it."""
+    found = MovingPupil.of(calibration)
+    if found is None or found.mm_per_rad2 == 0.0:
+        return None
+    *_, rim = _distances_and_rim(calibration)
+    return np.asarray(found.parameter_changes * (pupil.shift_mm(rim)[0] / rim**2 / found.mm_per_rad2))
 
 
 def solved_again(calibration: Calibration) -> MovingPupil | None:

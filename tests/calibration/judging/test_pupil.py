@@ -11,6 +11,7 @@ from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty
+from rigkit.calibration.compare import compare_calibrations
 from rigkit.calibration.judging.changing import changing
 from rigkit.calibration.judging.pupil import BY_CHANCE, MovingPupil, pupil_is_significant, solved_again
 from rigkit.calibration.judging.verdicts import judge
@@ -265,3 +266,13 @@ def test_the_number_of_corners_in_a_block_of_rows_does_not_change_the_pupil(monk
     # Two of the views, of 54 corners each, at once.
     monkeypatch.setattr("rigkit.calibration.judging.view_evidence.CORNERS_AT_ONCE", 120)
     np.testing.assert_array_equal(reported(), whole)
+
+
+def test_a_central_fit_to_a_lens_whose_pupil_moves_is_of_the_same_camera() -> None:
+    """As of few images, which show no pupil: `diff` allows for what a central lens leaves out."""
+    central, moving = session(NEAR, MM_PER_RAD2, 2), session(NEAR, MM_PER_RAD2, 1, pupil="moving")
+    assert compare_calibrations(central, moving).same and compare_calibrations(moving, central).same
+    assert not compare_calibrations(central, replace(moving, pupil=None)).same
+    scale = np.where(np.arange(moving.camera.parameters.size) < 2, 1.02, 1.0)
+    longer = replace(moving, camera=moving.camera.with_parameters(moving.camera.parameters * scale))
+    assert not compare_calibrations(central, longer).same
