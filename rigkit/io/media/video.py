@@ -105,12 +105,12 @@ class Video:
         with quiet_opencv():
             while self.next_number < number:
                 if not self._capture.grab():
-                    self._warn_of_truncation()
+                    self._check_end()
                     return None
                 self.next_number += 1
             well, picture = self._capture.read()
         if not well:
-            self._warn_of_truncation()
+            self._check_end()
             return None
         self.next_number += 1
         # Decoders of sequences keep grey files grey.
@@ -124,11 +124,13 @@ class Video:
         with quiet_opencv():
             while self._capture.grab():
                 self.next_number += 1
-        self._warn_of_truncation()
+        self._check_end()
         return self.next_number - first
 
-    def _warn_of_truncation(self) -> None:
-        """Warn once if the video ends before the announced number of frames."""
+    def _check_end(self) -> None:
+        """Warn once if the video ends before the announced number of frames; raise InputError if it has none."""
+        if self.next_number == 0 and not self.live:
+            raise InputError(f"video '{self.source}' has no frames that can be decoded; record it again")
         if self.next_number < COMPLETE * self.count:
             _log.warning(
                 f"video '{self.source}': {self.next_number} of {self.count} frames can be decoded; it is cut off or "

@@ -59,6 +59,15 @@ def test_sources_that_are_no_videos_are_refused(tmp_path: Path, monkeypatch: pyt
     assert os.environ["OPENCV_FFMPEG_LOGLEVEL"] == "-8"
 
 
+def test_a_video_without_frames_is_named(tmp_path: Path) -> None:
+    """As of a recording that was stopped at once: it opens well."""
+    path = tmp_path / "none.avi"
+    cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (320, 240)).release()
+    for read in (lambda video: video.frame(0), lambda video: video.frame(5), lambda video: video.skip_to_end()):
+        with Video(path) as video, pytest.raises(InputError, match="has no frames that can be decoded"):
+            read(video)
+
+
 def test_hidden_files_of_a_folder_are_no_videos_and_no_images(tmp_path: Path) -> None:
     """A Mac writes ._a.mp4 beside a.mp4 on disks that cannot hold its attributes."""
     for name in ("a.mp4", "._a.mp4", "._cover.jpg"):
