@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FIRST_EDGE_BLUR = 0.8
 FIRST_RADIUS_PX = 8.0
 """Smallest radius of circles in the reduced image of the first fits. With 6 px for 8 px, final centres differ by up to
-0.54 instead of 0.16 sigmas from those fitted in the image itself throughout (RENDERED, ten grids in 3840x2160)."""
+0.54 instead of 0.25 sigmas from those fitted in the image itself throughout (RENDERED, ten grids in 3840x2160)."""
 MIN_SIDE = 3
 """Smallest number of rows and columns: smaller lattices are too often no grids."""
 MIN_CIRCLES = MIN_SIDE**2
