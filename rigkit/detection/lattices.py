@@ -34,7 +34,7 @@ from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyra
 from rigkit.detection.saddles.saddle import Corners, Saddles, each_once, find_corners, joined
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
-from rigkit.detection.subpixel.subpixel import EvidenceScore, refine
+from rigkit.detection.subpixel.subpixel import refine
 from rigkit.detection.subpixel.uniform_blur import LOOKED_AT_PX, with_uniform_blur
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.kernels.front import near_any
@@ -212,7 +212,7 @@ def fit_and_confirm(grey: GreyImage, boards: Sequence[Lattice], criteria: BoardC
 
     Boards with uneven blur are fitted in a resampled part of the image with even blur (`RefinedLattice.picture`).
     """
-    refined = refine(grey, boards, _evidence_score(grey, criteria))
+    refined = refine(grey, boards, _score)
     found = _confirmed_parts(grey, boards, refined, criteria)
     if any(known_median(item.blur_px) <= LOOKED_AT_PX for item in found):
         # Blurred lattices in an image with a sharp board are background.
@@ -223,27 +223,13 @@ def fit_and_confirm(grey: GreyImage, boards: Sequence[Lattice], criteria: BoardC
             continue
         there = [replace(board, pixels=picture.of(board.pixels))]
         room = replace(criteria, sizes=criteria.sizes if len(found) < len(criteria.sizes) else ())
-        again = refine(picture.grey, there, _evidence_score(picture.grey, room), radius_px=picture.radius_px)
+        again = refine(picture.grey, there, _score, radius_px=picture.radius_px)
         found = _with_better(found, [one.out_of(picture) for one in _confirmed_parts(picture.grey, there, again, room)])
     return found
 
 
-def _evidence_score(grey: GreyImage, criteria: BoardCriteria) -> EvidenceScore:
-    """Return the function that scores the evidence for a lattice, given the lattices already fitted (`_accepted`)."""
-    sizes = criteria.sizes
-    every = {frozenset({(c, r), (r, c)}) for c, r in sizes}
-
-    def score(item: RefinedLattice, placed: Sequence[tuple[Lattice, RefinedLattice]]) -> float:
-        own, (columns, rows) = Evidence.of(item).score, item.lattice.size
-        if own <= 0.0 and criteria.has_markers is not None and criteria.has_markers(grey, item.lattice):
-            return np.inf
-        # The fit removes additional rows and columns (`part_of_known_size`), but adds none.
-        if own > 0.0 or not any(columns >= c and rows >= r for both in every for c, r in both):
-            return own
-        sure = sum(is_board(after, before.count, criteria.min_corners) for before, after in placed)
-        return own + OF_EXPECTED_SIZE if sure < len(sizes) else own
-
-    return score
+def _score(item: RefinedLattice) -> float:
+    return Evidence.of(item).score
 
 
 def _with_better(found: list[RefinedLattice], others: Sequence[RefinedLattice]) -> list[RefinedLattice]:
@@ -282,7 +268,7 @@ def _confirmed_parts(
         # The fits of these corners used edges on the other side of the discontinuity: fit them again.
         alone = [part.lattice.trimmed() for part in parts]
         own_parts = [part for part in alone if is_large_enough(part, criteria.min_corners)]
-        out += _confirmed_parts(grey, own_parts, refine(grey, own_parts, _evidence_score(grey, criteria)), criteria)
+        out += _confirmed_parts(grey, own_parts, refine(grey, own_parts, _score), criteria)
     return out
 
 
@@ -351,7 +337,7 @@ def _sample_is_plausible(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
     sample = sample_of(lattice)
     if sample is None:
         return True
-    (refined,) = refine(grey, [sample], _evidence_score(grey, BoardCriteria(0)))
+    (refined,) = refine(grey, [sample], _score)
     if is_board(refined, sample.count, 0):
         return True
     # Of clutter the fit leaves few corners.
@@ -359,5 +345,5 @@ def _sample_is_plausible(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
     if picture is None:
         return False
     there = [replace(sample, pixels=picture.of(sample.pixels))]
-    (again,) = refine(picture.grey, there, _evidence_score(grey, BoardCriteria(0)), radius_px=picture.radius_px)
+    (again,) = refine(picture.grey, there, _score, radius_px=picture.radius_px)
     return is_board(again, sample.count, 0)

@@ -30,9 +30,8 @@ from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import scatter_factors
 
 Part = tuple[slice, slice]
-EvidenceScore = Callable[[RefinedLattice, Sequence[tuple[Lattice, RefinedLattice]]], float]
-"""Returns the evidence score of a fitted lattice, given other lattices before and after their fits: above 0 it may be a
-board."""
+EvidenceScore = Callable[[RefinedLattice], float]
+"""Returns the evidence score of a fitted lattice: above 0 it may be a board."""
 
 FIRST_BLUR = 1.0
 """Initial s of the first pass, px."""
@@ -46,17 +45,17 @@ REACHED = 0.25
 """If blur brings the edges of neighbouring lines into more than this share of a board's windows, all corners are fitted
 once more, which takes a third more time; oblique squares or those at the rim alone do not require it."""
 
-MORE_EVIDENCE = 1.5
-"""Upper bound of the increase of the evidence score of lattices with small squares by further fits: by the second fit
-(measured: 0.13), and by modelling the image beyond the outer squares together with it (0.53 for scores above -3.5; 1.8
-at -4.4, 1.1 below). Of 173 such lattices in REAL images, some of them blurred, boards have 3.7 and more; one sample of
-a board that is found as a whole anyway has -4.6."""
+MORE_EVIDENCE = 5.5
+"""Upper bound of the increase of the evidence score of lattices with small squares: by the second fit (measured: 0.13),
+and by modelling the image beyond the outer squares together with it (0.53 for scores above -3.5; 1.8 at -4.4, 1.1
+below); and by 4 for a size that is expected, or where markers prove a board. Of 173 such lattices in REAL images, some
+of them blurred, boards have 3.7 and more; one sample of a board that is found as a whole anyway has -4.6."""
 
 
 def refine(
     image: GreyImage,
     lattices: Sequence[Lattice],
-    evidence_score: EvidenceScore = lambda *_: np.inf,
+    evidence_score: EvidenceScore = lambda _: np.inf,
     *,
     radius_px: float = LAST_PASS[0],
 ) -> list[RefinedLattice]:
@@ -85,32 +84,24 @@ def refine(
         radius_px=radius_px,
     )
     reached = _reached_by_others(start.known, gaps, blur, stack.parts)
-    unreached = np.flatnonzero(~reached).tolist()
-    if len(unreached) == len(lattices):
-        return sheet.placed(before, (shape.sides, gaps), blur, unreached, aslant=False)
     out = list[RefinedLattice | None](None for _ in lattices)
-    if unreached:
-        mine = sheet.corners_of(unreached)
-        own = mine[start.known]
-        settled = sheet.placed(before.without(~mine), (shape.sides[own], gaps[own]), blur, unreached, aslant=False)
-        for number, item in zip(unreached, settled, strict=True):
-            out[number] = item
-    # For the others the exact position of neighbouring lines, whose edges extend into the windows, matters.
-    close = np.flatnonzero(reached).tolist()
-    theirs = sheet.corners_of(close)
-    their = theirs[start.known]
-    windows = sheet.windows(before.without(~theirs), (shape.sides[their], gaps[their]), blur, aslant=True)
-    placed = [(lattices[k], item) for k, item in enumerate(out) if item is not None]
-    nearer, plausible = _nearer_pass(sheet, windows, close, lambda item: evidence_score(item, placed))
-    for number in close:
-        # Small lattices of background clutter are not fitted again: they would cost as much as the board.
-        out[number] = sheet.cut(nearer, number)
-    if plausible:
-        before = nearer.without(~sheet.corners_of(plausible))
-        blur = _typical_blur(before, [stack.parts[k] for k in plausible])
-        shape = fit_cells(before.lattice.pixels, before.lattice.known)
-        again = sheet.placed(before, (shape.sides, shape.gaps()), blur, plausible, aslant=True)
-        for number, item in zip(plausible, again, strict=True):
+    for close in (False, True):
+        numbers = np.flatnonzero(reached == close).tolist()
+        own = sheet.corners_of(numbers)[start.known]
+        mine, lines, typical = before.without(~sheet.corners_of(numbers)), (shape.sides[own], gaps[own]), blur
+        if close and numbers:
+            # The exact position of neighbouring lines, whose edges extend into the windows, matters.
+            windows = sheet.windows(mine, lines, blur, aslant=True)
+            nearer, plausible = _nearer_pass(sheet, windows, numbers, evidence_score)
+            for number in numbers:
+                # Small lattices of background clutter are not fitted again: they would cost as much as the board.
+                out[number] = sheet.cut(nearer, number)
+            numbers, mine = plausible, nearer.without(~sheet.corners_of(plausible))
+            typical = _typical_blur(mine, [stack.parts[k] for k in numbers])
+            again = fit_cells(mine.lattice.pixels, mine.lattice.known)
+            lines = again.sides, again.gaps()
+        placed = sheet.placed(mine, lines, typical, numbers, aslant=close) if numbers else []
+        for number, item in zip(numbers, placed, strict=True):
             out[number] = item
     return [item for item in out if item is not None]
 
@@ -261,7 +252,7 @@ def _beside_paper(
 
 
 def _nearer_pass(
-    sheet: _Stacked, windows: _Windows, numbers: Sequence[int], evidence_score: Callable[[RefinedLattice], float]
+    sheet: _Stacked, windows: _Windows, numbers: Sequence[int], evidence_score: EvidenceScore
 ) -> tuple[RefinedLattice, list[int]]:
     """Return the fit in the windows of the last pass, without corners that fail, and those of the lattices `numbers`
     with a sufficient `evidence_score`. Only for these the image beyond the boards is modelled."""

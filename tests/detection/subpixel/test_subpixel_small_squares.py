@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
 
 from rigkit.core.arrays import FloatArray
-from rigkit.detection import lattices as lattices_of_images
-from rigkit.detection.checks.evidence import OF_EXPECTED_SIZE, Evidence
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.subpixel import edge_fit, subpixel
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
-from rigkit.detection.subpixel.subpixel import MORE_EVIDENCE, EvidenceScore, refine
+from rigkit.detection.subpixel.subpixel import MORE_EVIDENCE, refine
 
 BLUR_PX, COLUMNS, ROWS = 1.6, 9, 6
 MATRIX = np.array([[1.0, 0.1], [-0.07, 0.96]])
@@ -68,39 +64,17 @@ def test_squares_without_promise_are_fitted_once(
 ) -> None:
     image, large, small = scene
     counts = fits(monkeypatch)
-    asked: list[tuple[int, int]] = []
+    asked: list[int] = []
 
-    def promise(item: RefinedLattice, placed: list[tuple[Lattice, RefinedLattice]]) -> float:
-        asked.append((item.lattice.count, len(placed)))
+    def promise(item: RefinedLattice) -> float:
+        asked.append(item.lattice.count)
         return -1.1 * MORE_EVIDENCE
 
-    refined = refine(image, [large, small], promise)  # type: ignore[arg-type]
+    refined = refine(image, [large, small], promise)
     # The first pass of both; the large squares for the last time, and the small ones, where that is all.
     assert counts[0] == 108 and counts.count(54) == 2
-    assert asked == [(54, 1)]
+    assert asked == [54]
     assert np.linalg.norm(refined[1].lattice.pixels - small.pixels, axis=-1).max() < 0.5
     counts.clear()
     refine(image, [large, small])
     assert counts.count(54) == 3
-
-
-def test_a_board_that_is_expected_promises_more_until_there_is_one(scene: tuple[np.ndarray, Lattice, Lattice]) -> None:
-    image, large, _ = scene
-    (sure,) = refine(image, [large])
-    assert Evidence.of(sure).score > 0.0
-    doubtful = replace(sure, blur_px=20.0 * sure.blur_px)
-    own = Evidence.of(doubtful).score
-    assert own < 0.0
-
-    def promised(sizes: list[tuple[int, int]]) -> EvidenceScore:
-        return lattices_of_images._evidence_score(image, lattices_of_images.BoardCriteria(12, sizes))
-
-    promise = promised([(ROWS, COLUMNS)])
-    assert promise(doubtful, []) == own + OF_EXPECTED_SIZE
-    assert promise(doubtful, [(large, sure)]) == own
-    assert promise(sure, []) == Evidence.of(sure).score
-    # What has more rows may lose them; a row that is not there is not found.
-    shorter = doubtful.cut(slice(0, ROWS - 1), slice(0, COLUMNS))
-    assert promise(shorter, []) == Evidence.of(shorter).score
-    assert promised([(ROWS - 1, COLUMNS)])(doubtful, []) == own + OF_EXPECTED_SIZE
-    assert promised([])(doubtful, []) == own
