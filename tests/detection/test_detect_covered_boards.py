@@ -8,7 +8,7 @@ from itertools import product
 import cv2
 import numpy as np
 import pytest
-from detection_bench.scenes import one_board
+from detection_bench.scenes import covered_board, one_board
 from measure_covers import Score, cover, laid_over, scored
 
 from rigkit.core.boards import Board
@@ -70,6 +70,23 @@ def test_strips_of_a_board_on_both_sides_of_an_arm_are_known_by_their_markers(se
     # Two corners are partly under the arm.
     assert np.sort(off)[-3] < 0.03
     assert off.max() < 1.0
+
+
+def test_parts_of_a_board_beside_a_wide_ruler_in_a_fisheye_are_joined() -> None:
+    """Their nearest cells differ in size and shape."""
+    rng = np.random.default_rng(1)
+    scene = covered_board(rng, lens="fisheye")
+    (ruler,), (truth,) = scene.occluders, scene.truth()
+    wide = replace(scene, occluders=(replace(ruler, height_mm=1.5 * 30.0),))
+    (found,) = detect_boards(np.asarray(wide.render(noise_levels=2.0, rng=rng), np.uint8))
+    assert (found.columns, found.rows) == (10, 10) and len(found.grid) > 60
+
+    def nearest(pixels: np.ndarray) -> tuple[np.ndarray, float]:
+        off = np.linalg.norm(pixels[:, None] - truth.pixels, axis=2)
+        return truth.grid[off.argmin(axis=1)], float(off.min(axis=1).max())
+
+    assert nearest(found.pixels)[1] < 0.2
+    assert any(np.array_equal(one.grid, nearest(one.pixels)[0]) for one in map(found.turned, range(4)))
 
 
 @pytest.mark.parametrize(("seed", "lens"), [(7, "regular"), (0, "fisheye")])

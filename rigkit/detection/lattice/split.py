@@ -49,9 +49,6 @@ JOIN_REACH = 3.3
 NEAREST_IN, NEAREST_OUT = 16, 6
 """Corners of one part that extrapolate its grid, and of the other part that must agree."""
 
-ALIKE = 0.5
-"""Largest difference of the sides of neighbouring cells across the gap, relative to the longer side."""
-
 MEETS_CELLS, MEETS_AT_ALL = 0.15, 0.42
 """Largest distances, in cells, between corners of the other part and their predictions by a homography of the first. Up
 to the smaller one the parts agree; up to the larger one, due to lens distortion, `_agree` decides."""
@@ -204,10 +201,6 @@ def join_parts(lattices: Sequence[Lattice]) -> list[Lattice]:
     return [part.lattice for part in parts]
 
 
-_Cell = Sequence[Sequence[float]]
-"""The sides of a cell along its row and its column, (u, v) px each."""
-
-
 @dataclass(frozen=True, eq=False)
 class _LatticePart:
     """A lattice with its corners (N, 2), their (column, row), bounding box, and longest side of a cell."""
@@ -249,10 +242,8 @@ def _joined(one: _LatticePart, two: _LatticePart) -> Lattice | None:
     """Return both lattices joined, None if `two` does not continue `one`."""
     squared = _squared_gaps(one, two)
     nearest = divmod(int(squared.argmin()), len(two.pixels))
-    separation = math.sqrt(squared[nearest])
-    cell = one.cells[nearest[0]].tolist()
-    longest = max(math.hypot(*side) for side in cell)
-    if not separation < JOIN_REACH * longest or not _alike(cell, two.cells[nearest[1]].tolist()):
+    longest = max(math.hypot(*side) for side in one.cells[nearest[0]].tolist())
+    if not math.sqrt(squared[nearest]) < JOIN_REACH * longest:
         return None
     near, place = _carried_over(one, two, squared)
     whole = np.rint(place)
@@ -321,17 +312,6 @@ def _carried_over(one: _LatticePart, two: _LatticePart, squared: FloatArray) -> 
     if grid_from_pixel is None:
         return near2, np.full((len(near2), 2), np.inf)
     return near2, cv2.perspectiveTransform(two.pixels[near2][None], grid_from_pixel)[0]
-
-
-def _alike(one: _Cell, two: _Cell) -> bool:
-    """Return whether the cell `two` is similar to `one` after some quarter turn."""
-    most = ALIKE * max(abs(x) for side in one for x in side)
-    (u1, v1), (u2, v2) = two
-    for _ in range(4):
-        if all(abs(x - y) < most for x, y in zip((*one[0], *one[1]), (u1, v1, u2, v2), strict=True)):
-            return True
-        u1, v1, u2, v2 = u2, v2, -u1, -v1
-    return False
 
 
 def _facing(one: Lattice, two: Lattice, steps: int, shape: int = cv2.MORPH_CROSS) -> int:
