@@ -197,6 +197,15 @@ def test_grey_values_of_sixteen_bit_images_reach_the_markers() -> None:
     assert found.board_id == "c"
 
 
+def test_a_board_of_two_rows_of_corners_is_found_by_the_outlines_of_its_markers() -> None:
+    """Two rows are no lattice that is searched for."""
+    rng = np.random.default_rng(0)
+    scene = one_board(rng, board=replace(BOARD, columns=7, rows=2), square_px=45.0)
+    (found,) = detect_boards(scene.render(supersample=2, noise_levels=2.0, rng=rng), [scene.boards[0].board])
+    assert found.board_id == "c" and found.complete
+    assert np.abs(errors_by_place(found, scene.truth()[0])).max() < 0.1
+
+
 def test_one_misread_marker_costs_nothing(rng: np.random.Generator) -> None:
     """OpenCV gives up a board for one marker in a wrong place."""
     scene = one_board(rng, board=BOARD)
