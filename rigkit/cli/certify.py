@@ -1,6 +1,6 @@
 """`rigkit certify`: bound the error of a length, depth, plane or angle measured with a calibration or rig.
 
-Exit code 1 where the bound exceeds --limit, or the calibration's verdict is bad.
+Exit code 1 where the bound exceeds --limit or none is certified, or the calibration's verdict is bad.
 
 examples:
   rigkit certify rig.json --length 800 --distance 1500 -r certificate.html
