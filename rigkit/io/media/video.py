@@ -130,7 +130,7 @@ class Video:
     def _check_end(self) -> None:
         """Warn once if the video ends before the announced number of frames; raise InputError if it has none."""
         if self.next_number == 0 and not self.live:
-            raise InputError(f"video '{self.source}' has no frames that can be decoded; record it again")
+            raise InputError(f"video '{self.source}' has no frames that can be decoded; copy it again, or record anew")
         if self.next_number < COMPLETE * self.count:
             _log.warning(
                 f"video '{self.source}': {self.next_number} of {self.count} frames can be decoded; it is cut off or "
