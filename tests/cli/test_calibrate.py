@@ -25,6 +25,7 @@ from rigkit.io.calibrations.calibration_file import load_calibration
 from rigkit.io.corners.corner_cache import CornerCache, FoundCorners
 from rigkit.io.disk import writing
 from rigkit.io.manifests.session import load_session
+from rigkit.planning.plan import plan_views
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import place_board, sees_paper
@@ -63,7 +64,7 @@ def session(halves: Path, tmp_path: Path) -> Path:
 
 
 def test_from_images_to_file_and_again_without_images(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with patch.object(next_pictures, "plan_views", wraps=next_pictures.plan_views) as planned:
+    with patch.object(next_pictures, "plan_views", wraps=plan_views) as planned:
         assert main(["calibrate", str(session), "--json", "--report"]) == 0
     assert planned.call_count == 1  # For the page and the JSON.
     reported = json.loads(capsys.readouterr().out)
