@@ -84,8 +84,9 @@ def frames_of_videos(
         return kept
     with _opened(sources, timestamps) as (videos, moments):
         live = any(video.live for video in videos.values())
-        _claim_folder(folder, sources, live)
+        _require_own_folder(folder, live)
         chosen, shots = _chosen_moments(sources, videos, moments, boards, max_frames, progress)
+    _claim_folder(folder, sources, live)
     images: dict[str, tuple[Path, ...]] = dict.fromkeys(sources, ())
     for number, pictures in shots.items() if live else moments_of_videos(sources, list(chosen), timestamps):
         for name in chosen[number].views:
@@ -257,21 +258,23 @@ def _request(
     }
 
 
-def _claim_folder(folder: Path, sources: Iterable[str], live: bool) -> None:
-    """Mark the folder as one of frames of videos, which can be taken again, unlike those of a `live` camera.
-
-    Raises InputError if it holds anything else.
-    """
+def _require_own_folder(folder: Path, live: bool) -> None:
+    """Raise InputError if the folder cannot be written, or holds anything but frames of videos, which can be taken
+    again, unlike those of a `live` camera."""
     ensure_folder_writable(folder)
     own = (folder / RECORD).is_file()
     if folder.is_dir() and any(folder.iterdir()) and (live or not own):
         what = "frames of videos" if own else "other files than frames kept of a video"
         raise InputError(f"'{folder}' holds {what}, which stay as they are; rename or remove that folder")
-    # Those of an earlier choice would be taken for images of this one.
+
+
+def _claim_folder(folder: Path, sources: Iterable[str], live: bool) -> None:
+    """Mark the folder as one of frames of videos, still without any, and remove the frames of an earlier choice, which
+    would be taken for images of this one."""
+    if not live:
+        write_atomic(folder / RECORD, json.dumps({"schema": FRAMES_SCHEMA, "asked": None}) + "\n", force=True)
     for earlier in (path for name in sources for path in (folder / name).glob("[0-9]" * 6 + ".png")):
         earlier.unlink()
-    if not own and not live:
-        write_atomic(folder / RECORD, json.dumps({"schema": FRAMES_SCHEMA, "asked": None}) + "\n")
 
 
 def _kept_before(folder: Path, asked: Mapping[str, object]) -> dict[str, tuple[Path, ...]] | None:

@@ -18,12 +18,14 @@ from rigkit.core.errors import InputError
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
+from rigkit.io.disk.writing import write_atomic
 from rigkit.io.media.images import read_image
 from rigkit.synthetic.photometry import Photometry, develop
 from rigkit.synthetic.render import Optics, radiance
 from rigkit.synthetic.scene import PlacedBoard
 from rigkit.workflows.calibration.calibrate_any import calibrate_folders
 from rigkit.workflows.detect import detect_in_images
+from rigkit.workflows.inputs import frames
 from rigkit.workflows.inputs.folder_session import boards_seen
 from rigkit.workflows.inputs.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
 from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos
@@ -176,3 +178,34 @@ def test_frames_of_an_earlier_choice_are_removed(tmp_path: Path) -> None:
     again = frames_of_videos({"": video(tmp_path / "a.avi", shots[:1])}, tmp_path / "out", [BOARD])
     assert len(first[""]) == 2 and again[""] == first[""][:1]
     assert sorted((tmp_path / "out").glob("*.png")) == list(again[""])
+
+
+def test_frames_stay_where_another_board_is_in_no_frame(tmp_path: Path) -> None:
+    """A board declared in error leaves the images of an earlier calibration, and no folder where there was none."""
+    path = video(tmp_path / "a.avi", [picture((0.0, 0.3 * k, 0.0), 0.0, board=MARKED) for k in range(2)])
+    kept = frames_of_videos({"": path}, tmp_path / "out", [MARKED])
+    other = replace(MARKED, pattern=Charuco("DICT_4X4_50", 19.5, inverted=True))
+    for folder in ("out", "new"):
+        with pytest.raises(InputError, match="no board in 2 frames"):
+            frames_of_videos({"": path}, tmp_path / folder, [other])
+    assert all(path.is_file() for path in kept[""])
+    assert not (tmp_path / "new").exists()
+
+
+def test_frames_of_an_interrupted_choice_are_not_taken_for_those_of_an_earlier_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shots = [picture((0.0, 0.3 * k, 0.0), 0.0) for k in range(2)]
+    paths = [video(tmp_path / name, own) for name, own in (("a.avi", shots), ("b.avi", shots[::-1]))]
+    first = [read_image(path) for path in frames_of_videos({"": paths[0]}, tmp_path / "out", [BOARD])[""]]
+
+    def written(path: Path, data: str | bytes, *, force: bool) -> None:
+        if path.suffix == ".json" and "b.avi" in str(data):
+            raise KeyboardInterrupt
+        write_atomic(path, data, force=force)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(frames, "write_atomic", written)
+        frames_of_videos({"": paths[1]}, tmp_path / "out", [BOARD])
+    again = [read_image(path) for path in frames_of_videos({"": paths[0]}, tmp_path / "out", [BOARD])[""]]
+    assert np.array_equal(again, first)
