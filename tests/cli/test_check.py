@@ -363,3 +363,10 @@ def test_a_board_is_known_by_whatever_name_and_way_up(caplog: pytest.LogCaptureF
         (board,) = _replaced_by_known([board_of_words(words)], known)
         assert board.board_id == board_of_words(words).board_id
         assert f"board '{board.board_id}' is not one of the calibration" in caplog.text
+
+
+@pytest.mark.parametrize("made", [None, {"inputs": None}, ["2 images"]])
+def test_a_provenance_written_by_hand_does_not_end_the_check(home: Path, tmp_path: Path, made: object) -> None:
+    stored = json.loads((home / "cam.json").read_text(encoding="utf-8")) | {"made": made}
+    (tmp_path / "cam.json").write_text(json.dumps(stored), encoding="utf-8")
+    assert main(["check", str(tmp_path / "cam.json"), str(home / "same" / "0.png")]) == 0

@@ -36,7 +36,7 @@ from rigkit.io.calibrations.calibration_file import (
 from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, ensure_register, path_from_register
 from rigkit.io.calibrations.rig_file import is_rig_file, load_saved_rig
 from rigkit.io.disk.json_reader import json_text
-from rigkit.io.disk.reading import about
+from rigkit.io.disk.reading import about, read_text
 from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.media.images import read_image_of
 from rigkit.report.pages.check_page import check_facts, check_page
@@ -126,7 +126,9 @@ def check_pictures(
 
 def _refuse_own_images(source: Path, frames: Sequence[Sequence[Path]]) -> None:
     """Raise InputError for the images, all of one camera, that the calibration in `source` was made from."""
-    known = json.loads(source.read_text(encoding="utf-8")).get("made", {}).get("inputs", {}).values()
+    made = json.loads(read_text(source)).get("made")
+    inputs = made.get("inputs") if isinstance(made, dict) else None
+    known = list(inputs.values()) if isinstance(inputs, dict) else []
     for camera in zip(*frames, strict=True):
         if _digest_alone(camera) in known:
             raise InputError(
