@@ -67,12 +67,12 @@ def calibrate_options(args: argparse.Namespace) -> CalibrateOptions:
 
 
 def _output(path: Path | None) -> Path | None:
-    """Return the file to write, with the suffix .json if it has none; raises InputError for a folder."""
+    """Return the file to write, a new one without suffix with .json; raises InputError for a folder."""
     if path is None:
         return None
     if path.is_dir():
         raise InputError(f"calibrate: -o '{path}' is a folder; give a file, such as '{path / 'calibration.json'}'")
-    return path if path.suffix else path.with_name(f"{path.name}.json")
+    return path if path.suffix or path.exists() else path.with_name(f"{path.name}.json")
 
 
 def folder_options(args: argparse.Namespace) -> FolderOptions:

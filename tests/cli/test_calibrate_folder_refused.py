@@ -47,3 +47,13 @@ def test_images_instead_of_their_folder(
 def test_a_folder_to_write_is_refused(pictures: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["calibrate", str(pictures), "--board", "9x6x30", "-o", str(pictures)]) == 2
     assert capsys.readouterr().err.endswith(f"give a file, such as '{pictures / 'calibration.json'}'\n")
+
+
+def test_a_file_without_suffix_that_exists_is_not_another_name(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Such as /dev/null, beside which nothing is to be written."""
+    there = tmp_path / "there"
+    there.touch()
+    assert main(["calibrate", str(pictures), "--board", "9x6x30", "-o", str(there)]) == 2
+    assert f"'{there}' exists and is left as it is" in capsys.readouterr().err
