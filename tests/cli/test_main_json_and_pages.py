@@ -57,8 +57,9 @@ def test_a_rig(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_diff_certify_check_and_plan(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     known = str(calibrated / "calibration.json")
     images = [str(path) for path in sorted(calibrated.glob("*.JPG"))[:2]]
-    assert main(["check", known, str(calibrated)]) == 2
-    assert "was made from these very images" in capsys.readouterr().err
+    for given in ([str(calibrated)], [str(path) for path in sorted(calibrated.glob("*.JPG"), reverse=True)]):
+        assert main(["check", known, *given]) == 2
+        assert "was made from these very images" in capsys.readouterr().err
     commands = {
         "diff": ["diff", known, known],
         "certify": ["certify", known, "--length", "50", "--distance", "400"],

@@ -125,12 +125,12 @@ def check_pictures(
 
 
 def _refuse_own_images(source: Path, frames: Sequence[Sequence[Path]]) -> None:
-    """Raise InputError for the images, all of one camera, that the calibration in `source` was made from."""
+    """Raise InputError for all images of a camera, in any order, from which the calibration in `source` was made."""
     made = json.loads(read_text(source)).get("made")
     inputs = made.get("inputs") if isinstance(made, dict) else None
     known = list(inputs.values()) if isinstance(inputs, dict) else []
     for camera in zip(*frames, strict=True):
-        if _digest_alone(camera) in known:
+        if _digest_alone(sorted(camera)) in known:
             raise InputError(
                 f"check: '{source}' was made from these very images, which fit it even if the camera has changed; "
                 "give new ones"
