@@ -64,8 +64,8 @@ def fill_holes(
     compared = np.flatnonzero(there & surface.valid)[::COMPARED_EVERY]
     holes = np.flatnonzero(there & ~surface.valid)
     both = _swept_planes(np.concatenate([compared, holes]), grown.step, sweep, view1, view2, cam2_from_cam1)
-    scale = _noise_over_scatter(both.select(np.arange(len(compared))), surface.plane.reshape(-1, 3)[compared])
-    planes = both.select(np.arange(len(compared), len(both.nodes)))
+    scale = _noise_over_scatter(both, surface.plane.reshape(-1, 3)[both.nodes])
+    planes = both.select(np.flatnonzero(~surface.valid.ravel()[both.nodes]))
     good = sweep.cost_over_rivals(planes.pixels1, planes.plane, planes.slope) < planes.agree
     planes = planes.select(np.flatnonzero(good))
     covariance = scale**2 * planes.covariance
@@ -143,11 +143,11 @@ def _swept_planes(
 def _noise_over_scatter(planes: _SweptPlanes, of_patches: FloatArray) -> float:
     """Return the noise of the ranges of planes, by planes (N, 3) of patches, over that of independent samples.
 
-    Samples are not independent: they share pixels and paths.
+    Samples are not independent: they share pixels and paths. Planes of patches are NaN in holes.
     """
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", planes.rays, planes.covariance, planes.rays))
     off = np.abs(np.sum((planes.plane - of_patches) * planes.rays, axis=1))
-    known = sigma > 0.0
+    known = (sigma > 0.0) & np.isfinite(off)
     return max(SIGMA_OF_MEDIAN * float(np.median(off[known] / sigma[known])), 1.0) if known.any() else 1.0
 
 

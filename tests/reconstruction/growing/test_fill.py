@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from helpers.textured_scene import CAM2_FROM_CAM1, SMALL_LENSES, Corner
 from rigkit.affine.features import match_affine_features
 from rigkit.core.arrays import BoolArray
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.kernels.sweep import LevelPlanes, fitted_level_planes
 from rigkit.reconstruction.growing import dense as dense_module
 from rigkit.reconstruction.growing import fill
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
@@ -23,23 +26,30 @@ HOLES = np.zeros((80, 107), dtype=bool)
 HOLES[8:-8:14, 8:-8:14] = HOLES[9:-7:14, 8:-8:14] = HOLES[9:-7:14, 9:-7:14] = True
 
 
-@pytest.fixture(scope="module")
-def corner() -> tuple[Corner, DenseScene, DenseScene]:
-    """A corner of a room as it is reconstructed, and with planes taken away."""
+@cache
+def grown() -> Callable[[], DenseScene]:
+    """A corner of a room, as a function that reconstructs it."""
     rng = np.random.default_rng(5)
     room = Corner.of_a_room()
     images = [np.asarray(room.image(CAMERA, pose, rng)) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)]
     seeds = match_affine_features(*images)
     length, known = float(np.linalg.norm(CAM2_FROM_CAM1.translation_mm)), KnownPose(CAM2_FROM_CAM1)
     sparse = reconstruct_scene(seeds, CAMERA, CAMERA, baseline_mm=length, known_pose=known, image1=images[0])
-    whole = grow_scene(sparse, seeds, *images, pose_is_known=True)
+    return lambda: grow_scene(sparse, seeds, *images, pose_is_known=True)
 
-    def with_holes(*args: Any) -> BoolArray:
-        return np.asarray(fill.at_best_depth(*args) & ~HOLES)
 
+def with_holes(*args: Any) -> BoolArray:
+    """Planes that fit best, without those of the nodes HOLES."""
+    return np.asarray(fill.at_best_depth(*args) & ~HOLES)
+
+
+@pytest.fixture(scope="module")
+def corner() -> tuple[Corner, DenseScene, DenseScene]:
+    """A corner of a room as it is reconstructed, and with planes taken away."""
     with pytest.MonkeyPatch.context() as patched:
+        whole = grown()()
         patched.setattr(dense_module, "at_best_depth", with_holes)
-        return room, whole, grow_scene(sparse, seeds, *images, pose_is_known=True)
+        return Corner.of_a_room(), whole, grown()()
 
 
 def test_holes_are_filled_with_the_true_surface(corner: tuple[Corner, DenseScene, DenseScene]) -> None:
@@ -65,6 +75,24 @@ def test_filled_points_have_pairs_normals_and_sigmas_as_others_have(
     assert (np.sum(r.cloud.normals * r.cloud.points_mm, axis=1) < 0.0).all()
     off = np.abs((r.cloud.points_mm - room.apex_mm) @ room.axes).min(axis=1)[new]
     assert np.mean(off < 2.0 * r.cloud.sigma_mm[new]) > 0.9
+
+
+def test_a_plane_of_the_sweep_behind_the_camera_leaves_the_others_as_they_are(
+    corner: tuple[Corner, DenseScene, DenseScene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, _, filled = corner
+
+    def first_behind(*args: Any, **rules: Any) -> LevelPlanes:
+        fits = fitted_level_planes(*args, **rules)
+        fits.planes[0, 0] = -1e6
+        return fits
+
+    monkeypatch.setattr(dense_module, "at_best_depth", with_holes)
+    monkeypatch.setattr(fill, "fitted_level_planes", first_behind)
+    again = grown()()
+    np.testing.assert_array_equal(again.nodes, filled.nodes)
+    sigma, before = (d.scene.reconstruction.cloud.sigma_mm for d in (again, filled))
+    np.testing.assert_allclose(sigma, before, rtol=0.01)
 
 
 def test_a_hole_gets_the_plane_of_a_neighbour_only_if_the_sweep_agrees_with_it() -> None:
