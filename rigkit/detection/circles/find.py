@@ -145,6 +145,11 @@ def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool) 
     if not _enough(draft):
         return None
     evidence = _evidence(draft)
+    if scale > 1 and not (evidence.convincing or quick or draft.mixed):
+        # Sizes of much blurred circles are not yet those of the image itself.
+        again = _again(grey, draft)
+        if _enough(again):
+            draft, evidence = again, _evidence(again)
     if evidence.convincing and not quick:
         draft = _through_its_blur(grey, draft)
     return _finished(draft, evidence, (grey.shape[1], grey.shape[0]))

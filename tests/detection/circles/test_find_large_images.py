@@ -56,3 +56,13 @@ def test_a_board_that_is_not_seen_whole_is_searched_for_on_all_levels(monkeypatc
     coarse = looks_coarse(monkeypatch)
     (found,) = detect_boards(image, [board])
     assert coarse == [True, False] and len(found.grid) >= 75
+
+
+def test_large_circles_with_much_blur_are_found() -> None:
+    """Their sizes from the reduced image need two fits in the image itself."""
+    board = Board("b", 10, 8, 25.0, 25.0, pattern=Circles(diameter_mm=21.0))
+    rng = np.random.default_rng(101)
+    scene = one_board(rng, board=board, size_px=(1280, 960), square_px=40.0 / 0.84, max_tilt_deg=35.0)
+    image = scene.render(blur_px=6.0, noise_levels=2.0, rng=np.random.default_rng(1), supersample=1)
+    (found,) = detect_boards(image, [board])
+    assert found.complete
