@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from rigkit.detection.circles.lattices import LabelledBlobs
 
 FIRST_EDGE_BLUR = 0.8
-FIRST_RADIUS_PX = 8.0
-"""Smallest radius of circles in the reduced image of the first fits. With 6 px for 8 px, final centres differ by up to
-0.54 instead of 0.25 sigmas from those fitted in the image itself throughout (RENDERED, ten grids in 3840x2160)."""
 MIN_SIDE = 3
 """Smallest number of rows and columns: smaller lattices are too often no grids."""
 MIN_CIRCLES = MIN_SIDE**2
@@ -131,15 +128,13 @@ class _Draft:
 
 def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool) -> CircleGrid | None:
     """Return the grid of the `blobs` of a lattice, or None. Large circles are found in a smaller image."""
-    scale = _reduction(blobs)
+    scale = blobs.reduction()
     small = reduced(grey, scale)
     draft = _first(small, blobs.reduced(scale), found)
     for step in () if quick else (_again, _with_all):
         if _enough(draft):
             draft = step(small, draft)
-    draft = draft.enlarged(scale)
-    if _enough(draft) and not quick:
-        draft = _again(grey, draft)
+    draft = draft.enlarged(scale) if quick else _in_the_image(grey, draft, scale)
     if not (_enough(draft) or quick):
         draft = _mixed(grey, _first(grey, blobs, found, beside=True))
     if not _enough(draft):
@@ -155,9 +150,17 @@ def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool) 
     return _finished(draft, evidence, (grey.shape[1], grey.shape[0]))
 
 
-def _reduction(blobs: Blobs) -> int:
-    """Return by which power of two an image is reduced for the first fits of circles."""
-    return int(2 ** max(0.0, np.floor(np.log2(np.median(blobs.radius_px()) / FIRST_RADIUS_PX))))
+def _in_the_image(grey: GreyImage, draft: _Draft, scale: int) -> _Draft:
+    """Return the draft of an image reduced by `scale` fitted in `grey`, and before that in images of sizes between.
+
+    Each fit has its maps from the last centres; with those of a much smaller image, slants scatter by up to five times
+    as much (RENDERED, circles of 200 px), and with them the stated sigmas.
+    """
+    if not _enough(draft):
+        return draft
+    finer = max(scale // 2, 1)
+    draft = _again(reduced(grey, finer), draft.enlarged(scale // finer))
+    return draft if finer == 1 else _in_the_image(grey, draft, finer)
 
 
 def _first(grey: GreyImage, own: Blobs, found: LabelledBlobs, *, beside: bool = False) -> _Draft:

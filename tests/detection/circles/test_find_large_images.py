@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from detection_bench.scenes import one_board
+from detection_bench.scenes import BenchScene, one_board
 
+from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.circles.blobs import Blobs, find_blobs
 from rigkit.detection.detect import detect_boards
@@ -30,6 +32,12 @@ def looks_coarse(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     return said
 
 
+def errors(found: BoardDetection, scene: BenchScene) -> FloatArray:
+    """Return the errors (N, 2) of the centres of the only board, px."""
+    truth = scene.truth()[0].pixels
+    return np.asarray(found.pixels - truth[np.linalg.norm(found.pixels[:, None] - truth, axis=2).argmin(axis=1)])
+
+
 @pytest.mark.parametrize("square_px", [66.0, 10.0])
 def test_circles_of_any_size_are_found_whole_and_accurately(monkeypatch: pytest.MonkeyPatch, square_px: float) -> None:
     """The search of a quarter of the pixels has all circles of 40 px; those of 6 px need the other."""
@@ -41,8 +49,7 @@ def test_circles_of_any_size_are_found_whole_and_accurately(monkeypatch: pytest.
     (found,) = detect_boards(image, [board])
     assert found.board_id == "b" and found.complete
     assert coarse == ([True] if square_px > 20.0 else [True, False])
-    truth = scene.truth()[0].pixels
-    off = found.pixels - truth[np.linalg.norm(found.pixels[:, None] - truth, axis=2).argmin(axis=1)]
+    off = errors(found, scene)
     assert np.sqrt((off**2).sum(axis=1).mean()) < ACCURATE_PX
     assert HONEST[0] < np.sqrt(((off / found.sigma_px[:, None]) ** 2).mean()) < HONEST[1]
 
@@ -66,3 +73,12 @@ def test_large_circles_with_much_blur_are_found() -> None:
     image = scene.render(blur_px=6.0, noise_levels=2.0, rng=np.random.default_rng(1), supersample=1)
     (found,) = detect_boards(image, [board])
     assert found.complete
+
+
+def test_sigmas_of_circles_first_found_in_a_much_smaller_image_are_those_of_the_image_itself() -> None:
+    """Circles of 90 px are first found in an image of a sixteenth of the pixels."""
+    board = Board("b", 8, 6, 25.0, 25.0, pattern=Circles(diameter_mm=15.0))
+    rng = np.random.default_rng(4)
+    scene = one_board(rng, board=board, size_px=SIZE_PX, square_px=150.0, max_tilt_deg=20.0)
+    (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng, supersample=3), [board])
+    assert HONEST[0] < np.sqrt(((errors(found, scene) / found.sigma_px[:, None]) ** 2).mean()) < HONEST[1]
