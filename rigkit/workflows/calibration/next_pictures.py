@@ -20,13 +20,15 @@ from rigkit.planning.goal import Goal, projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.planning.rig_goal import rig_goal
+from rigkit.validation.certificate.certify import MAP_CELLS
 from rigkit.validation.certificate.propagation import gradients, measured_points
 from rigkit.validation.monitoring.evidence import Monitored
 from rigkit.validation.monitoring.frames import Frames
 
 NEXT_VIEWS = 3
 TASK_CELLS = (13, 10)
-"""Columns and rows of the places at which a length is measured."""
+"""Columns and rows of the places at which a length is measured; a length that is in view at none of them is measured at
+those of a certificate."""
 
 
 def next_views(
@@ -89,8 +91,11 @@ def length_goal(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], task:
     is_rig = len(cameras) > 1
     if not is_rig and task.quantity is not Quantity.LENGTH:
         raise InputError(f"plan: one camera measures no {task.quantity}; give a length at a distance")
-    rays, valid = cameras[0].unproject(grid_pixels(cameras[0].size_px, TASK_CELLS).reshape(-1, 2))
-    _, by_calibration, _, seen = gradients(cameras, cam_from_rig, *measured_points(rays[valid], task, is_rig))
+    for cells in (TASK_CELLS, MAP_CELLS):
+        rays, valid = cameras[0].unproject(grid_pixels(cameras[0].size_px, cells).reshape(-1, 2))
+        _, by_calibration, _, seen = gradients(cameras, cam_from_rig, *measured_points(rays[valid], task, is_rig))
+        if seen.any():
+            break
     if not seen.any():
         raise DegenerateError(
             f"nowhere is a length of {task.size_mm:g} mm at {task.distance_mm:g} mm in view; give a shorter "

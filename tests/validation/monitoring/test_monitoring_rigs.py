@@ -31,7 +31,7 @@ from rigkit.validation.monitoring.epipolar import (
 )
 from rigkit.validation.monitoring.evidence import FreshEvidence, FreshView, Monitored
 from rigkit.validation.monitoring.judge import ALARM_PX, CalibrationCheck, check_views, evaluate_evidence
-from rigkit.workflows.calibration.next_pictures import TASK_CELLS, length_goals
+from rigkit.workflows.calibration.next_pictures import TASK_CELLS, length_goal, length_goals
 
 MATCH_NOISE_PX, FINE_MATCH_NOISE_PX = 0.3, 0.07
 
@@ -216,6 +216,14 @@ def test_what_a_change_of_a_rig_costs_in_a_length(turn: float) -> None:
     far = Task(quantity=Quantity.LENGTH, size_mm=90000.0, distance_mm=700.0)
     with pytest.raises(DegenerateError, match="of no two cameras"):
         length_goals(monitored.cameras, monitored.cam_from_rig, far)
+
+
+def test_a_length_that_fits_only_through_the_centre_of_the_image_is_in_view() -> None:
+    """The grid of lengths has no row through the centre, that of certificates has one."""
+    camera = Brown((640, 480), np.array([500.0, 500.0, 319.5, 239.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    # 475 of the 480 rows.
+    task = Task(quantity=Quantity.LENGTH, size_mm=570.0, distance_mm=600.0)
+    assert length_goal((camera,), (Rigid3.identity(),), task).unit == "mm"
 
 
 def test_calibration_uncertainty_raises_no_alarm() -> None:
