@@ -4,6 +4,7 @@ examples:
   rigkit export calibration.json -o camera.yaml --to opencv
   rigkit export rig.json -o camchain.yaml --to kalibr
   rigkit export rig.json -o rig --to ros --names left right
+  rigkit export rig.json -o left.txt --to ocamcalib --names left      one camera of a rig
   rigkit export camchain.yaml -o camera.json --to rigkit      import the file of another tool
   rigkit export lab -p first -o cloud.ply
 """

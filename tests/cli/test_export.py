@@ -242,6 +242,16 @@ def test_a_rig_goes_out_to_colmap_and_mrcal(tmp_path: Path, capsys: pytest.Captu
     assert "no camera 'middle'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("kind", ["opencv", "ros", "ocamcalib"])
+def test_one_camera_of_a_rig_goes_out_to_formats_of_single_cameras(kind: str, tmp_path: Path) -> None:
+    rig, file = saved_rig(tmp_path / "rig.json", (LEFT, RIGHT, WIDE), POSES), tmp_path / "third"
+    assert main(["export", str(rig), "--to", kind, "-o", str(file), "--names", "third"]) == 0
+    assert main(["export", str(file), "--from", kind, "-o", str(tmp_path / "third.json")]) == 0
+    rays, _ = WIDE.unproject(np.array([[320.0, 240.0], [400.0, 300.0]]))
+    expected, got = WIDE.project(rays)[0], load_camera(tmp_path / "third.json").project(rays)[0]
+    assert np.abs(got - expected).max() < REFIT_PX
+
+
 @pytest.mark.parametrize(
     ("files", "names"),
     [

@@ -15,7 +15,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.interop.camera_formats import FOREIGN_FORMATS
 from rigkit.interop.exchange import Written
-from rigkit.interop.rigs import RIG_FORMATS, Outlines, Rig, write_rig
+from rigkit.interop.rigs import RIG_FORMATS, ForeignRig, Outlines, Rig, write_rig
 from rigkit.io.calibrations.calibration_file import save_camera
 from rigkit.io.calibrations.rig_file import is_rig_file, load_saved_rig
 from rigkit.io.disk.reading import about
@@ -86,7 +86,8 @@ def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedC
 def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence[str] = ()) -> ExportedRig:
     """Write a rig's file (of rigkit or another tool) in another format; `names` selects cameras and their order.
 
-    A single selected camera may be written in rigkit's format. Formats with one file for each camera get OUT-NAME.
+    A single selected camera may also be written in rigkit's format and in those of cameras alone. Formats with one file
+    for each camera get OUT-NAME.
     Raises InputError for a source that is no rig, a format without rigs, an unknown camera, or a file that cannot be
     written.
     """
@@ -110,7 +111,12 @@ def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence
         return ExportedRig(kind=kind, max_error_px=0.0, written=(options.output,))
     with about(source):
         outlines = load_saved_rig(source).outlines if is_rig_file(source) else {}
-        foreign = write_rig(rig, kind, outlines)
+        if len(rig) == 1 and kind in FOREIGN_ENDINGS and (kind not in RIG_FORMATS or RIG_FORMATS[kind].stereo_only):
+            ((name, (camera, _)),) = rig.items()
+            done = _written_camera(camera, kind, outlines.get(name))
+            foreign = ForeignRig({"": done.text}, done.max_error_px, (done.note,) if done.note else ())
+        else:
+            foreign = write_rig(rig, kind, outlines)
     files = {_camera_path(options.output, key): text for key, text in foreign.files.items()}
     ensure_writable(list(files), force=options.force, inputs=[source])
     write_together(dict(files), force=options.force)
