@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +36,8 @@ from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_near_camera
 from rigkit.workflows.inputs.identify_board import why_not_detected
 from rigkit.workflows.options.cameras import HandEyeOptions
+
+_log = logging.getLogger(__name__)
 
 HAND_EYE_SCHEMA = "rigkit.hand_eye/1"
 POSE_NAMES = (("cam_from_hand", "base_from_board"), ("cam_from_base", "hand_from_board"))
@@ -222,16 +225,23 @@ def _measured_shape(camera: str | Path, board: Board) -> BoardShape | None:
         shapes = load_calibration(camera).boards
     except InputError:
         return None
-    same = [shape for shape in shapes if shape.kind != "flat" and _declared_as(shape, board)]
+    measured = [shape for shape in shapes if shape.kind != "flat"]
+    same = [shape for shape in measured if shape.declared is not None and _alike(shape.declared, board)]
+    if not same and any(d is not None and _alike(d, board, across=True) for d in (s.declared for s in measured)):
+        columns, rows = board.size[::-1]
+        _log.warning(
+            "'%s' measured the corners of a board of %dx%d, taken here as flat: declare it that way round to use them",
+            camera,
+            columns,
+            rows,
+        )
     return same[0] if len(same) == 1 else None
 
 
-def _declared_as(shape: BoardShape, board: Board) -> bool:
-    """Return whether a measured board was declared as `board` is, but for name and sigma."""
-    known = shape.declared
-    if known is None:
-        return False
-    return (known.size, known.squares_mm, known.pattern) == (board.size, board.squares_mm, board.pattern)
+def _alike(known: Board, board: Board, *, across: bool = False) -> bool:
+    """Return whether a board was declared as `board` is, or as it is with rows for columns, but for name and sigma."""
+    size, squares = (board.size[::-1], board.squares_mm[::-1]) if across else (board.size, board.squares_mm)
+    return (known.size, known.squares_mm, known.pattern) == (size, squares, board.pattern)
 
 
 def hand_eye_text(result: HandEye, options: HandEyeOptions) -> str:

@@ -35,7 +35,9 @@ def bowed(board: Board) -> np.ndarray:
 
 
 @pytest.mark.parametrize("turns", [0, 2])
-def test_pose_uses_the_measured_corners(turns: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pose_uses_the_measured_corners(
+    turns: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """Whichever end the detection calls the first; a board of other squares is taken as declared."""
     known = calibrated_lens()
     measured = BoardShape.of(EVEN, "released", bowed(EVEN))
@@ -54,3 +56,6 @@ def test_pose_uses_the_measured_corners(turns: int, tmp_path: Path, monkeypatch:
     other = placed("8x6x31", "board-8x6x31")
     assert not other.board_measured
     assert other.rms_px > 10.0 * found.rms_px
+    assert not caplog.records
+    assert not placed("6x8x30", "board-6x8x30").board_measured
+    assert "a board of 8x6, taken here as flat" in caplog.text

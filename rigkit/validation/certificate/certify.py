@@ -19,6 +19,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
 from rigkit.core.measurement_task import Quantity, Task
 from rigkit.validation.certificate.propagation import (
+    MAP_CELLS,
     OF_CORNERS,
     OF_DISTANCE,
     OF_LENSES,
@@ -31,8 +32,6 @@ from rigkit.validation.certificate.propagation import (
 from rigkit.validation.certificate.result import Certificate
 from rigkit.validation.monitoring.evidence import Monitored
 
-MAP_CELLS = (33, 25)
-"""Columns and rows of the grid on which the bound is evaluated."""
 MAX_SHARE = 0.3
 """Largest bound, and uncertainty of points, relative to the measured size (for angles to a radian), at which the bound
 is relied upon. SIMULATED corner noise, lengths, depths, planes and angles: up to 0.5 94 to 96 % of the errors lie

@@ -40,6 +40,9 @@ PLANE_POINTS = 5
 OF_CORNERS, OF_LENSES, OF_MOUNTS, OF_SCALE, OF_DISTANCE = "corners", "lenses", "mounts", "board scale", "distance"
 """Causes of error."""
 
+MAP_CELLS = (33, 25)
+"""Columns and rows of the grid on which the bound is evaluated."""
+
 
 def measured_points(rays: Rays, task: Task, is_rig: bool) -> tuple[Points, FloatArray]:
     """Return the measured points (N, K, 3) around N `rays`, in the first camera's frame, and the gradients (N, M, K, 3)

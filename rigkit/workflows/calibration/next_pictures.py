@@ -20,8 +20,7 @@ from rigkit.planning.goal import Goal, projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.planning.rig_goal import rig_goal
-from rigkit.validation.certificate.certify import MAP_CELLS
-from rigkit.validation.certificate.propagation import gradients, measured_points
+from rigkit.validation.certificate.propagation import MAP_CELLS, gradients, measured_points
 from rigkit.validation.monitoring.evidence import Monitored
 from rigkit.validation.monitoring.frames import Frames
 
