@@ -72,7 +72,8 @@ def _output(path: Path | None) -> Path | None:
         return None
     if path.is_dir():
         raise InputError(f"calibrate: -o '{path}' is a folder; give a file, such as '{path / 'calibration.json'}'")
-    return path if path.suffix or path.exists() else path.with_name(f"{path.name}.json")
+    known = path.suffix or path.exists() or path.is_symlink()
+    return path if known else path.with_name(f"{path.name}.json")
 
 
 def folder_options(args: argparse.Namespace) -> FolderOptions:
