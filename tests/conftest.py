@@ -119,5 +119,8 @@ LESS: dict[str, object] = {
 @pytest.fixture(autouse=True)
 def less_work(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if request.path.is_relative_to(ROOT) and request.path.relative_to(ROOT).parts[1] in BESIDES:
+        # All before the first is changed: a module first imported after that would keep the changed value of another.
+        for name in LESS:
+            importlib.import_module(name.rpartition(".")[0])
         for name, value in LESS.items():
             monkeypatch.setattr(name, value)
