@@ -71,6 +71,8 @@ def main() -> None:
     parser.add_argument("--page", type=Path, help="write the long table between the marks of this page")
     parser.add_argument("--short", type=Path, help="write the table with a column a tool into this page")
     args = parser.parse_args()
+    if unknown := sorted(set(args.sets) - set(BENCHES)):
+        parser.error(f"no set is called {', '.join(unknown)}; known: {', '.join(BENCHES)}")
     args.work.mkdir(parents=True, exist_ok=True)
     if not peers.mrcal_there():
         print("mrcal does not install here: left out")
