@@ -14,6 +14,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.detection.detect import detect_boards
 from rigkit.io.boards.board_words import board_in_words
+from rigkit.io.corners.corner_cache import source_hash
 from rigkit.io.media.images import read_image
 
 Views = dict[str, list[BoardView]]
@@ -79,7 +80,7 @@ def views_of(path: Path, board: Board, cache: Path) -> tuple[list[BoardView], tu
     """Return what an image shows and its size, from the images or from the cache."""
     if path.suffix == ".orpc":
         return [published_corners(path, board)], PUBLISHED_SIZE_PX
-    digest = hashlib.sha256(path.read_bytes() + repr(board).encode()).hexdigest()[:20]
+    digest = hashlib.sha256(path.read_bytes() + repr((board, source_hash())).encode()).hexdigest()[:20]
     kept = cache / f"{digest}.pickle"
     if not kept.is_file():
         image = read_image(path)
