@@ -42,9 +42,9 @@ from rigkit.workflows.outputs.export_camera import foreign_files, foreign_rig_fi
 from rigkit.workflows.outputs.provenance import provenance_of
 
 MOST_CORNERS = 0.8
-"""Share of a board's corners that some image of a session nearly always shows. With the first mark numbered wrongly, each
-image lacks those whose marks are not on the declared board; then the board is identified once more. Not measured: a
-smaller share only identifies less often."""
+"""Share of a board's corners that some image of a session nearly always shows. With the first mark numbered wrongly,
+each image lacks those whose marks are not on the declared board; then the board is identified once more. Not measured:
+a smaller share only identifies less often."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
