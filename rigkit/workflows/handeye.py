@@ -208,8 +208,9 @@ def _view_of(
     views = [
         replace(view, grid=d.grid, pixels=d.pixels, sigma_px=d.sigma_px, points_mm=shape.at(d.grid)) for d in turned
     ]
-    views = [_with_fixed_pupil(camera, one) for one in views]
-    return views[0] if len(views) == 1 else min(views, key=lambda one: _poses(far_camera(camera), one)[0][0].rms_rad)
+    with about(path):
+        views = [_with_fixed_pupil(camera, one) for one in views]
+        return min(views, key=lambda one: _poses(far_camera(camera), one)[0][0].rms_rad) if board.turns else views[0]
 
 
 def _poses(lens: Camera, view: BoardView) -> tuple[tuple[BoardPose, ...], BoolArray]:
@@ -225,9 +226,9 @@ def _measured_shape(camera: str | Path, board: Board) -> BoardShape | None:
         shapes = load_calibration(camera).boards
     except InputError:
         return None
-    measured = [shape for shape in shapes if shape.kind != "flat"]
-    same = [shape for shape in measured if shape.declared is not None and _alike(shape.declared, board)]
-    if not same and any(d is not None and _alike(d, board, across=True) for d in (s.declared for s in measured)):
+    measured = [(shape.declared, shape) for shape in shapes if shape.kind != "flat" and shape.declared is not None]
+    same = [shape for declared, shape in measured if _alike(declared, board)]
+    if not same and any(_alike(declared, board, across=True) for declared, _ in measured):
         columns, rows = board.size[::-1]
         _log.warning(
             "'%s' measured the corners of a board of %dx%d, taken here as flat: declare it that way round to use them",
