@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -79,6 +80,20 @@ class BoardShape:
             return named
         along_x, along_y = _stretch(named, self.points_mm)
         return named.with_squares(along_x * named.square_x_mm, along_y * named.square_y_mm)
+
+
+def measured_shape(shapes: Iterable[BoardShape], board: Board, *, across: bool = False) -> BoardShape | None:
+    """Return the measured shape of the one board that was declared as `board` is, under any name; None if there is
+    none, or several. With `across`: as `board` is with rows for columns."""
+    same = [s for s in shapes if s.kind != "flat" and s.declared and declared_alike(s.declared, board, across=across)]
+    return same[0] if len(same) == 1 else None
+
+
+def declared_alike(known: Board, board: Board, *, across: bool = False) -> bool:
+    """Return whether two boards have the same size, squares and pattern, whatever their names and sigmas; with
+    `across`: one with rows for columns."""
+    size, squares = (board.size[::-1], board.squares_mm[::-1]) if across else (board.size, board.squares_mm)
+    return (known.size, known.squares_mm, known.pattern) == (size, squares, board.pattern)
 
 
 def _stretch(board: Board, points_mm: Points) -> tuple[float, float]:

@@ -8,13 +8,14 @@ A check fails if the difference is too large for its standard deviation. Which m
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
+from rigkit.calibration.board_shape import BoardShape
 from rigkit.core.arrays import FloatArray, without_nan
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
@@ -145,6 +146,7 @@ def crosscheck(
     *,
     other_chain: Reconstruction | None = None,
     shifts: CalibrationShifts | None = None,
+    shapes: Mapping[str, BoardShape] | None = None,
     coverage: float = CROSS_COVERAGE,
     seed: int = 0,
 ) -> CrossCheckReport:
@@ -157,6 +159,7 @@ def crosscheck(
     reconstruction : of one pair.
     other_chain : the same pair reconstructed in other pixels (rectified if this one is raw, or the reverse).
     shifts : from `calibration_shifts`: adds the effect of calibration errors on the difference; None: exact intrinsics.
+    shapes : boards, by id, whose corners the calibrations measured: planar PnP uses those, of others the declared ones.
     coverage : largest |difference| / sigma that passes.
     seed : of COLMAP's RANSAC.
     """
@@ -164,7 +167,7 @@ def crosscheck(
     skipped: list[str] = []
     attempts: dict[str, Callable[[], list[IndependentMethod]]] = {
         "pycolmap": lambda: _colmap_methods(reconstruction, seed),
-        "planar PnP": lambda: [_pnp_method(reconstruction)],
+        "planar PnP": lambda: [_pnp_method(reconstruction, shapes)],
     }
     for name, attempt in attempts.items():
         try:
@@ -175,8 +178,10 @@ def crosscheck(
         skipped.append(f"{TWO_VIEW}: its own bundle adjustment changes it by more than its uncertainty")
     if other_chain is not None:
         methods.append(compare_chains(reconstruction, other_chain, OTHER_CHAIN))
-    measured = measure(reconstruction)
-    checks = [check for method in methods for check in _checks(reconstruction, measured, method, coverage, shifts)]
+    measured, pnp_sigmas = measure(reconstruction), dict[str, float]()
+    if shifts is not None and any(method.name == PNP for method in methods):
+        pnp_sigmas = _difference_sigmas(measured, shifts, shapes)
+    checks = [check for method in methods for check in _checks(reconstruction, measured, method, coverage, pnp_sigmas)]
     return CrossCheckReport(
         reconstruction.pair_id,
         reconstruction.affine_method,
@@ -223,8 +228,8 @@ def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[Independe
     ]
 
 
-def _pnp_method(reconstruction: Reconstruction) -> IndependentMethod:
-    found = planar_pnp(reconstruction)
+def _pnp_method(reconstruction: Reconstruction, shapes: Mapping[str, BoardShape] | None) -> IndependentMethod:
+    found = planar_pnp(reconstruction, shapes)
     rms = found.rms_rad * reconstruction.camera1.focal_px
     pose, covariance = found.cam2_from_cam1, found.covariance
     method = _method(PNP, reconstruction, pose, covariance, found.angles_deg, rms, found.count, 0)
@@ -284,16 +289,16 @@ def _checks(
     measured: Measured,
     method: IndependentMethod,
     coverage: float,
-    shifts: CalibrationShifts | None,
+    pnp_sigmas: Mapping[str, float],
 ) -> list[Check]:
     """Return the checks of one method, with the standard deviation of a difference of estimates from the same corners.
 
     Quantities without uncertainty are not checked. Calibration errors change the results of all epipolar methods alike;
-    only for planar PnP do they enter the difference.
+    only for planar PnP do they enter the difference, with `pnp_sigmas`.
     """
     rows_of: list[tuple[str, str, str, tuple[float, float], tuple[float, float]]] = []
     ours = _angles(measured)
-    sigmas = _difference_sigmas(measured, shifts) if shifts is not None and method.name == PNP else {}
+    sigmas = pnp_sigmas if method.name == PNP else {}
     sigma = _pose_sigmas(method.cam2_from_cam1, method.covariance)
     if all(np.isfinite(value) for value in sigma):
         own = _pose_sigmas(reconstruction.cam2_from_cam1, _covariance(reconstruction))
@@ -317,7 +322,9 @@ def _checks(
     return checks
 
 
-def _difference_sigmas(measured: Measured, shifts: CalibrationShifts) -> dict[str, float]:
+def _difference_sigmas(
+    measured: Measured, shifts: CalibrationShifts, shapes: Mapping[str, BoardShape] | None
+) -> dict[str, float]:
     """Return the standard deviations, from the calibrations, of the differences between ours and planar PnP."""
     every = (shifts.base, *shifts.moved)
     cloud, boards = shifts.base.cloud, shifts.base.boards
@@ -328,7 +335,7 @@ def _difference_sigmas(measured: Measured, shifts: CalibrationShifts) -> dict[st
             like = measured.boards[board.board_id].plane
             normals[board.board_id], _ = fit_moved(points[:, cloud.board_index == index], like)
     rows: list[dict[str, FloatArray]] = []
-    for m, (moved, (pose, angles_deg)) in enumerate(zip(every, moved_pnp(every), strict=True)):
+    for m, (moved, (pose, angles_deg)) in enumerate(zip(every, moved_pnp(every, shapes), strict=True)):
         ours = moved.cam2_from_cam1
         row = {
             "rotation": log_so3(pose.rotation @ ours.rotation.T),

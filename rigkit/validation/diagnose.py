@@ -137,14 +137,15 @@ def diagnose_squares(fitting: Sequence[FittingSquares]) -> tuple[str, ...]:
     return (f"{', or '.join(sizes)}; measure them again",) if sizes else ()
 
 
-def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
-    """Return the probable causes of failed checks in a data set, from one report for each pair."""
+def diagnose(reports: Sequence[ValidationReport], *, agreed: bool = True) -> tuple[str, ...]:
+    """Return the probable causes of failed checks in a data set, from one report for each pair, and whether all
+    independent methods `agreed`: where they did not, wrong boards are a cause even if all measurements pass."""
     if all(report.passed for report in reports):
-        return ()
+        return () if agreed else tuple(_diagnose_boards(reports))
     # A wrong prior changes the whole result: it explains all other failures of that pair.
     free = [report for report in reports if not _contradicted(report)]
     out = [f"pair '{r.pair_id}': {_contradicted(r)}" for r in reports if _contradicted(r)]
-    out += [] if all(report.passed for report in free) else _diagnose_free(free)
+    out += [] if agreed and all(report.passed for report in free) else _diagnose_free(free)
     return tuple(dict.fromkeys(out))
 
 
@@ -292,7 +293,11 @@ def _diagnose_lengths(failed: Sequence[tuple[str, Check]], reports: Sequence[Val
         return [f"{names}: written in {unit}? Lengths are in mm; or the squares are {squares}"]
     sigma = max(check.combined_sigma / check.measured for _, check in failed)
     if len(lengths) > 1 and all(agree) and np.ptp(ratios) < SAME_RATIO + 4.0 * sigma:
-        return [f"square size: all {len(lengths)} lengths are off by {percent:+.1f} %; {squares} would explain them"]
+        return [
+            f"square size: all {len(lengths)} lengths are off by {percent:+.1f} %: the squares are {squares}, or every "
+            "length was misread by this factor, as with one wrong rule; the images cannot tell which, so measure both "
+            "again with another rule"
+        ]
     if len(lengths) == 1:
         return [
             f"pair '{failed[0][0]}': {failed[0][1].name} is off by {percent:+.1f} %: it was misread, or the squares "

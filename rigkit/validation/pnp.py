@@ -8,7 +8,10 @@ from itertools import combinations
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, Points, Rays
+from rigkit.calibration.board_shape import BoardShape
+from rigkit.core.arrays import FloatArray, IntArray, Points, Rays
+from rigkit.core.boards import Board
+from rigkit.core.detections import grid_turned
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.board_pose import BoardPose, board_pose, moved_board_poses
 from rigkit.geometry.relative_pose import relative_pose, relative_pose_covariance
@@ -45,12 +48,16 @@ class PnpResult:
     count: int
 
 
-def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
+def planar_pnp(reconstruction: Reconstruction, shapes: Mapping[str, BoardShape] | None = None) -> PnpResult:
     """Return relative pose and face angles from planar PnP of each board in each view, for any field of view.
 
     Raises DegenerateError if no board has eight corners.
+
+    Parameters
+    ----------
+    shapes : measured boards, by id; the others are taken as declared.
     """
-    seen = _board_rays([reconstruction])
+    seen = _board_rays([reconstruction], shapes or {})
     if not seen:
         raise DegenerateError(
             f"pair '{reconstruction.pair_id}': no board has {MIN_CORNERS_FOR_PNP} corners for its own pose; "
@@ -74,7 +81,9 @@ def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
     )
 
 
-def moved_pnp(moved: Sequence[Reconstruction]) -> tuple[tuple[Rigid3, AnglesDeg], ...]:
+def moved_pnp(
+    moved: Sequence[Reconstruction], shapes: Mapping[str, BoardShape] | None = None
+) -> tuple[tuple[Rigid3, AnglesDeg], ...]:
     """Return relative pose and face angles of `planar_pnp` for one pair with slightly different cameras.
 
     Only corners in the field of view of all cameras are used.
@@ -84,7 +93,7 @@ def moved_pnp(moved: Sequence[Reconstruction]) -> tuple[tuple[Rigid3, AnglesDeg]
             moved_board_poses(rays, seen.points, board_pose(rays[0], seen.points).cam_from_board)
             for rays in (seen.rays1, seen.rays2)
         ]
-        for name, seen in _board_rays(moved).items()
+        for name, seen in _board_rays(moved, shapes or {}).items()
     }
     out = []
     for m, reconstruction in enumerate(moved):
@@ -103,7 +112,7 @@ class _BoardRays:
     rays2: Rays
 
 
-def _board_rays(reconstructions: Sequence[Reconstruction]) -> dict[str, _BoardRays]:
+def _board_rays(reconstructions: Sequence[Reconstruction], shapes: Mapping[str, BoardShape]) -> dict[str, _BoardRays]:
     """Return, by id, the boards with enough corners that all cameras of these reconstructions of one pair see."""
     first = reconstructions[0]
     rays1, seen1 = zip(*(r.camera1.unproject(r.pixels1) for r in reconstructions), strict=True)
@@ -113,9 +122,21 @@ def _board_rays(reconstructions: Sequence[Reconstruction]) -> dict[str, _BoardRa
     for index, board in enumerate(first.boards):
         on = (first.cloud.board_index == index) & seen
         if int(on.sum()) >= MIN_CORNERS_FOR_PNP:
-            points = board.points(first.cloud.grid[on])
-            out[board.board_id] = _BoardRays(points, np.array(rays1)[:, on], np.array(rays2)[:, on])
+            own1, own2 = np.array(rays1)[:, on], np.array(rays2)[:, on]
+            points = _points(board, shapes.get(board.board_id), first.cloud.grid[on], (own1[0], own2[0]))
+            out[board.board_id] = _BoardRays(points, own1, own2)
     return out
+
+
+def _points(board: Board, shape: BoardShape | None, grid: IntArray, rays: tuple[Rays, Rays]) -> Points:
+    """Return the corners `grid` (N, 2) of a board, (N, 3) mm, seen along the rays (N, 3) of two views.
+
+    A measured board is not as symmetric as a declared one: of its orientations the one that fits best is returned.
+    """
+    if shape is None:
+        return board.points(grid)
+    each = [shape.at(grid_turned(grid, board.size, turns)) for turns in (0, *board.turns)]
+    return min(each, key=lambda points: sum(board_pose(seen, points).rms_rad ** 2 for seen in rays))
 
 
 def _predicted_square(reconstruction: Reconstruction, board_ids: list[str]) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigkit.calibration.board_shape import BoardShape
+from rigkit.calibration.board_shape import BoardShape, measured_shape
 from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.certainty.uncertainty import pose_covariance_of_lens
 from rigkit.calibration.hand_eye import HandEye, hand_eye
@@ -226,9 +226,8 @@ def _measured_shape(camera: str | Path, board: Board) -> BoardShape | None:
         shapes = load_calibration(camera).boards
     except InputError:
         return None
-    measured = [(shape.declared, shape) for shape in shapes if shape.kind != "flat" and shape.declared is not None]
-    same = [shape for declared, shape in measured if _alike(declared, board)]
-    if not same and any(_alike(declared, board, across=True) for declared, _ in measured):
+    shape = measured_shape(shapes, board)
+    if shape is None and measured_shape(shapes, board, across=True) is not None:
         columns, rows = board.size[::-1]
         _log.warning(
             "'%s' measured the corners of a board of %dx%d, taken here as flat: declare it that way round to use them",
@@ -236,13 +235,7 @@ def _measured_shape(camera: str | Path, board: Board) -> BoardShape | None:
             columns,
             rows,
         )
-    return same[0] if len(same) == 1 else None
-
-
-def _alike(known: Board, board: Board, *, across: bool = False) -> bool:
-    """Return whether a board was declared as `board` is, or as it is with rows for columns, but for name and sigma."""
-    size, squares = (board.size[::-1], board.squares_mm[::-1]) if across else (board.size, board.squares_mm)
-    return (known.size, known.squares_mm, known.pattern) == (size, squares, board.pattern)
+    return shape
 
 
 def hand_eye_text(result: HandEye, options: HandEyeOptions) -> str:

@@ -11,14 +11,16 @@ import pytest
 from helpers.board_scenes import fisheye_camera, regular_camera
 from helpers.reconstructions import BOARDS, CAM2_FROM_CAM1, make_reconstruction, trihedral_poses
 
+from rigkit.calibration.board_shape import BoardShape
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.eucm import EUCM
 from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.core.detections import grid_turned
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.relative_pose import relative_pose, relative_pose_covariance
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, log_so3
+from rigkit.geometry.rotation import exp_so3, log_so3, rotation_angle
 from rigkit.interop.colmap import colmap_pair, solve_pair
 from rigkit.reconstruction.calibration_shifts import calibration_shifts
 from rigkit.reconstruction.reconstruct import Reconstruction
@@ -160,6 +162,26 @@ def test_a_bent_board_is_contradicted_by_pnp_only(rng: np.random.Generator) -> N
     assert any(c.how == PNP and not c.passed for c in report.checks)
     assert all(c.passed for c in report.checks if c.how == ADJUSTED)
     assert "calibration or board" in report.diagnosis[0]
+
+
+@pytest.mark.parametrize("turns", [0, 2])
+def test_a_bent_board_agrees_where_its_shape_was_measured(rng: np.random.Generator, turns: int) -> None:
+    """Squares that are longer one way, and at one end; the calibration may have counted them from the other end."""
+    exact = made(regular_camera(), keep=(1,))
+    true = exact.boards[0]
+    middle = true.points().mean(axis=0)
+    x, y, _ = (true.points() - middle).T / 200.0
+    on_board = middle + 200.0 * np.stack([1.006 * x + 0.01 * x**2, 0.994 * y, 0.0 * x], axis=1)
+    cam1_from_board = trihedral_poses()[1]
+    in_cam1 = cam1_from_board.apply(on_board[true.index(exact.cloud.grid)])
+    pixels1, pixels2 = (exact.camera1.project(p)[0] for p in (in_cam1, CAM2_FROM_CAM1.apply(in_cam1)))
+    seen = noisy(replace(exact, pixels1=pixels1, pixels2=pixels2), rng, 0.02)
+    order = true.index(grid_turned(true.grid(), true.size, turns))
+    counted = np.empty_like(on_board)
+    counted[order] = on_board if turns == 0 else (2.0 * middle - on_board) * [1.0, 1.0, -1.0]
+    found = planar_pnp(seen, {true.board_id: BoardShape.of(true, "released", counted)})
+    assert found.rms_rad < 0.1 * planar_pnp(seen).rms_rad
+    assert np.deg2rad(0.1) > rotation_angle(found.cam2_from_cam1.rotation @ CAM2_FROM_CAM1.rotation.T)
 
 
 def test_another_chain_is_compared(rng: np.random.Generator) -> None:

@@ -75,6 +75,8 @@ def test_wrong_squares_show_in_several_pairs() -> None:
     found = diagnose([reported(scale=1.03, distances=False, pair_id=name) for name in ("a", "b")])
     assert len(found) == 1
     assert "square size: all 2 lengths" in found[0]
+    # Baselines of a rule that is off are off like that: nothing in the images tells the two apart.
+    assert "or every length was misread by this factor" in found[0]
 
 
 def test_a_misread_baseline_is_recognised_by_the_other_lengths() -> None:
@@ -125,6 +127,15 @@ def test_a_declaration_that_is_contradicted_comes_alone() -> None:
     off = replace(bent.checks[0], name="level", kind="level", passed=False)
     found = diagnose([reported(pair_id="well"), replace(bent, checks=(*bent.checks, off))])
     assert len(found) == 1 and found[0].startswith("pair 'made': the images contradict the declared level: declare")
+
+
+def test_squares_that_are_odd_are_a_cause_where_only_an_independent_method_disagrees() -> None:
+    """A board that is a little longer one way, with a baseline that says nothing of it."""
+    boards = tuple(replace(board, square_y_mm=50.2) for board in BOARDS)
+    passing = replace(reported(boards=boards), checks=reported().checks)
+    assert passing.passed and diagnose([passing]) == ()
+    (found,) = diagnose([passing], agreed=False)
+    assert "0.4 % wider than high" in found and "measure square_x_mm and square_y_mm" in found
 
 
 def test_boards_that_are_all_stretched_alike_are_one_cause() -> None:

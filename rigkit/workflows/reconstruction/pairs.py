@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from rigkit.calibration.board_shape import BoardShape, declared_alike, measured_shape
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.choices import Planes, Support
@@ -130,6 +131,20 @@ def shifts_of(reconstruction: Reconstruction, camera1: LoadedCamera, camera2: Lo
         return None
     second = None if camera1 is camera2 else known2
     return calibration_shifts(reconstruction, known1, second)
+
+
+def measured_shapes(pair: Pair, camera1: LoadedCamera, camera2: LoadedCamera) -> dict[str, BoardShape]:
+    """Return the boards of a pair, by id, whose corners the calibration of camera 1, or else of camera 2, measured.
+
+    Of boards declared alike, which one was measured is unknown: none is returned.
+    """
+    out: dict[str, BoardShape] = {}
+    for board in pair.boards:
+        if sum(declared_alike(other, board) for other in pair.boards) == 1:
+            known = (one.calibration.boards for one in (camera1, camera2) if one.calibration is not None)
+            found = [shape for shapes in known if (shape := measured_shape(shapes, board)) is not None]
+            out |= {board.board_id: found[0]} if found else {}
+    return out
 
 
 def planes_of(geometry: PairGeometry, planes: Planes, camera1: LoadedCamera, camera2: LoadedCamera) -> BoardPlanes:

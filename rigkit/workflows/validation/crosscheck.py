@@ -15,7 +15,13 @@ from rigkit.report.tables import table_files
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.workflows.options.clouds import DatasetOptions
 from rigkit.workflows.reconstruction.datasets import PairFailure, PairJob, over_pairs, ready_dataset, write_for
-from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_other_chain, reconstruct_with, shifts_of
+from rigkit.workflows.reconstruction.pairs import (
+    match_images,
+    measured_shapes,
+    reconstruct_other_chain,
+    reconstruct_with,
+    shifts_of,
+)
 
 FILES = ("crosscheck.md", "crosscheck.json")
 
@@ -67,4 +73,5 @@ def _crosscheck(job: PairJob[DatasetOptions]) -> CrossCheckReport:
     matched, _, _ = match_images(job.pair, camera1.near, camera2.near, job.options.chain)
     other = reconstruct_other_chain(matched, job.pair)
     ours = reconstruct_with(matched, job.pair, "3SDIR")
-    return crosscheck(ours, other_chain=other, shifts=shifts_of(ours, camera1, camera2))
+    shapes = measured_shapes(job.pair, camera1, camera2)
+    return crosscheck(ours, other_chain=other, shifts=shifts_of(ours, camera1, camera2), shapes=shapes)

@@ -38,6 +38,7 @@ from rigkit.workflows.reconstruction.pairs import (
     find_boards,
     geometry_of,
     match_found,
+    measured_shapes,
     planes_of,
     reconstruct_other_chain,
     shifts_of,
@@ -103,7 +104,7 @@ def validate_dataset(
     )
     compared = [pair.crosscheck for pair in pairs if pair.crosscheck is not None]
     causes = [cause for pair in pairs for cause in pair.causes]
-    causes += diagnose([pair.best for pair in pairs])
+    causes += diagnose([pair.best for pair in pairs], agreed=all(report.passed for report in compared))
     causes += [f"pair '{report.pair_id}': {words}" for report in compared for words in report.diagnosis]
     seconds = time.monotonic() - started
     page, files = validation_files(
@@ -175,7 +176,8 @@ def _validated(
     compared = None
     if job.options.crosscheck:
         other = reconstruct_other_chain(matched, pair)
-        compared = crosscheck(shown, other_chain=other, shifts=shifts[best.affine_method])
+        shapes = measured_shapes(pair, *job.cameras.of(pair))
+        compared = crosscheck(shown, other_chain=other, shifts=shifts[best.affine_method], shapes=shapes)
     section = None
     if job.options.pictures:
         drawn = pair_pictures(shown, image1, image2, pdf=job.options.pdf)
