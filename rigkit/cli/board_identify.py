@@ -53,8 +53,8 @@ def identify(args: argparse.Namespace) -> int:
         )
     if isinstance(board.pattern, Circles) and board.pattern.stagger == "left":
         note(
-            'stagger = "left": every second row begins half a step further left, which is rare; '
-            "are the images mirrored, as by the driver of a webcam?"
+            'stagger = "left": every second row begins half a step further left, as BoofCV prints them; if the rows of '
+            "the print begin further right, as OpenCV's do, the images are mirrored"
         )
     for error in found.unreadable:
         note(f"left out: {error}")
@@ -63,4 +63,4 @@ def identify(args: argparse.Namespace) -> int:
 
 def without_scale(words: str) -> str:
     """Return the description of a board with squares of 1 mm, with the unknown scale in words."""
-    return re.sub(r"([\d.]+) mm\b", r"\1 of that", words.replace(" 1 x 1 mm", " of unknown size"))
+    return re.sub(r"([\d.]+) mm\b", r"about \1 of that", words.replace(" 1 x 1 mm", " of unknown size"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 from pathlib import Path
 
 from rigkit.cli.console import add_options, options_of
@@ -21,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a session file; or one folder of images (or video, or camera:0) per camera",
     )
     parser.add_argument(
-        "-o", "--output", type=Path, help="file; default: calibration.json (rig.json) beside the session"
+        "-o", "--output", type=_output, help="file; default: calibration.json (rig.json) beside the session"
     )
     parser.add_argument(
         "-r",
@@ -62,15 +63,13 @@ def calibrate_options(args: argparse.Namespace) -> CalibrateOptions:
     cache = Cache.OFF if args.no_cache else Cache.UPDATE
     exports = tuple(dict.fromkeys(args.exports))
     known = options_of(Known, args)
-    output = _output(args.output)
-    return options_of(CalibrateOptions, args, cache=cache, exports=exports, known=known, output=output, plan=args.json)
+    return options_of(CalibrateOptions, args, cache=cache, exports=exports, known=known, plan=args.json)
 
 
-def _output(path: Path | None) -> Path | None:
+def _output(text: str) -> Path:
     """Return the file to write, a new one without suffix with .json; raises InputError for a folder."""
-    if path is None:
-        return None
-    if path.is_dir():
+    path = Path(text)
+    if path.is_dir() or text.endswith(("/", os.sep)):
         raise InputError(f"calibrate: -o '{path}' is a folder; give a file, such as '{path / 'calibration.json'}'")
     known = path.suffix or path.exists() or path.is_symlink()
     return path if known else path.with_name(f"{path.name}.json")

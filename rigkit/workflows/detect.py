@@ -110,18 +110,20 @@ def detect_in_images(
         more = f"; so it is with {len(failures) - 1} more" if len(failures) > 1 else ""
         raise InputError(f"{next(iter(failures.values()))}{more}")
     if not any(found.values()) and not failures:
-        raise CheckFailed(_nothing_found(images, boards, doubtful))
+        raise CheckFailed(_nothing_found(images, boards, doubtful, progress))
     if options.output is not None and any(found.values()):
         write_corners(options.output, found, force=options.force)
     return DetectionResult(found, failures, doubtful)
 
 
-def _nothing_found(images: Sequence[Path], boards: Sequence[Board], doubtful: Mapping[str, str]) -> str:
+def _nothing_found(
+    images: Sequence[Path], boards: Sequence[Board], doubtful: Mapping[str, str], progress: Progress
+) -> str:
     """Return why no board was found: what images show instead if that is known, else what to check."""
     looked_for = " or ".join(f"'{board.board_id}'" for board in boards) if boards else "chessboard"
     lead = f"no {'board ' if boards else ''}{looked_for} found in {counted(len(images), 'image')}"
-    shown = None if boards else suggestion(images).words
-    why = why_not_detected(images, boards) if boards else shown and f"they show --board {shown}"
+    shown = None if boards else suggestion(images, progress).words
+    why = why_not_detected(images, boards, progress) if boards else shown and f"they show --board {shown}"
     if why:
         return f"{lead}; {why}"
     seen = next((f"; in '{name}' {words}" for name, words in doubtful.items()), "")

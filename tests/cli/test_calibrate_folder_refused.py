@@ -45,8 +45,10 @@ def test_images_instead_of_their_folder(
 
 
 def test_a_folder_to_write_is_refused(pictures: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["calibrate", str(pictures), "--board", "9x6x30", "-o", str(pictures)]) == 2
-    assert capsys.readouterr().err.endswith(f"give a file, such as '{pictures / 'calibration.json'}'\n")
+    for folder in (pictures, pictures / "new"):
+        assert main(["calibrate", str(pictures), "--board", "9x6x30", "-o", f"{folder}/"]) == 2
+        assert capsys.readouterr().err.endswith(f"give a file, such as '{folder / 'calibration.json'}'\n")
+    assert not (pictures / "new.json").exists()
 
 
 def test_a_file_without_suffix_that_exists_is_not_another_name(

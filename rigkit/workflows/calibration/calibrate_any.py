@@ -186,6 +186,7 @@ def _session(
         output=options.output,
         known=options.known,
         cameras=cameras,
+        progress=progress,
     )
     return wanted, list(cameras or ()), corners
 
@@ -241,7 +242,11 @@ def _report_path(options: CalibrateOptions, output: Path) -> Path | None:
 
 
 def _videos_of(places: Sequence[Path], output: Path | None) -> dict[Path, Path]:
-    """Return the given videos by the folder of their frames, in that of `output` or of the videos; {} for folders."""
+    """Return the given videos by the folder of their frames, beside the session named after `output`, or beside the
+    videos; {} for folders.
+
+    A result has frames of its own: those of another board would replace the ones that its session names.
+    """
     videos = [place for place in places if is_video(place)]
     if not videos:
         return {}
@@ -249,9 +254,7 @@ def _videos_of(places: Sequence[Path], output: Path | None) -> dict[Path, Path]:
         raise InputError(
             "calibrate: videos mixed with folders of images; give all cameras as videos, or all as folders"
         )
-    folder = frames_folder(videos)
-    if output is not None:
-        folder = output.parent / folder.name
+    folder = frames_folder(videos) if output is None else beside_session(_session_path(videos, output), "frames")
     out = {folder: videos[0]} if len(videos) == 1 else {folder / video.stem: video for video in videos}
     if len(out) < len(videos):
         raise InputError("calibrate: two videos have the same name, which names a camera; rename one")

@@ -61,6 +61,7 @@ def session_of_folders(
     output: Path | None = None,
     known: Known | None = None,
     cameras: ImagesByCamera | None = None,
+    progress: Progress = silent,
 ) -> dict[Path, str]:
     """Return the session file `path` of one folder of images, or of one folder for each camera, and its board files.
 
@@ -75,9 +76,10 @@ def session_of_folders(
     output : file of the calibration; None: named after the session.
     known : known lenses and rig, of several cameras.
     cameras : the images of each camera; by default those of `cameras_in`.
+    progress : of the search for the board that images show, to say what is missing.
     """
     if not boards:
-        raise InputError(_missing_board_message(folders))
+        raise InputError(_missing_board_message(folders, progress))
     cameras = cameras or cameras_in(folders)
     for folder in dict.fromkeys(folder for own in cameras.values() for folder, _ in own):
         warn_of_unread_formats(folder)
@@ -169,7 +171,7 @@ def boards_seen(places: Sequence[Path], side_mm: float, progress: Progress = sil
     return tuple(with_length(words, side_mm) for words in shown.words.split(" --board "))
 
 
-def _board_suggestion(places: Sequence[Path], progress: Progress = silent) -> Suggestion:
+def _board_suggestion(places: Sequence[Path], progress: Progress) -> Suggestion:
     if any(is_video(place) for place in places):
         return suggestion(places, progress)
     try:
@@ -179,9 +181,9 @@ def _board_suggestion(places: Sequence[Path], progress: Progress = silent) -> Su
     return suggestion(images_of_camera(entries), progress)
 
 
-def _missing_board_message(folders: Sequence[Path]) -> str:
+def _missing_board_message(folders: Sequence[Path], progress: Progress) -> str:
     """Return the error message for a missing --board, with the board that the images show."""
-    shown = _board_suggestion(folders)
+    shown = _board_suggestion(folders, progress)
     if shown.fault is not None:
         return f"calibrate: {shown.fault}"
     such = f"give the board, such as --board {WORDS_HELP}, or --board board.toml"

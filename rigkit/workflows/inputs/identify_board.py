@@ -88,18 +88,18 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     progress("reading", len(images), len(images))
     guess = guess_board(list(images.values()), progress)
     names = tuple(Path(name).name for name in images)
-    mirrored = _mirrored_where_doubtful(guess, list(images.items()))
+    mirrored = _mirrored_where_doubtful(guess, list(images.items()), progress)
     if mirrored is not None:
         raise CheckFailed(mirrored)
     if guess is None:
         if unreadable:
             raise InputError(f"no board is seen in {counted(len(names), 'image')}, and {unreadable[0]}")
-        seen = _doubtful(list(images.items())) or "no chessboard, ChArUco board, AprilGrid or grid of circles"
+        seen = _doubtful(list(images.items()), progress) or "no chessboard, ChArUco board, AprilGrid or grid of circles"
         raise CheckFailed(f"no board is seen in {counted(len(names), 'image')}: {seen}")
     if not guess.determined:
         raise CheckFailed(f"{counted(len(guess.images), 'image')} of {len(names)} show {_partial_board_words(guess)}")
     pictures = list(images.values())
-    elsewhere = _other_board([(names[k], pictures[k]) for k in range(len(names)) if k not in guess.images])
+    elsewhere = _other_board([(names[k], pictures[k]) for k in range(len(names)) if k not in guess.images], progress)
     twice = tuple(names[k] for k in guess.images if duplicate_boards(pictures[k], [guess.board]) is not None)
     return IdentifiedBoard(
         board=guess.board,
@@ -114,11 +114,11 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     )
 
 
-def _other_board(rest: Sequence[tuple[str, GreyImage]]) -> tuple[str, tuple[str, ...]] | None:
+def _other_board(rest: Sequence[tuple[str, GreyImage]], progress: Progress) -> tuple[str, tuple[str, ...]] | None:
     """Return the board in words that most of the remaining images show, and their names; None if there is none."""
     if len(rest) < MIN_IMAGES_OF_GUESS:
         return None
-    guess = guess_board([image for _, image in rest])
+    guess = guess_board([image for _, image in rest], _named(progress, "searching for another board"))
     if (
         guess is None
         or not guess.determined
@@ -128,12 +128,17 @@ def _other_board(rest: Sequence[tuple[str, GreyImage]]) -> tuple[str, tuple[str,
     return words_of_board(guess.board), tuple(rest[k][0] for k in guess.images)
 
 
+def _named(progress: Progress, what: str) -> Progress:
+    """Return a callback that names every step `what`."""
+    return lambda _, done, total: progress(what, done, total)
+
+
 def why_not_detected(paths: Sequence[Path], boards: Sequence[Board], progress: Progress = silent) -> str | None:
     """Return in words why images do not show the declared boards; None if unknown."""
     mirrored = _mirrored(paths, [board for board in boards if board.identified or _handed(board)])
     if mirrored is not None:
         return mirrored
-    guess, *_ = _guess(paths, progress)
+    guess, *_ = _guess(paths, _named(progress, "checking which board it is"))
     if guess is None or not guess.determined:
         return None
     determined = [difference(seen, board) for board in boards for seen in (guess.board, *guess.beside)]
@@ -200,7 +205,9 @@ def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     return _mirror_message(name, board.pattern)
 
 
-def _mirrored_where_doubtful(guess: BoardGuess | None, pictures: Sequence[tuple[str, GreyImage]]) -> str | None:
+def _mirrored_where_doubtful(
+    guess: BoardGuess | None, pictures: Sequence[tuple[str, GreyImage]], progress: Progress
+) -> str | None:
     """Return a message if the flipped images show boards with marks and `guess` is doubtful, else None.
 
     A guess is doubtful if it is None, a chessboard in few images, or one with marks in its squares.
@@ -211,15 +218,17 @@ def _mirrored_where_doubtful(guess: BoardGuess | None, pictures: Sequence[tuple[
     ):
         return None
     some = pictures[:: max(1, -(-len(pictures) // EXPLAINING_IMAGES))]
-    marks = guess_board([_flipped(image) for _, image in some])
+    marks = guess_board([_flipped(image) for _, image in some], _named(progress, "checking for mirrored images"))
     if marks is not None and marks.board.identified and len(marks.images) >= MIN_SHARE_OF_IMAGES * len(some):
         return _mirror_message(some[marks.images[0]][0], marks.board.pattern)
     return None
 
 
-def _doubtful(pictures: Sequence[tuple[str, GreyImage]]) -> str | None:
+def _doubtful(pictures: Sequence[tuple[str, GreyImage]], progress: Progress) -> str | None:
     """Return a description of the first doubtful grid in images, or None."""
-    for name, image in pictures[:: max(1, -(-len(pictures) // EXPLAINING_IMAGES))]:
+    some = pictures[:: max(1, -(-len(pictures) // EXPLAINING_IMAGES))]
+    for k, (name, image) in enumerate(some):
+        progress("searching for doubtful boards", k, len(some))
         words = doubtful_grid(image)
         if words is not None:
             return f"in '{Path(name).name}' {words}"
@@ -261,11 +270,11 @@ def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion
     guess, pictures, unreadable = _guess(paths, progress)
     if unreadable is not None and not pictures:
         return Suggestion(fault=str(unreadable))
-    mirrored = _mirrored_where_doubtful(guess, pictures)
+    mirrored = _mirrored_where_doubtful(guess, pictures, progress)
     if mirrored is not None:
         return Suggestion(fault=mirrored)
     if guess is None:
-        return Suggestion(doubt=_doubtful(pictures))
+        return Suggestion(doubt=_doubtful(pictures, progress))
     if not guess.determined:
         return Suggestion(part=_partial_board_words(guess))
     # Other chessboards may be background. A tag is on one board of a rig: a board with the same is of other images.

@@ -139,7 +139,8 @@ def foreign_rig_files(rig: Rig, result: Path, kinds: Sequence[str], outlines: Ou
             _log.warning(f"no {kind} file of the rig: {error}")
             continue
         files |= dict(zip(places, foreign.files.values(), strict=True))
-        _log.info(f"{', '.join(map(str, places))}: {'; '.join(foreign.notes)}")
+        if foreign.notes:
+            _log.info(f"{', '.join(map(str, places))}: {'; '.join(foreign.notes)}")
     return files
 
 

@@ -34,9 +34,9 @@ def test_squares_in_metres_are_not_printed(tmp_path: Path) -> None:
     [
         (
             Board("c", 7, 6, 1.0, 1.0, pattern=Circles(diameter_mm=0.6)),
-            "distance of unknown size, diameter 0.6 of that",
+            "distance of unknown size, diameter about 0.6 of that",
         ),
-        (Board("m", 7, 5, 1.0, 1.0, pattern=Charuco("DICT_5X5_100", 0.74)), "markers 0.74 of that"),
+        (Board("m", 7, 5, 1.0, 1.0, pattern=Charuco("DICT_5X5_100", 0.74)), "markers about 0.74 of that"),
         (Board("b", 9, 6, 1.0, 1.0), "squares of unknown size"),
     ],
     ids=["circles", "charuco", "chessboard"],

@@ -138,6 +138,24 @@ def test_a_folder_of_videos_is_a_camera_each(tmp_path: Path) -> None:
         calibrate_folders([tmp_path], FolderOptions(boards=("7x5x20",)), CalibrateOptions())
 
 
+def test_results_in_one_folder_have_frames_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames chosen for another board would replace those that the session of the first result names."""
+    folders = []
+
+    def kept(sources: object, folder: Path, *_: object, **__: object) -> None:
+        folders.append(folder)
+        raise InputError("enough")
+
+    monkeypatch.setattr("rigkit.workflows.calibration.calibrate_any.frames_of_videos", kept)
+    path = video(tmp_path / "a.avi", [np.full((240, 320), 90, np.uint8)])
+    for name in ("one", "two"):
+        with pytest.raises(InputError, match="enough"):
+            calibrate_folders(
+                [path], FolderOptions(boards=("7x5x20",)), CalibrateOptions(output=tmp_path / "out" / f"{name}.json")
+            )
+    assert folders == [tmp_path / "out" / f"{name}-session-frames" for name in ("one", "two")]
+
+
 def test_moments_of_videos_are_chosen_by_number(tmp_path: Path) -> None:
     path = video(tmp_path / "a.avi", [np.full((240, 320), 60 * k, np.uint8) for k in range(4)])
     found = [int(pictures[""].mean()) for _, pictures in moments_of_videos({"": path}, (1, 3))]

@@ -63,7 +63,7 @@ def test_an_identified_grid_with_rows_staggered_to_the_left_may_be_mirrored(
     assert main(["board", "identify", str(tmp_path)]) == 0
     printed = capsys.readouterr()
     assert "layout=hexagonal,stagger=left" in printed.out
-    assert "are the images mirrored, as by the driver of a webcam?" in printed.err
+    assert "as BoofCV prints them; if the rows of the print begin further right" in printed.err
 
 
 @pytest.mark.parametrize(

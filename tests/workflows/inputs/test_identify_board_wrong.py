@@ -90,10 +90,11 @@ def test_boards_alike_are_named_where_a_rig_comes_to_nothing(
 
 
 def test_boards_that_are_as_declared_are_not_misread(folder: Path) -> None:
-    """The board is identified once more meanwhile, which takes a minute with large ones: its progress is shown."""
+    """The board is identified once more meanwhile, which takes a minute with large ones: its progress is shown, under
+    another name than that of the first time."""
     said: list[str] = []
     assert why_misplaced(sorted(folder.glob("*.png")), [BOARD], lambda what, done, total: said.append(what)) is None
-    assert set(said) == {"identifying the board"}
+    assert set(said) == {"checking which board it is"}
     assert why_misplaced([folder / "0.png"], [Board("plain", 7, 7, 30.0, 30.0)]) is None
 
 
