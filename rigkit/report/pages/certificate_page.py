@@ -46,8 +46,9 @@ def certificate_facts(certificate: Certificate, limit: float | None = None) -> P
     """Return the facts of a certificate, compared with `limit` (in the task's unit) if given."""
     unit = certificate.task.unit
     place = ", ".join(f"{x:.0f}" for x in certificate.pixels[certificate.worst_place])
+    view = "that part" if certificate.coarse_share else "the view"
     sentences = [
-        f"The bound is {certificate.median:.3g} {unit} in half of the view, and largest at pixel ({place}).",
+        f"The bound is within {certificate.median:.3g} {unit} in half of {view}, and largest at pixel ({place}).",
         f"{100.0 * float(certificate.in_view.mean()):.0f} % of the image of camera '{certificate.instrument.names[0]}' "
         "have the whole object in view" + (" of both cameras." if certificate.instrument.is_rig else "."),
     ]
@@ -74,7 +75,7 @@ def _headline(certificate: Certificate) -> str:
         return f"{what}: no bound is certified"
     where = f"in {_percent(1.0 - coarse)} of the view; elsewhere none is certified"
     return (
-        f"{what}: {100.0 * task.confidence:g} % of errors within {certificate.worst_certified:.3g} {task.unit} "
+        f"{what}: {100.0 * task.confidence:g} % of errors within {certificate.worst:.3g} {task.unit} "
         f"{where if coarse else 'everywhere in view'}"
     )
 
@@ -101,7 +102,7 @@ def causes_table(certificate: Certificate) -> Table:
     unit, shares = certificate.task.unit, certificate.shares()
     row, column = certificate.worst_place
     rows = tuple(
-        cells(cause, float(np.nanmedian(sigma)), float(sigma[row, column]), 100.0 * shares[cause])
+        cells(cause, float(np.median(sigma[certificate.places])), float(sigma[row, column]), 100.0 * shares[cause])
         for cause, sigma in certificate.sigma.items()
     )
     heads = columns(
@@ -204,7 +205,7 @@ def _draw_map(axis: Any, certificate: Certificate) -> None:
 
 def _draw_causes(axis: Any, certificate: Certificate) -> None:
     row, column = certificate.worst_place
-    middle = {cause: float(np.nanmedian(sigma)) ** 2 for cause, sigma in certificate.sigma.items()}
+    middle = {cause: float(np.median(sigma[certificate.places])) ** 2 for cause, sigma in certificate.sigma.items()}
     worst = {cause: float(sigma[row, column]) ** 2 for cause, sigma in certificate.sigma.items()}
     for place, shares in enumerate((middle, worst)):
         whole, base = sum(shares.values()), 0.0

@@ -68,19 +68,25 @@ class Certificate:
     findings: tuple[Finding, ...] = ()
 
     @property
+    def places(self) -> BoolArray:
+        """Mask (R, C) of the places that the figures below are of: where the bound is certified; if it is so nowhere,
+        all in view."""
+        return self.in_view & ~self.coarse if self.coarse_share < 1.0 else self.in_view
+
+    @property
     def worst(self) -> float:
-        """The largest bound in view."""
-        return float(np.nanmax(self.bound))
+        """The largest bound at these `places`."""
+        return float(np.max(self.bound[self.places]))
 
     @property
     def median(self) -> float:
-        """The median bound in view."""
-        return float(np.nanmedian(self.bound))
+        """The median bound at these `places`."""
+        return float(np.median(self.bound[self.places]))
 
     @property
     def worst_place(self) -> tuple[int, int]:
-        """Row and column of the largest bound."""
-        row, column = np.unravel_index(int(np.nanargmax(self.bound)), self.bound.shape)
+        """Row and column of the largest bound at these `places`."""
+        row, column = np.unravel_index(int(np.argmax(np.where(self.places, self.bound, -1.0))), self.bound.shape)
         return int(row), int(column)
 
     @property
@@ -92,11 +98,6 @@ class Certificate:
     def is_bad(self) -> bool:
         """Whether a finding says that the bound must not be trusted."""
         return any(finding.severity is Severity.BAD for finding in self.findings)
-
-    @property
-    def worst_certified(self) -> float:
-        """The largest bound in view where it is certified; NaN if there is no such place."""
-        return float(np.max(self.bound[self.in_view & ~self.coarse])) if self.coarse_share < 1.0 else np.nan
 
     def share_within(self, limit: float) -> float:
         """Return the fraction of the view with a certified bound of at most `limit`."""

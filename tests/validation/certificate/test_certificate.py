@@ -22,7 +22,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.report.pages import certificate_page
-from rigkit.report.pages.certificate_page import basis, bound_figure, certificate_pdf
+from rigkit.report.pages.certificate_page import basis, bound_figure, certificate_facts, certificate_pdf
 from rigkit.report.pictures.figures import _drawn
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.propagation import (
@@ -215,6 +215,21 @@ def test_the_causes_add_up_and_the_worst_is_named_first(rng: np.random.Generator
     advice = certificate.findings[-1]
     assert "to halve the worst error: board scale makes" in advice.message
     assert 0.0 < certificate.share_within(certificate.median) < certificate.share_within(certificate.worst) == 1.0
+
+
+def test_what_is_said_of_the_worst_place_is_said_of_a_certified_one(rng: np.random.Generator) -> None:
+    """Where nothing is certified the bound is largest, but it is none."""
+    rig = rig_of("brown", rig_covariance(lens("brown"), rng))
+    whole = certify(rig, Task(quantity=Quantity.LENGTH, size_mm=200.0, distance_mm=1500.0), cells=(9, 7))
+    partly = replace(whole, coarse=whole.in_view & (whole.bound > whole.median))
+    assert 0.3 < partly.coarse_share < 0.7
+    assert partly.worst == partly.to_dict()["worst"] == pytest.approx(whole.median)
+    assert partly.median < partly.worst < whole.worst
+    assert not partly.coarse[partly.worst_place] and partly.bound[partly.worst_place] == partly.worst
+    place = ", ".join(f"{x:.0f}" for x in partly.pixels[partly.worst_place])
+    assert f"in half of that part, and largest at pixel ({place})" in certificate_facts(partly).sentences[0]
+    nowhere = replace(whole, coarse=whole.in_view)
+    assert nowhere.worst == whole.worst and nowhere.worst_place == whole.worst_place
 
 
 def test_what_is_not_counted_in_is_said(rng: np.random.Generator) -> None:
