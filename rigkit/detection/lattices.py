@@ -97,10 +97,12 @@ def find_lattices(
         if sum(item.count for item in boards) <= more_than:
             return []
         out = fit_and_confirm(grey, boards, criteria)
-        if has_markers is None and at is not searched:
-            # Of discs that nearly touch, coarser levels show corners that hide how far the edges bow between them.
-            # Markers in the squares bow edges, too, but the finest level shows their corners.
-            out = [item for item in out if not (item.lattice.solid and has_bowed_edges(item.lattice, searched.finest))]
+        if has_markers is None:
+            # Large lattices were tested before they were fully grown. Of discs that nearly touch, coarser levels show
+            # corners that hide how far the edges bow between them. Markers in the squares bow edges, too, but the
+            # finest level shows their corners.
+            off = has_edge_offset if at is searched else has_bowed_edges
+            out = [item for item in out if not (item.lattice.solid and off(item.lattice, searched.finest))]
         plausible.rejected += 0 if out else len(boards)
         return out
 
@@ -263,13 +265,22 @@ def _confirmed_parts(
         if len(parts) == 1:
             if is_large_enough(own.lattice, criteria.min_corners):
                 # Corners of squares with markers are fitted again by their finder.
-                out.append(_with_scatter(placed_together(grey, own, criteria.has_markers)))
+                placed = placed_together(grey, own, criteria.has_markers)
+                raised = _with_scatter(placed)
+                if raised is placed or _remains_board(grey, raised, criteria):
+                    out.append(raised)
             continue
         # The fits of these corners used edges on the other side of the discontinuity: fit them again.
         alone = [part.lattice.trimmed() for part in parts]
         own_parts = [part for part in alone if is_large_enough(part, criteria.min_corners)]
         out += _confirmed_parts(grey, own_parts, refine(grey, own_parts, _score), criteria)
     return out
+
+
+def _remains_board(grey: GreyImage, item: RefinedLattice, criteria: BoardCriteria) -> bool:
+    """Return whether a lattice is still a board after its sigmas were raised for the scatter of its corners."""
+    prior = OF_EXPECTED_SIZE if _of_size(item.lattice, criteria.sizes) else 0.0
+    return Evidence.of(item).score + prior > 0.0 or _is_marked_board(grey, item.lattice, item, criteria)
 
 
 def _with_scatter(item: RefinedLattice) -> RefinedLattice:

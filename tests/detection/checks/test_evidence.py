@@ -12,10 +12,12 @@ from detection_bench.blanks import blank
 from detection_bench.scenes import CONDITIONS, one_board
 
 from rigkit.core.boards import Board
+from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.checks.evidence import OF_NOISE, SCORE, Evidence
 from rigkit.detection.checks.validate import without_shared_corners
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.saddles.response import grey_image
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import excess_scatter, scatter_factors
 
@@ -70,6 +72,19 @@ def test_what_only_coarser_levels_show_is_no_board(name: str, seed: int) -> None
     """There are saddles between the crossings of stripes, where the image is uniform, and between discs, whose edges
     are off the lines of the saddles."""
     assert not detect_boards(blank(name, np.random.default_rng(seed)))
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "board"),
+    [
+        ("staggered", 316, None),
+        ("staggered", 316, Board("plain", 8, 6, 60.0, 60.0)),
+        ("tartan", 611, Board("marked", 8, 6, 60.0, 60.0, pattern=Charuco("DICT_5X5_100", 45.0))),
+    ],
+)
+def test_what_passes_with_few_corners_is_judged_again(name: str, seed: int, board: Board | None) -> None:
+    """Of discs the first corners seem to be those of squares, of stripes the scatter is known after the last fit."""
+    assert not detect_boards(grey_image(blank(name, np.random.default_rng(seed))), board and [board])
 
 
 def fitted(contrast: np.ndarray) -> RefinedLattice:
