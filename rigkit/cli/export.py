@@ -1,4 +1,4 @@
-"""`rigkit export`: convert cameras and rigs between formats; clouds to PLY, LAS, of a data set also to npz, COLMAP.
+"""`rigkit export`: convert cameras and rigs between formats; clouds to PLY, npz, LAS, of a data set also to COLMAP.
 
 examples:
   rigkit export calibration.json -o camera.yaml --to opencv

@@ -13,7 +13,7 @@ from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import unit
 from rigkit.interop.las import las_bytes
-from rigkit.io.ply import write_ply
+from rigkit.io.ply import ply_bytes, read_ply, write_ply
 
 laspy = pytest.importorskip("laspy")
 ROUNDED = 2.0**-30
@@ -67,6 +67,12 @@ def test_what_cannot_be_is_said(tmp_path: Path, rng: np.random.Generator, capsys
     source = tmp_path / "scene.ply"
     write_ply(source, cloud(3, rng))
     assert main(["export", str(source), "--to", "colmap", "-o", str(tmp_path / "model")]) == 2
-    assert "a PLY is written as ply, las" in capsys.readouterr().err
+    assert "a PLY is written as ply, npz, las" in capsys.readouterr().err
+    source.write_bytes(ply_bytes(cloud(3, rng), unit="baselines"))
+    assert main(["export", str(source), "-o", str(tmp_path / "scene.npz")]) == 0
+    arrays, stored = np.load(tmp_path / "scene.npz"), read_ply(source)
+    assert np.array_equal(arrays["points_baselines"], stored.points_mm)
+    assert np.array_equal(arrays["normals"], stored.normals)
+    assert "pixels1" not in arrays and "points_mm" not in arrays
     with pytest.raises(InputError, match="no points"):
         las_bytes(cloud(3, rng).select(np.zeros(3, dtype=bool)))

@@ -34,6 +34,8 @@ OURS = re.compile(r'\A\s*\{\s*["}]')
 JSON_TOO = ("mrcal", "py-ocamcalib", "opencv")
 STEREO = re.compile(r'^\s*["<]?M1\b', re.MULTILINE)
 """Key that OpenCV's stereo files have and single cameras lack."""
+COLMAP_RIG = re.compile(r'"image_prefix"\s*:')
+"""Key of COLMAP's rig_config.json."""
 
 
 def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[int, int] | None = None) -> Camera:
@@ -51,6 +53,15 @@ def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[i
     return known.camera
 
 
+def _refuse_colmap_rig(text: str, name: str) -> None:
+    """Raise InputError for a rig_config.json of COLMAP."""
+    if COLMAP_RIG.search(text):
+        raise InputError(
+            f"'{name}': a rig_config.json of COLMAP does not say how large images are, so it is written only; give the "
+            "rig that it was made of, or cameras.txt of the model"
+        )
+
+
 def import_near_camera(path: str | Path) -> Camera:
     """Return the camera of a file for points in mm: a `NearCamera` if the pupil moves, else as `import_camera`."""
     known = _camera_or_calibration(Path(path), None, None)
@@ -62,6 +73,7 @@ def _camera_or_calibration(source: Path, kind: str | None, size_px: tuple[int, i
     text, name = camera_text(source), str(source)
     kind = kind or camera_format(text)
     if kind is None:
+        _refuse_colmap_rig(text, name)
         raise InputError(f"'{name}': none of the known camera formats ({', '.join(READ_FORMATS)}); check the file")
     if kind not in READ_FORMATS:
         raise InputError(f"'{kind}' is no camera format; known are {', '.join(READ_FORMATS)}")
@@ -161,6 +173,8 @@ def is_rig(path: str | Path) -> bool:
     kind = camera_format(text)
     if kind == "matlab":
         return is_matlab_pair(text)
+    if kind is None:
+        return COLMAP_RIG.search(text) is not None
     return (kind == "kalibr" and "T_cn_cnm1" in text) or (kind == "opencv" and STEREO.search(text) is not None)
 
 
@@ -191,6 +205,7 @@ def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
         return {"left": (left, Rigid3.identity()), "right": (right, right_from_left)}
     if kind == "rigkit":
         return load_rig(path)
+    _refuse_colmap_rig(text, name)
     raise InputError(
         f"'{name}': no rig of rigkit, Kalibr (camchain), OpenCV (M1, D1, M2, D2, R, T) or MATLAB; check the file"
     )

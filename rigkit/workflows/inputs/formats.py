@@ -15,5 +15,5 @@ FOREIGN_ENDINGS = {
 CAMERA_FORMATS = ("rigkit", *FOREIGN_ENDINGS)
 READ_FORMATS = (*CAMERA_FORMATS, "py-ocamcalib", "matlab")
 CLOUD_FORMATS = ("ply", "npz", "las", "colmap")
-PLY_FORMATS = ("ply", "las")
+PLY_FORMATS = ("ply", "npz", "las")
 """Formats that a PLY file can be exported to."""

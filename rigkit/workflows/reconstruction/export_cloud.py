@@ -74,7 +74,8 @@ def export_ply(source: Path, options: ExportCloudOptions) -> OrientedCloud:
     """
     ensure_writable(options.output, force=options.force, inputs=(source,))
     cloud = read_ply(source)
-    content = _cloud_bytes(cloud, options, ply_unit(source))
+    unit = ply_unit(source)
+    content = npz_bytes(_cloud_arrays(cloud, unit)) if options.kind == "npz" else _cloud_bytes(cloud, options, unit)
     files: dict[str, str | bytes] = {options.output.name: content}
     write_results(options.output.parent, files, force=options.force, inputs=(source,))
     return cloud
@@ -82,17 +83,8 @@ def export_ply(source: Path, options: ExportCloudOptions) -> OrientedCloud:
 
 def _cloud_npz(reconstruction: Reconstruction) -> bytes:
     """Return an npz file of points, normals, sigmas, corners, affinities and relative pose."""
-    cloud, matches = reconstruction.cloud, reconstruction.matches
-    arrays: dict[str, NDArray[Any]] = {
-        "points_mm": cloud.points_mm,
-        "normals": cloud.normals,
-        "colours": cloud.colours,
-        "sigma_mm": cloud.sigma_mm,
-        "normal_sigma_rad": cloud.normal_sigma_rad,
-        "calibration_in_sigmas": np.array(cloud.calibration_in_sigmas),
-        "board_index": cloud.board_index,
-        "grid": cloud.grid,
-        "board_ids": np.array(cloud.board_ids),
+    matches = reconstruction.matches
+    arrays = _cloud_arrays(reconstruction.cloud, "mm") | {
         "pixels1": reconstruction.pixels1,
         "pixels2": reconstruction.pixels2,
         "cam2_from_cam1": reconstruction.cam2_from_cam1.matrix(),
@@ -103,6 +95,21 @@ def _cloud_npz(reconstruction: Reconstruction) -> bytes:
     if reconstruction.pose_covariance is not None:
         arrays["pose_covariance"] = reconstruction.pose_covariance
     return npz_bytes(arrays)
+
+
+def _cloud_arrays(cloud: OrientedCloud, unit: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a cloud by name; lengths are in `unit`, by which points and sigmas are named."""
+    return {
+        f"points_{unit}": cloud.points_mm,
+        "normals": cloud.normals,
+        "colours": cloud.colours,
+        f"sigma_{unit}": cloud.sigma_mm,
+        "normal_sigma_rad": cloud.normal_sigma_rad,
+        "calibration_in_sigmas": np.array(cloud.calibration_in_sigmas),
+        "board_index": cloud.board_index,
+        "grid": cloud.grid,
+        "board_ids": np.array(cloud.board_ids),
+    }
 
 
 def _cloud_bytes(cloud: OrientedCloud, options: ExportCloudOptions, unit: str = "mm") -> bytes:
