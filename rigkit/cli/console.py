@@ -27,12 +27,15 @@ if TYPE_CHECKING:
 
 Options = TypeVar("Options")
 REDRAW_S = 0.1
+REPEAT_S = 5.0
+"""Time after which a stage that goes on says how far it is where there is no terminal to draw a bar on."""
 BAR_WIDTH = 24
 IMAGE_SIZE = re.compile(r"([0-9]{1,6})[xX]([0-9]{1,6})")
 
 
 def progress_on_stderr() -> Progress:
-    """Return a progress callback: a bar on a terminal, elsewhere one line for each finished stage."""
+    """Return a progress callback: a bar on a terminal, elsewhere one line for each finished stage, and some between for
+    those that take long."""
     started: dict[str, float] = {}
     drawn = 0.0
 
@@ -50,6 +53,9 @@ def progress_on_stderr() -> Progress:
                     bar = "#" * filled + "." * (BAR_WIDTH - filled)
                     end = f" {now - started[what]:.1f} s\n" if finished else ""
                     print(f"\r{what:<36.36} [{bar}] {done}/{total}{end}", end="", file=sys.stderr, flush=True)
+            elif done and not finished and now - max(drawn, started[what]) >= REPEAT_S:
+                drawn = now
+                print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)
             elif finished:
                 print(f"{what}: {done} done in {now - started[what]:.1f} s", file=sys.stderr, flush=True)
         if finished:

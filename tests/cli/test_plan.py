@@ -141,6 +141,8 @@ def test_a_calibration_that_was_called_bad_is_warned_of(
         printed = {"severity": severity, "message": "two cameras are mixed", "remedy": "calibrate each"}
         source = tmp_path / f"{severity}.json"
         source.write_text(json.dumps(data | {"verdicts": [printed]}))
-        assert main(["plan", str(source), "-n", "1"]) == 0
+        page = tmp_path / f"{severity}.html"
+        assert main(["plan", str(source), "-n", "1", "-r", str(page)]) == 0
+        assert ("verdict is bad: two cameras are mixed" in page.read_text()) == (severity == "bad")
         called = f"'{source}': the calibration's verdict is bad: two cameras are mixed"
         assert (called in capsys.readouterr().err) == (severity == "bad")

@@ -4,7 +4,8 @@ Image viewers apply the EXIF orientation; conferencing programs mirror. Such an 
 principal point reflected at the image centre, and a mirrored image shows a mirrored board. The only unknown is which
 images were flipped. Each image is tested: with lens and board shape held, does it fit better unchanged or flipped back?
 Then lens and board shape are solved for again. This needs no two clusters of principal points, which few images, or
-boards that compensate by their tilt, do not show clearly.
+boards that compensate by their tilt, do not show clearly. Images that were cropped on opposite sides have reflected
+principal points, too: that is said beside it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 
 from rigkit.calibration.assemble import with_solution
 from rigkit.calibration.choosing.board_orientation import with_boards_renumbered
-from rigkit.calibration.judging.two_kinds import MIN_LEAD, split_entropy, split_in_two
+from rigkit.calibration.judging.two_kinds import MIN_LEAD, SIGMAS_DO_NOT_HOLD, split_entropy, split_in_two
 from rigkit.calibration.judging.view_evidence import ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
@@ -43,6 +44,11 @@ ROUNDS = 4
 MIN_FIRST_GAIN = 0.1
 """Part of the squares that flipping views back must explain, with lens and boards held, before it is solved for: 0.4 to
 0.6 for REAL and SIMULATED sessions with every fourth image mirrored, 0 to 0.01 for the unchanged sessions."""
+MAX_OFF_CENTRE = 0.04
+"""Distance of the principal point from the image centre, as a part of the longer side, from which images were rather
+cropped than flipped: that of REAL lenses is 0.001 to 0.035 (camodocal, bouguet). It decides which is said first."""
+MIN_CROP = 0.01
+"""Part of the longer side that a crop takes at least, to be said at all."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -74,7 +80,7 @@ def flipped_images(
     before = float(weighted_squares(fit.state, observations, fit.weight(observations)).sum())
     tried = [
         _alternated(way, at, turns, observations, fit, before)
-        for way in FLIP_SIGNS
+        for way in _possible_ways(observations)
         for at, turns in _initial_flips(way, evidence if shifted else None, observations, fit)
     ]
     if not tried or not before > 0.0:
@@ -84,6 +90,12 @@ def flipped_images(
     solved = with_solution(calibration, back.observations, back.state, residuals, fit.kept)
     now = view_evidence(solved, clusters)
     return None if now is None else _finding_of(back, before, now)
+
+
+def _possible_ways(observations: Observations) -> list[str]:
+    """Return the flips after which the boards are still found: mirrored markers and tags cannot be read."""
+    readable = not any(board.pattern.identified for board in observations.boards)
+    return [way for way, signs in FLIP_SIGNS.items() if readable or math.prod(signs) > 0.0]
 
 
 def _initial_flips(
@@ -180,8 +192,18 @@ def _finding_of(back: _FlippedBack, before: float, evidence: ViewEvidence) -> Fi
         return None
     names = [view.image for view in back.observations.views]
     flipped = list(dict.fromkeys(name for name, of in zip(names, at, strict=True) if of == (part <= 0.5)))
+    camera = back.state.camera
+    off = np.where(np.array(FLIP_SIGNS[back.way]) < 0.0, camera.axis_px - image_center(camera.size_px), 0.0)
+    apart = float(np.linalg.norm(2.0 * off))
+    causes, size = [back.way], max(camera.size_px)
+    if apart > MIN_CROP * size:
+        causes.insert(
+            0 if apart > 2.0 * MAX_OFF_CENTRE * size else 1,
+            f"cropped on opposite sides (principal points {apart:.0f} px apart)",
+        )
     return Finding.bad(
-        f"{len(flipped)} of {len(set(names))} images (such as '{flipped[0]}'), or all others, are {back.way}: undoing "
-        f"that removes {100.0 * (1.0 - left):.0f} % of the sum of squared residuals",
+        f"{len(flipped)} of {len(set(names))} images (such as '{flipped[0]}'), or all others, are "
+        f"{', or '.join(causes)}: undoing that removes {100.0 * (1.0 - left):.0f} % of the sum of squared residuals; "
+        f"{SIGMAS_DO_NOT_HOLD}",
         "use the image files as the camera wrote them, and calibrate again",
     )

@@ -258,19 +258,17 @@ def _coverage(c: Calibration) -> Iterator[Finding]:
     rays, valid = c.camera.unproject(np.stack([u, v], axis=-1))
     empty = (count < CELL_CORNERS) & valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(ASKED_DEG)))
     if empty.any():
-        yield Finding.look(
-            f"no corners in the {_in_words(empty)} of the image", "take images with the board there, tilted"
-        )
+        yield Finding.look(f"no corners in {_in_words(empty)} of the image", "take images with the board there, tilted")
 
 
 def _in_words(cells: BoolArray) -> str:
     """Return cells (columns, rows) of the image in words, whole rows and columns together."""
     columns, rows = np.asarray(cells.all(axis=1)), np.asarray(cells.all(axis=0))
-    names = [f"whole {NAMES_U[i]}" for i in np.flatnonzero(columns)]
-    names += [f"whole {NAMES_V[j]}" for j in np.flatnonzero(rows)]
+    names = [f"the {NAMES_U[i]} quarter" for i in np.flatnonzero(columns)]
+    names += [f"the {NAMES_V[j]} third" for j in np.flatnonzero(rows)]
     single = np.asarray(cells & ~columns[:, None] & ~rows[None, :])
-    names += [f"{NAMES_V[j]} {NAMES_U[i]}" for i, j in np.argwhere(single)]
-    return ", ".join(names)
+    names += [f"the {NAMES_V[j]} {NAMES_U[i]}" for i, j in np.argwhere(single)]
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def _cell(c: Calibration, pixel: FloatArray) -> str:

@@ -138,14 +138,19 @@ def plan_lead(plan: Plan) -> str:
 
 
 def plan_page(
-    plan: Plan, title: str, provenance: Mapping[str, str], taken: Pixels | None = None, found: Sequence[Table] = ()
+    plan: Plan,
+    title: str,
+    provenance: Mapping[str, str],
+    taken: Pixels | None = None,
+    found: Sequence[Table] = (),
+    warning: str = "",
 ) -> str:
-    """Return the plan as self-contained HTML."""
+    """Return the plan as self-contained HTML, with a `warning` first."""
     facts = plan_facts(plan, found)
     return render(
         "plan.html",
         title=title,
-        lead="",
+        lead=warning,
         verdict_line={"words": "", "colour": "", "headline": facts.headline},
         views=views_context(plan, taken),
         dots=taken is not None and len(taken) > 0,

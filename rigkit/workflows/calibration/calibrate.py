@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -159,16 +159,21 @@ def calibration_from(
         if shown is not None:
             # It names the print, too.
             verdicts = (verdicts[0], Finding.bad(shown), *(one for one in verdicts[1:] if one not in prints))
-    elif any(board.identified and _mostly_hidden(board, views) for board in session.boards):
+    elif _mostly_hidden(session.boards, views):
         shown = why_misplaced(session.images, session.boards, progress)
         verdicts = (*verdicts, *(() if shown is None else (Finding.look(shown),)))
     return replace(result, dropped=(*dropped, *result.dropped), verdicts=verdicts)
 
 
-def _mostly_hidden(board: Board, views: Sequence[BoardView]) -> bool:
-    """Return whether no view of a board shows most of its corners, as if its marks were numbered otherwise."""
-    seen = [len(view.grid) for view in views if view.board.board_id == board.board_id]
-    return bool(seen) and max(seen) < MOST_CORNERS * board.corner_count
+def _mostly_hidden(boards: Iterable[Board], views: Sequence[BoardView]) -> bool:
+    """Return whether no view of some board with marks shows most of its corners, as if these were numbered
+    otherwise."""
+    most: dict[str, int] = {}
+    for view in views:
+        name = view.board.board_id
+        most[name] = max(most.get(name, 0), len(view.grid))
+    marked = [board for board in boards if board.identified and board.board_id in most]
+    return any(most[board.board_id] < MOST_CORNERS * board.corner_count for board in marked)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -337,15 +342,25 @@ def rig_from(
         also += [] if session.rigid_boards else suggest_rigid_boards(seen, calibration)
         also += wrong_print(seen, named_images(session.cameras[name]))
     rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(also)))
-    if rig.verdicts[0].severity is Severity.BAD:
-        wrong = [Finding.bad(words) for words in _misread(session, progress)]
-        rig = replace(rig, verdicts=(rig.verdicts[0], *wrong, *rig.verdicts[1:]))
+    rig = _with_misread(rig, session, [view for framed in views.values() for _, view in framed], progress)
     single = [replace(c, dropped=(*dropped[n], *c.dropped)) for n, c in zip(session.cameras, rig.single, strict=True)]
     cameras = [
         replace(c, calibration=replace(c.calibration, dropped=alone.dropped))
         for c, alone in zip(rig.cameras, single, strict=True)
     ]
     return replace(rig, single=tuple(single), cameras=tuple(cameras))
+
+
+def _with_misread(
+    rig: RigCalibration, session: RigSession, views: Sequence[BoardView], progress: Progress
+) -> RigCalibration:
+    """Return the rig with verdicts on boards that are declared with other marks than printed, looked for where it is
+    bad or no camera's view shows most of a board's corners."""
+    bad = rig.verdicts[0].severity is Severity.BAD
+    if not bad and not _mostly_hidden([b for own in session.cameras.values() for b in own.boards], views):
+        return rig
+    wrong = [Finding.bad(words) if bad else Finding.look(words) for words in _misread(session, progress)]
+    return replace(rig, verdicts=(rig.verdicts[0], *wrong, *rig.verdicts[1:]))
 
 
 def _misread(session: RigSession, progress: Progress) -> list[str]:

@@ -10,6 +10,7 @@ from rigkit.calibration.views.usable import without_parts
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.findings import Finding
 from rigkit.core.measurement_task import Task
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
@@ -32,7 +33,13 @@ from rigkit.validation.monitoring.watch import monitored_camera
 from rigkit.workflows.calibration.calibrate import calibrate_session, session_inputs
 from rigkit.workflows.calibration.next_pictures import NEXT_VIEWS, goal_of, next_frames, next_views
 from rigkit.workflows.checks.check import load_monitored
-from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad, warn_of_pupil
+from rigkit.workflows.inputs.camera_files import (
+    bad_verdict,
+    bad_verdict_in_file,
+    require_covariance,
+    warn_if_bad,
+    warn_of_pupil,
+)
 from rigkit.workflows.options.base import NamesFiles
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
@@ -101,24 +108,27 @@ def plan_session(
     if rig and source.suffix == ".toml":
         raise InputError(f"plan: '{source}' is a session of a rig; give the rig that it was calibrated to, rig.json")
     ensure_writable(options.report, force=options.force, inputs=[source])
+    bad = None
     if source.suffix != ".toml":
         require_covariance(source)
+        bad = bad_verdict_in_file(source)
         warn_if_bad(source)
     if rig:
         monitored, boards = load_monitored(source)
         if not boards:
             raise InputError(f"plan: '{source}' does not say what boards there are; calibrate it with rigkit")
         if options.check:
-            return _checked(monitored, boards, options, source)
+            return _checked(monitored, boards, options, source, bad)
         with about(source):
             plan = next_frames(monitored, boards, options.count, length=options.length, reach=options.reach)
-        return _shown(plan, options, f"Next images for {source.name}", source)
+        return _shown(plan, options, f"Next images for {source.name}", source, bad)
     if source.suffix == ".toml":
         session = load_session(source)
         calibrating = CalibrateOptions(cache=Cache.UPDATE)
         ensure_writable(options.report, force=options.force, inputs=[source, *session_inputs(session, calibrating)])
         calibration = calibrate_session(session, calibrating, progress=progress).calibration
         warn_if_bad(source, calibration.verdicts)
+        bad = bad_verdict(calibration.verdicts)
         boards = session.boards
     else:
         calibration = load_calibration(source)
@@ -128,21 +138,26 @@ def plan_session(
             raise InputError(f"plan: no whole board was seen for '{source}'; give the session that it was made from")
     taken = calibration.corners.used[0]
     if options.check:
-        return _checked(monitored_camera(calibration, source.stem), boards, options, source, taken)
+        return _checked(monitored_camera(calibration, source.stem), boards, options, source, bad, taken)
     warn_of_pupil(source, calibration)
     with about(source):
         plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
-    return _shown(plan, options, f"Next images for {source.name}", source, taken)
+    return _shown(plan, options, f"Next images for {source.name}", source, bad, taken)
 
 
 def _checked(
-    monitored: Monitored, boards: Sequence[Board], options: PlanOptions, source: Path, taken: Pixels | None = None
+    monitored: Monitored,
+    boards: Sequence[Board],
+    options: PlanOptions,
+    source: Path,
+    bad: Finding | None,
+    taken: Pixels | None = None,
 ) -> PlannedSession:
     """Return the pictures to check a camera or a rig with."""
     with about(source):
         plan, powers = informative_views(monitored, boards, options.count, options.reach)
     found = (power_table(powers, "Changes that these images would reveal"),)
-    return _shown(plan, options, f"Images to check {source.name} with", source, taken, found)
+    return _shown(plan, options, f"Images to check {source.name} with", source, bad, taken, found)
 
 
 def plan_lens(lens: LensOptions, options: PlanOptions) -> PlannedSession:
@@ -164,12 +179,14 @@ def _shown(
     options: PlanOptions,
     title: str,
     source: Path | None = None,
+    bad: Finding | None = None,
     taken: Pixels | None = None,
     found: tuple[Table, ...] = (),
 ) -> PlannedSession:
     """Return the plan, and write its page where one is asked for."""
     if options.report is not None:
         facts = software_facts() | ({source.name: digest_line(source)} if source is not None else {})
-        write_atomic(options.report, plan_page(plan, title, facts, taken, found), force=options.force)
+        page = plan_page(plan, title, facts, taken, found, "" if bad is None else bad.text)
+        write_atomic(options.report, page, force=options.force)
     written = () if options.report is None else (options.report,)
     return PlannedSession(plan=plan, found=found, written=written)

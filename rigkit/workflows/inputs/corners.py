@@ -64,7 +64,10 @@ def session_views(
     size_px = _common_size(session, found)
     if (halves := side_by_side_pictures(found, session.boards)) is not None:
         raise InputError(f"{session.path}: {halves}")
-    views, dropped = [], list(corners.unreadable.items())
+    paths = named_images(session)
+    # The image is named by who reports it.
+    dropped = [(n, why.replace(f"image '{paths.get(n)}'", "it", 1)) for n, why in corners.unreadable.items()]
+    views: list[BoardView] = []
     boards = without_lookalikes({name: item.detections for name, item in found.items()}, session.boards)
     for name, item in found.items():
         if item.size_px != size_px:

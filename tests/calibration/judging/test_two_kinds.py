@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +11,10 @@ from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.cameras.base import Camera
+from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.findings import Severity
+from rigkit.core.patterns.charuco import Charuco
 
 NOISE_PX = 0.03
 KINDS = "the images form two groups"
@@ -88,6 +91,25 @@ def test_pictures_mirrored_about_their_principal_point() -> None:
     text = calibrate(some, SIZE, model="brown").verdicts[0].text
     assert "5 of 20 images (such as" in text and "mirrored left to right" in text
     assert "are mirrored" not in str(calibrate(views, SIZE, model="brown").verdicts)
+
+
+@pytest.mark.parametrize(
+    "board", [BOARD, replace(BOARD, pattern=Charuco("DICT_4X4_50", marker_mm=0.7 * BOARD.square_x_mm))]
+)
+def test_pictures_cropped_left_and_right_are_not_called_mirrored(board: Board, rng: np.random.Generator) -> None:
+    """What is left of a lens in the middle has its principal point left and right of the middle, as in a mirror. In a
+    mirror markers cannot be read."""
+    camera = lens("reg", np.array([815.0, 680.0]))
+    whole = [replace(view, board=board) for view in seen(camera, 16, rng)]
+    views = [
+        on_image(replace(v, pixels=v.pixels + np.array([(-1) ** k * 120.0, 0.0])), camera) for k, v in enumerate(whole)
+    ]
+    first, _ = reported(views, rng)
+    if board.pattern.identified:
+        assert "mirrored left" not in first and KINDS in first and "cropped" in first
+    else:
+        assert "8 of 16 images (such as" in first
+        assert re.search(r"cropped on opposite sides \(principal points 2[34]\d px apart\), or mirrored left", first)
 
 
 @pytest.mark.parametrize("later", [False, True])

@@ -49,7 +49,7 @@ def test_too_few_tilts_and_empty_corners(rng: np.random.Generator) -> None:
     result = calibrate(views, SIZE, model="brown", board="flat")
     assert printed(result, "tilted by more than") and result.verdicts[0].severity is Severity.BAD
     assert printed(result, "where boards were seen, most in the")
-    assert printed(result, "no corners in the whole left, whole right")
+    assert printed(result, "no corners in the left quarter, the right quarter")
 
 
 @pytest.mark.parametrize(("tilt_deg", "reported"), [((0.0, 3.0), False), ((10.0, 45.0), True)])

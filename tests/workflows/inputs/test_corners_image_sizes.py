@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,15 @@ def test_images_turned_by_a_quarter_are_called_that() -> None:
 def test_other_sizes_are_not_called_turned() -> None:
     text = refusal((320, 240))
     assert "turned" not in text and "one setting" in text and "folder of their own" in text
+
+
+def test_an_image_that_cannot_be_read_is_named_once() -> None:
+    """By who says that it is left out."""
+    session = replace(SESSION, images=tuple(Path(f"/far/{k}.jpg") for k in range(4)))
+    found = {f"{k}.jpg": FoundCorners((640, 480), (detection(BOARD, BOARD.grid() * 30.0 + 40.0),)) for k in range(3)}
+    why = "image '/far/3.jpg' cannot be decoded; convert it"
+    corners = SessionCorners(found=found, unreadable={"3.jpg": why}, source="")
+    assert session_views(session, corners)[2] == [("3.jpg", "it cannot be decoded; convert it")]
 
 
 @pytest.mark.parametrize(("other", "turned"), [((320, 240), ""), ((480, 640), ", turned by some program")])
