@@ -63,7 +63,7 @@ def detect_boards(
         # Chessboards that are not listed are returned too if lattices were searched for anyway.
         if own or (kind == Chessboard.type and (search.has_lattices or not search.boards)):
             found += finder.find(search, own)
-    sizes = search.chessboard_sizes
+    sizes = [board.size for board in search.boards]
     if search.min_corners_seen < min_corners:
         found = [item for item in found if len(item.grid) >= min_corners or _whole(item, sizes)]
     ordered = sorted(found, key=_rank) if len(found) > 1 else found

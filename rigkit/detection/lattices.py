@@ -30,7 +30,7 @@ from rigkit.detection.lattice.grow import MAX_FAILED_GROWTHS, grow_all
 from rigkit.detection.lattice.lattice import MIN_ROWS, Lattice, build_lattices
 from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
-from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
+from rigkit.detection.saddles.response import GreyImage, Level, enlarged_level, grey_image, pyramid
 from rigkit.detection.saddles.saddle import Corners, Saddles, each_once, find_corners, joined
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
@@ -78,6 +78,7 @@ def find_lattices(
     sizes: Sequence[tuple[int, int]] = (),
     *,
     has_markers: MarkerTest | None = None,
+    enlarged: bool = False,
 ) -> list[RefinedLattice]:
     """Return the refined lattices of all boards in `image`, in arbitrary order and orientation.
 
@@ -85,11 +86,12 @@ def find_lattices(
     `has_markers` : for boards with markers in their squares, which affect edges and fit. Lattices with edge offsets
     (`has_edge_offset`) are then not rejected, and those for which it is true are accepted regardless of their evidence
     and shape.
+    `enlarged` : search at twice the resolution of the image only, for narrow white lines between squares and markers.
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
     criteria = BoardCriteria(min_corners, sizes, has_markers)
-    searched = SearchedImage.of(grey)
+    searched = SearchedImage.of(grey, enlarged=enlarged)
     plausible = _RejectionCounter(_is_plausible if has_markers is None else _plausible_or_marked(has_markers))
 
     def search(at: SearchedImage, more_than: int = 0) -> list[RefinedLattice]:
@@ -108,15 +110,15 @@ def find_lattices(
 
     found = search(searched)
     if _needs_second_search(searched, found, sizes):
-        found = max(search(searched.with_smeared()), found, key=_corner_count)
-    for k in range(1, len(searched.levels)):
+        found = max(search(searched.with_smeared()), found, key=corner_count)
+    for k in range(1, 1 if enlarged else len(searched.levels)):
         # Coarser levels help only where squares do not meet at their corners; those of clutter do.
         if _has_whole_board(found, sizes) or plausible.rejected >= MAX_FAILED_GROWTHS:
             break
         coarser = searched.coarser(k)
         if coarser is None:
             break
-        found = max(found, search(coarser, _corner_count(found)), key=_corner_count)
+        found = max(found, search(coarser, corner_count(found)), key=corner_count)
     if min_corners < MIN_BOARD_CORNERS:
         return found
     return [
@@ -139,9 +141,10 @@ class SearchedImage:
     saddles: Saddles
 
     @classmethod
-    def of(cls, grey: GreyImage) -> SearchedImage:
+    def of(cls, grey: GreyImage, *, enlarged: bool = False) -> SearchedImage:
         levels = pyramid(grey)
-        return cls(grey, levels[0], levels, *find_corners(levels))
+        searched = [enlarged_level(grey), *levels] if enlarged else levels
+        return cls(grey, levels[0], searched, *find_corners(searched))
 
     def coarser(self, without: int) -> SearchedImage | None:
         """Return the corners of the coarser levels only, `without` the finest ones; None if there are too few.
@@ -173,7 +176,8 @@ class _RejectionCounter:
         return passed
 
 
-def _corner_count(found: Sequence[RefinedLattice]) -> int:
+def corner_count(found: Sequence[RefinedLattice]) -> int:
+    """Return the number of corners of all lattices."""
     return sum(item.lattice.count for item in found)
 
 

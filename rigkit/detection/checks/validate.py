@@ -207,7 +207,7 @@ def is_board(refined: RefinedLattice, before: int, min_corners: int, prior: floa
     It must keep most corners, and its evidence score plus `prior` must be positive.
     """
     lattice = refined.lattice
-    if lattice.count < max(min_corners, (1.0 - MAX_LOST) * before) or min(lattice.size) < MIN_ROWS:
+    if lattice.count < (1.0 - MAX_LOST) * before or not is_large_enough(lattice, min_corners):
         return False
     return Evidence.of(refined).score + prior > 0.0
 

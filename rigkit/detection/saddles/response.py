@@ -139,6 +139,16 @@ def each_level(grey: GreyImage) -> Iterator[Level]:
         scale *= 2
 
 
+def enlarged_level(grey: GreyImage) -> Level:
+    """Return a level of twice the resolution of an image."""
+    smooth, _, thresholds = front.level(
+        cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC),
+        _level_rules(),
+        max(1, int(np.sqrt(4 * grey.size / TYPICAL))),
+    )
+    return Level(smooth, thresholds, 0.5, -0.25)
+
+
 def _shrunk(grey: GreyImage, factor: int) -> GreyImage:
     """Return the means of `factor` x `factor` pixels."""
     return grey if factor == 1 else front.shrunk(grey, factor)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, known_median
 from rigkit.core.boards import Board
 from rigkit.core.detections import grid_turned
 from rigkit.core.patterns.aprilgrid import AprilGrid
@@ -50,7 +50,29 @@ def has_markers_of(boards: Sequence[Board], image: GreyImage, lattice: Lattice) 
 def place_by_markers(image: GreyImage, lattice: Lattice, board: Board) -> tuple[int, IntArray] | None:
     """Return the quarter turns and the shift (2,) from a lattice to the grid of a ChArUco board; None if its markers do
     not agree."""
+    place = _place(image, lattice, board)
+    if place is not None:
+        return place
+    # Most markers of a board of few rows are in its outer squares.
+    place = _place(image, _with_outer_squares(lattice), board)
+    return None if place is None else (place[0], place[1] + 1)
+
+
+def _with_outer_squares(lattice: Lattice) -> Lattice:
+    """Return `lattice` with a predicted corner more at both ends of each row and column."""
+    wide = lattice.padded((1, 1), (1, 1))
+    outside = ~wide.known
+    ahead = predicted(wide.pixels, outside)
+    wide.pixels[outside] = np.where(ahead.gain[:, None] < MAX_PREDICTION_GAIN, ahead.pixels, np.nan)
+    wide.contrast[outside] = np.where(np.isnan(wide.pixels[outside, 0]), np.nan, known_median(lattice.contrast))
+    return wide
+
+
+def _place(image: GreyImage, lattice: Lattice, board: Board) -> tuple[int, IntArray] | None:
+    """Return the place of a lattice, as `place_by_markers`, from the markers between its corners."""
     squares, cells = squares_of(lattice, dark=_pattern(board).inverted)
+    inside = _in_image(image, squares).all(axis=1)
+    squares, cells = squares[inside], cells[inside]
     if len(squares) < MIN_MARKERS:
         return None
     tags = _read(image, squares, board)
@@ -60,23 +82,24 @@ def place_by_markers(image: GreyImage, lattice: Lattice, board: Board) -> tuple[
         votes, turns, shift = voted_place(lattice, cells[sure], tags.turns[sure], at)
         if votes >= max(MIN_MARKERS, AGREEING_MARKERS * len(sure)):
             return turns, shift
-    return _place_together(image, lattice, board)
+    return _place_together(image, squares, cells, lattice.size, board)
 
 
-def _place_together(image: GreyImage, lattice: Lattice, board: Board) -> tuple[int, IntArray] | None:
-    """Return the place of a lattice, as `place_by_markers`, from all markers in its squares together, which may be too
-    blurred to be read one by one."""
-    squares, cells = squares_of(lattice, dark=_pattern(board).inverted)
+def _place_together(
+    image: GreyImage, squares: FloatArray, cells: IntArray, size: tuple[int, int], board: Board
+) -> tuple[int, IntArray] | None:
+    """Return the place of a lattice of this (columns, rows), as `place_by_markers`, from all markers in its `squares`
+    (N, 4, 2) at `cells` (N, 2) together, which may be too blurred to be read one by one."""
     if len(squares) < MIN_TAGS_OF_PLACE:
         return None
     excess = excess_likeness(as_printed(image, _pattern(board)), _within(squares, board), marker_codes(board))
     codes_at, places = np.full((board.rows + 1, board.columns + 1), -1), _places(board)
     codes_at[places[:, 1], places[:, 0]] = 4 * np.arange(len(places))
-    place = place_together(excess, cells, lattice.size, codes_at)
+    place = place_together(excess, cells, size, codes_at)
     if place is None:
         return None
     _, turns, shift = place
-    columns, rows = lattice.size
+    columns, rows = size
     column, row = (grid_turned(cells, (columns - 1, rows - 1), turns) + shift).T
     inside = (column >= 0) & (row >= 0) & (column <= board.columns) & (row <= board.rows)
     codes = codes_at[row[inside], column[inside]]

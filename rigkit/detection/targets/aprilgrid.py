@@ -50,7 +50,7 @@ class AprilGridFinder(Finder):
             grey = 255 - image if inverted and tags else image
             for item, pixels in self._placed(grey, tags):
                 seen = tag_corners(grey, item, pixels, search.camera) if np.isfinite(pixels).any() else None
-                if seen is None or len(seen.grid) < search.min_corners:
+                if seen is None or len(seen.grid) < search.min_corners_of(item.board):
                     continue
                 # Tags that place less than half of the corners may be of another board, whose corners fit as well.
                 few = 2 * np.count_nonzero(np.isfinite(pixels[..., 0])) < len(seen.grid)

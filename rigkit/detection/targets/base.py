@@ -9,15 +9,21 @@ from collections.abc import Sequence
 import numpy as np
 
 from rigkit.cameras.base import Camera
+from rigkit.core.arrays import known_median
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
-from rigkit.detection.lattices import MIN_BOARD_CORNERS, BoardCriteria, find_lattices, fit_and_confirm
+from rigkit.detection.lattice.lattice import MIN_ROWS
+from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.lattices import MIN_BOARD_CORNERS, BoardCriteria, corner_count, find_lattices, fit_and_confirm
 from rigkit.detection.saddles.local_contrast import equalised, stretched
-from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.saddles.response import BASE_PIXELS, GreyImage
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.tags.in_squares import has_markers_of
+
+SMALL_SQUARE_PX = 24.0
+"""Largest squares, px, whose markers leave white lines narrower than the ring of the finest level (radius 2.6 px)."""
 
 
 class Search:
@@ -73,11 +79,18 @@ class Search:
         """Keep only these lattices for other finders."""
         self._lattices = list(lattices)
 
+    def min_corners_of(self, board: Board) -> int:
+        """Return the smallest number of points of a reported detection of `board`, which may be small."""
+        return min(self.min_corners, board.corner_count)
+
     @property
     def min_corners_seen(self) -> int:
-        """Corners of the smallest lattice searched for: a whole board may have fewer than `min_corners`."""
+        """Corners of the smallest lattice searched for: a whole board may have fewer than `min_corners`. Below
+        MIN_BOARD_CORNERS lattices may have two rows, as boards with markers."""
         whole = (max(columns * rows, MIN_BOARD_CORNERS) for columns, rows in self.chessboard_sizes)
-        return min([self.min_corners, *whole])
+        marked = [board for board in self.boards if board.pattern.type == Charuco.type]
+        strips = (min(board.corner_count, MIN_BOARD_CORNERS - 1) for board in marked if min(board.size) < MIN_ROWS)
+        return min([self.min_corners, *whole, *(board.corner_count for board in marked), *strips])
 
     def _found_lattices(self) -> list[RefinedLattice]:
         plain = all(board.pattern.type == Chessboard.type for board in self.boards)
@@ -85,6 +98,9 @@ class Search:
         marked = [board for board in self.boards if board.pattern.type == Charuco.type]
         has_markers = functools.partial(has_markers_of, marked) if marked else None
         found = find_lattices(self.grey, self.min_corners_seen, only, has_markers=has_markers)
+        if marked and self.grey.size < BASE_PIXELS and _may_miss_squares(found, marked):
+            every = find_lattices(self.grey, self.min_corners_seen, has_markers=has_markers, enlarged=True)
+            found = max(found, every, key=corner_count)
         if not found and self.grey.dtype != np.uint8:
             # In images of more than 8 bits a board may use a hundredth of the range of brightness.
             seen = [item.lattice for item in find_lattices(equalised(self.grey), self.min_corners_seen, only)]
@@ -92,6 +108,15 @@ class Search:
             self.grey = stretched(self.grey, [lattice.pixels for lattice in seen])
             found = fit_and_confirm(self.grey, seen, BoardCriteria(self.min_corners_seen, only, has_markers))
         return found
+
+
+def _may_miss_squares(found: Sequence[RefinedLattice], boards: Sequence[Board]) -> bool:
+    """Return whether boards with markers may have corners that were not `found` because their squares are small."""
+    small = all(
+        known_median(fit_cells(item.lattice.pixels, item.lattice.known).gaps()) < SMALL_SQUARE_PX for item in found
+    )
+    sizes = {frozenset(board.size) for board in boards}
+    return small and not any(item.lattice.known.all() and frozenset(item.lattice.size) in sizes for item in found)
 
 
 class Finder(ABC):

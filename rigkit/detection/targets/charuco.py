@@ -19,14 +19,15 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
-from rigkit.detection.checks.validate import has_edge_offset
+from rigkit.detection.checks.validate import has_edge_offset, is_large_enough
 from rigkit.detection.guided.corner_fit import MARKER_BLURS, RADIUS_PX, fit_corners, gap_to_markers
 from rigkit.detection.guided.guided import MAX_ADDED_RESIDUAL_MARKED, completed
 from rigkit.detection.guided.lopsided_blur import blur_shift_px
 from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.saddles.response import GreyImage, pyramid
+from rigkit.detection.lattices import MIN_BOARD_CORNERS
+from rigkit.detection.saddles.response import GreyImage, Level, pyramid
 from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_model import NEAR_PX, TAIL_SIGMAS
@@ -66,13 +67,17 @@ class CharucoFinder(Finder):
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
         lattices = search.lattices
         found, rest = _charuco_boards(search, lattices, boards)
-        finest = pyramid(search.grey)[0] if rest else None
-        search.leave([item for item in rest if finest and not has_edge_offset(item.lattice, finest)])
+        search.leave([item for item in rest if _may_be_chessboard(item.lattice, pyramid(search.grey)[0])])
         every = [completed(item.picture, _detection(item), [item.shown], search.camera) for item in found]
         if search.quick:
             return every
         pairs = zip(every, found, strict=True)
         return [_less_sure(relit(search.grey, seen, item.refined, item.board), item) for seen, item in pairs]
+
+
+def _may_be_chessboard(lattice: Lattice, finest: Level) -> bool:
+    """Return whether a lattice that belongs to no ChArUco board may be a chessboard."""
+    return is_large_enough(lattice, MIN_BOARD_CORNERS) and not has_edge_offset(lattice, finest)
 
 
 def _too_unlike(fitted: RefinedLattice, sure: BoolArray) -> BoolArray:
@@ -126,7 +131,7 @@ def _charuco_boards(
         if not whole.count:
             continue
         placed = _beside_markers(image, refine(image, [whole])[0], board, search.camera)
-        if placed.refined.lattice.count >= search.min_corners:
+        if placed.refined.lattice.count >= search.min_corners_of(board):
             out.append(placed)
             rest = left
     return out, rest

@@ -354,3 +354,15 @@ def test_around_a_cover_corners_are_as_fine_as_elsewhere(blur_px: float) -> None
     assert lost <= 1
     assert np.median(np.abs(np.concatenate(off))) < 0.0065
     assert 0.8 < np.median(np.abs(np.concatenate(over_sigma))) / MEDIAN_OF_NORMAL < 1.3
+
+
+@pytest.mark.parametrize(("size", "square_px"), [((7, 7), 12.0), ((3, 3), 20.0), ((4, 2), 20.0), ((9, 2), 20.0)])
+def test_small_squares_and_few_rows_are_enough(size: tuple[int, int], square_px: float) -> None:
+    """Markers leave white lines of 1.5 to 2.5 px between the squares, and most are in the outer squares."""
+    board = Board("c", *size, 30.0, 30.0, pattern=Charuco("DICT_4X4_50", 22.5))
+    for seed in range(2):
+        scene = one_board(np.random.default_rng(seed), board=board, max_tilt_deg=30.0, square_px=square_px)
+        image = scene.render(optics=Optics(0.7), noise_levels=2.0, rng=np.random.default_rng(seed))
+        (found,) = detect_boards(image, [board])
+        assert (found.board_id, found.complete) == ("c", True)
+        assert np.abs(errors_by_place(found, scene.truth()[0])).max() < 0.25
