@@ -15,7 +15,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.detection.lattice.lattice import build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
 from rigkit.detection.saddles.local_contrast import equalised, stretched
-from rigkit.detection.saddles.response import GreyImage, Level, each_level
+from rigkit.detection.saddles.response import BASE_PIXELS, GreyImage, Level, each_level, enlarged_level
 from rigkit.detection.saddles.saddle import Corners, each_once, find_corners
 from rigkit.detection.tags.codes import read_tags
 from rigkit.detection.tags.corners import tag_corners
@@ -48,7 +48,7 @@ class AprilGridFinder(Finder):
             tags = [item for item in every if item.pattern.inverted == inverted]
             # The negative of an image has its corners in the same places.
             grey = 255 - image if inverted and tags else image
-            for item, pixels in self._placed(grey, tags):
+            for item, pixels in self._placed(grey, tags, quick=search.quick):
                 seen = tag_corners(grey, item, pixels, search.camera) if np.isfinite(pixels).any() else None
                 if seen is None or len(seen.grid) < search.min_corners_of(item.board):
                     continue
@@ -58,7 +58,9 @@ class AprilGridFinder(Finder):
                     found.append(seen)
         return found
 
-    def _placed(self, grey: GreyImage, tags: Sequence[TagBoard]) -> Iterator[tuple[TagBoard, FloatArray]]:
+    def _placed(
+        self, grey: GreyImage, tags: Sequence[TagBoard], *, quick: bool
+    ) -> Iterator[tuple[TagBoard, FloatArray]]:
         """Yield the boards and their approximate corners (R, C, 2), NaN where not found."""
         joined = [item for item in tags if item.pattern.corner_squares]
         yield from ((item, placed_tags(grey, item)) for item in tags if not item.pattern.corner_squares)
@@ -79,6 +81,11 @@ class AprilGridFinder(Finder):
                 if len(alone) < MIN_SEEN_AT_FIRST or any(np.isfinite(pixels).any() for _, pixels in placed):
                     break
                 placed = list(_placed_by(alone, level, grey, joined))
+        if not quick and grey.size < BASE_PIXELS and not _known(placed):
+            # Between tags of 12 px the squares are 4 px wide.
+            twice = enlarged_level(grey)
+            corners, _ = find_corners([twice])
+            placed = list(_placed_by(corners, twice, grey, joined))
         yield from ((item, _or_lone_tags(grey, item, pixels)) for item, pixels in placed)
 
 

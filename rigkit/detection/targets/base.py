@@ -98,7 +98,7 @@ class Search:
         marked = [board for board in self.boards if board.pattern.type == Charuco.type]
         has_markers = functools.partial(has_markers_of, marked) if marked else None
         found = find_lattices(self.grey, self.min_corners_seen, only, has_markers=has_markers)
-        if marked and self.grey.size < BASE_PIXELS and _may_miss_squares(found, marked):
+        if marked and not self.quick and self.grey.size < BASE_PIXELS and _may_miss_squares(found, marked):
             every = find_lattices(self.grey, self.min_corners_seen, has_markers=has_markers, enlarged=True)
             found = max(found, every, key=corner_count)
         if not found and self.grey.dtype != np.uint8:

@@ -258,3 +258,13 @@ def test_tags_without_squares_between_them_are_no_board_with_squares(rng: np.ran
     image = one_board(rng, board=board).render(noise_levels=2.0, rng=rng)
     assert detect_boards(image, [board])
     assert not detect_boards(image, [replace(board, pattern=AprilGrid(0.3))])
+
+
+@pytest.mark.parametrize("lens", ["regular", "fisheye"])
+def test_tags_of_twelve_pixels_are_found(lens: str) -> None:
+    """The squares between them are 3 to 4 px wide, less than the ring of a corner."""
+    rng = np.random.default_rng(2)
+    scene = one_board(rng, lens=lens, board=KALIBR, max_tilt_deg=30.0, square_px=11.0)
+    (found,) = detect_boards(scene.render(optics=Optics(0.6), noise_levels=2.0, rng=rng), [KALIBR])
+    assert len(found.grid) > 0.9 * KALIBR.corner_count
+    assert np.abs(errors_by_place(found, scene.truth()[0])).max() < 0.25
