@@ -32,6 +32,7 @@ from rigkit.core.matches import Matches as Matches
 from rigkit.core.measurement_task import Quantity as Quantity
 from rigkit.core.measurement_task import Task as Task
 from rigkit.core.posetype import PoseType as PoseType
+from rigkit.core.reach import Reach as Reach
 from rigkit.core.truth import PairTruth as PairTruth
 from rigkit.detection.detect import detect_boards as detect_boards
 from rigkit.detection.guided.guided import complete_boards as complete_boards
@@ -54,7 +55,6 @@ from rigkit.io.manifests.session import load_session as load_session
 from rigkit.io.media.images import read_image as read_image
 from rigkit.io.ply import read_ply as read_ply
 from rigkit.io.ply import write_ply as write_ply
-from rigkit.planning.candidates import Reach as Reach
 from rigkit.reconstruction.pairing import MatchedPair as MatchedPair
 from rigkit.reconstruction.pairing import match_pair as match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction as Reconstruction
@@ -77,9 +77,7 @@ from rigkit.workflows.calibration.calibrate import calibrate_session as calibrat
 from rigkit.workflows.calibration.calibrate_any import calibrate_folders as calibrate_folders
 from rigkit.workflows.calibration.calibrate_any import calibrate_session_file as calibrate_session_file
 from rigkit.workflows.capture.coach import run_coach as run_coach
-from rigkit.workflows.capture.plan import LensOptions as LensOptions
 from rigkit.workflows.capture.plan import PlannedSession as PlannedSession
-from rigkit.workflows.capture.plan import PlanOptions as PlanOptions
 from rigkit.workflows.capture.plan import plan_lens as plan_lens
 from rigkit.workflows.capture.plan import plan_session as plan_session
 from rigkit.workflows.capture.print_board import MeasuredPrint as MeasuredPrint
@@ -127,6 +125,8 @@ from rigkit.workflows.options.clouds import RigSceneOptions as RigSceneOptions
 from rigkit.workflows.options.clouds import SceneOptions as SceneOptions
 from rigkit.workflows.options.clouds import ValidateOptions as ValidateOptions
 from rigkit.workflows.options.coach import CoachOptions as CoachOptions
+from rigkit.workflows.options.plan import LensOptions as LensOptions
+from rigkit.workflows.options.plan import PlanOptions as PlanOptions
 from rigkit.workflows.outputs.export_camera import ExportedCamera as ExportedCamera
 from rigkit.workflows.outputs.export_camera import ExportedRig as ExportedRig
 from rigkit.workflows.outputs.export_camera import export_camera as export_camera

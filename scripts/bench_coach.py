@@ -38,9 +38,10 @@ from rigkit.coach.look import FrameObservation
 from rigkit.coach.rig import RigGuide
 from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.detections import BoardView
+from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.planning.candidates import Reach, outline_mm
+from rigkit.planning.candidates import outline_mm
 from rigkit.planning.goal import GOAL_GRID, projection_goal, rays_within
 from rigkit.synthetic.scene import PlacedBoard
 

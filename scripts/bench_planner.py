@@ -30,9 +30,9 @@ from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
+from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import BoardPoses, CornerError, Knowledge
 from rigkit.planning.plan import plan_views

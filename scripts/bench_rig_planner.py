@@ -20,9 +20,9 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
+from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
-from rigkit.planning.candidates import Reach
 from rigkit.synthetic.scene import PlacedBoard
 from rigkit.validation.monitoring.evidence import Monitored
 from rigkit.workflows.calibration.next_pictures import next_frames

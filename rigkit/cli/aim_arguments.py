@@ -9,7 +9,7 @@ from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
     from rigkit.core.measurement_task import Task
-    from rigkit.planning.candidates import Reach
+    from rigkit.core.reach import Reach
 
 
 def add_board_argument(parser: argparse._ActionsContainer, words: str, *, required: bool = False) -> None:
@@ -30,7 +30,7 @@ def add_reach_arguments(parser: argparse.ArgumentParser) -> None:
 
 def reach_of(args: argparse.Namespace) -> Reach:
     """Return the limits of the positions of boards."""
-    from rigkit.planning.candidates import Reach
+    from rigkit.core.reach import Reach
 
     return Reach(nearest_mm=args.near, farthest_mm=args.far, field_deg=args.field)
 

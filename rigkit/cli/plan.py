@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigkit.cli.aim_arguments import add_board_argument, add_reach_arguments, length_of, reach_of
-from rigkit.cli.console import size_of_words
+from rigkit.cli.console import add_options, options_of, size_of_words
 from rigkit.core.errors import ExitCode, InputError
+from rigkit.workflows.options.plan import TYPICAL_SIGMA_PX, LensOptions, PlanOptions
 
 if TYPE_CHECKING:
-    from rigkit.workflows.capture.plan import PlannedSession, PlanOptions
+    from rigkit.workflows.capture.plan import PlannedSession
 
 MAX_VIEWS = 100
 """Nobody takes more by a plan."""
@@ -33,23 +34,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CALIBRATION|RIG.json|SESSION.toml",
         help="calibration or session to improve; or give --lens",
     )
-    parser.add_argument(
-        "-n", "--views", type=int, metavar="N", help="number of images to plan (default: 3; with --lens 12)"
-    )
-    parser.add_argument("--check", action="store_true", help="plan images for `rigkit check` that reveal changes best")
+    add_options(parser, PlanOptions, count="-n --views N", check="")
     parser.add_argument("--length", type=float, metavar="MM", help="optimise the measurement of a length of MM")
     parser.add_argument(
         "--distance", type=float, metavar="MM", help="at this distance (default: the projection over the image)"
     )
     add_reach_arguments(parser)
-    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write an HTML report")
-    parser.add_argument("--force", action="store_true", help="replace an existing page")
+    add_options(parser, PlanOptions, report="-r FILE.html", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     lens = parser.add_argument_group("before there is a calibration")
     lens.add_argument("--lens", type=float, metavar="DEG", help="field of view across the width of the image")
     lens.add_argument("--size", metavar="WxH", help="image size, px")
     add_board_argument(lens, "board, such as 9x6x25 (repeatable)")
-    lens.add_argument("--model", help="camera model (default: chosen by the field of view)")
+    add_options(lens, LensOptions, model="")
     lens.add_argument(
         "--sigma-px", type=float, metavar="PX", help="standard deviation of a corner per coordinate (default: 0.15)"
     )
@@ -80,7 +77,7 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
     from rigkit.cli.console import progress_on_stderr
     from rigkit.io.boards.board_words import board_files, board_of_words
     from rigkit.io.disk.writing import ensure_writable
-    from rigkit.workflows.capture.plan import TYPICAL_SIGMA_PX, LensOptions, plan_lens, plan_session
+    from rigkit.workflows.capture.plan import plan_lens, plan_session
 
     if (args.source is None) == (args.lens is None):
         raise InputError("plan: give a calibration or a session, or describe a lens with --lens, --size and --board")
@@ -92,7 +89,7 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
             raise InputError(
                 f"plan: --{given[0].replace('_', '-')} needs --lens; '{args.source}' states it itself, leave it out"
             )
-        return plan_session(args.source, _options(args, 3), progress=progress_on_stderr())
+        return plan_session(args.source, _options(args), progress=progress_on_stderr())
     if not (args.size and args.board):
         raise InputError("plan: --lens needs --size 1280x960 and --board 9x6x25")
     size_px = size_of_words(args.size)
@@ -107,14 +104,10 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
         model=args.model,
         sigma_px=sigma,
     )
-    return plan_lens(lens, _options(args, 12))
+    return plan_lens(lens, _options(args))
 
 
-def _options(args: argparse.Namespace, count: int) -> PlanOptions:
-    from rigkit.cli.console import options_of
-    from rigkit.workflows.capture.plan import PlanOptions
-
-    if args.views is not None and not 1 <= args.views <= MAX_VIEWS:
-        raise InputError(f"--views {args.views}: 1 to {MAX_VIEWS}")
-    given = {"count": args.views or count, "length": length_of(args, "plan"), "reach": reach_of(args)}
-    return options_of(PlanOptions, args, **given)
+def _options(args: argparse.Namespace) -> PlanOptions:
+    if args.count is not None and not 1 <= args.count <= MAX_VIEWS:
+        raise InputError(f"--views {args.count}: 1 to {MAX_VIEWS}")
+    return options_of(PlanOptions, args, length=length_of(args, "plan"), reach=reach_of(args))

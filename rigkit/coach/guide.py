@@ -23,8 +23,8 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.processes import SerialExecutor
+from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Goal, RemainingError, Requirement, projection_goal, px_words, rotation_free_jacobian
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import BoardPoses, CornerError, Knowledge

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from rigkit.cameras.base import Camera, image_center
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points
 from rigkit.core.boards import Board
-from rigkit.core.errors import DegenerateError, InputError
-from rigkit.core.printing import brief
+from rigkit.core.errors import DegenerateError
+from rigkit.core.reach import Reach
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.planning.information import BoardPoses
 
@@ -32,25 +30,6 @@ INWARD = 0.12
 """Part of the distance to the image centre by which a board that leaves the field of view is moved in each."""
 MAX_SLANT_DEG = 76.0
 """Largest angle between a line of sight and the board's normal, at any of its corners."""
-
-
-@dataclass(frozen=True, slots=True)
-class Reach:
-    """Where boards can be held: between `nearest_mm` and `farthest_mm` from the camera, the depth of field, and within
-    `field_deg` of a lens whose image does not fill the sensor (None: the field of view of the model)."""
-
-    nearest_mm: float = 0.0
-    farthest_mm: float = np.inf
-    field_deg: float | None = None
-
-    __repr__ = brief
-
-    def __post_init__(self) -> None:
-        """Raise InputError for impossible distances or fields of view."""
-        if not 0.0 <= self.nearest_mm < self.farthest_mm:
-            raise InputError(f"boards held from {self.nearest_mm:g} to {self.farthest_mm:g} mm: give the nearer first")
-        if self.field_deg is not None and not 0.0 < self.field_deg <= 360.0:
-            raise InputError(f"a lens that sees {self.field_deg:g} degrees: give its full angle, up to 360")
 
 
 def outline_mm(board: Board) -> Points:

@@ -11,8 +11,9 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.planning.candidates import Reach, board_poses_in_view
+from rigkit.planning.candidates import board_poses_in_view
 from rigkit.planning.goal import Aim
 from rigkit.planning.information import Knowledge
 

@@ -22,9 +22,10 @@ from rigkit.coach.guide import CHECKING, MIN_GAIN_TO_CONTINUE, CaptureGuide, Gui
 from rigkit.coach.keeper import Keeper
 from rigkit.coach.look import FrameObservation
 from rigkit.core.detections import BoardView
+from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.manifests.session import Session
-from rigkit.planning.candidates import Reach, board_poses_in_view
+from rigkit.planning.candidates import board_poses_in_view
 from rigkit.planning.goal import Goal, projection_goal
 from rigkit.workflows.calibration.calibrate import SessionCalibration
 from rigkit.workflows.capture.coach import finished_words, open_coach

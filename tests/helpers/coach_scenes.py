@@ -15,9 +15,10 @@ from rigkit.coach.guide import GuideOptions
 from rigkit.coach.look import FrameObservation
 from rigkit.coach.server import MAX_UPLOAD_BYTES
 from rigkit.core.boards import Board
+from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.planning.candidates import Reach, board_poses_in_view
+from rigkit.planning.candidates import board_poses_in_view
 from rigkit.planning.information import BoardPoses
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render

@@ -16,9 +16,10 @@ from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.planning.candidates import MAX_SLANT_DEG, TILT_DEG, Reach, board_poses_in_view, outline_mm
+from rigkit.planning.candidates import MAX_SLANT_DEG, TILT_DEG, board_poses_in_view, outline_mm
 from rigkit.planning.goal import Goal, projection_goal, px_words, rays_within
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import BoardPoses, CornerError, Knowledge

@@ -18,7 +18,7 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
-from rigkit.planning.candidates import Reach
+from rigkit.core.reach import Reach
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, choose_views, covariance_of
 from rigkit.validation.monitoring.evidence import FreshEvidence, Monitored

@@ -10,8 +10,9 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
+from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.planning.candidates import CANDIDATES_KEPT, Reach, board_in_view, board_poses_in_view
+from rigkit.planning.candidates import CANDIDATES_KEPT, board_in_view, board_poses_in_view
 from rigkit.planning.goal import Goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, Proposal, choose_views, covariance_of

@@ -14,8 +14,8 @@ from rigkit.cameras.compare import grid_pixels
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.measurement_task import Quantity, Task
+from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Goal, projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.planning.plan import Plan, plan_views

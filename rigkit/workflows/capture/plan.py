@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from rigkit.calibration.views.usable import without_parts
@@ -11,7 +11,6 @@ from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
-from rigkit.core.measurement_task import Task
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Table
@@ -21,7 +20,6 @@ from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.io.manifests.rig_session import is_rig_session
 from rigkit.io.manifests.session import load_session
-from rigkit.planning.candidates import Reach
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, plan_views
@@ -40,46 +38,14 @@ from rigkit.workflows.inputs.camera_files import (
     warn_if_bad,
     warn_of_pupil,
 )
-from rigkit.workflows.options.base import NamesFiles
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions
+from rigkit.workflows.options.plan import LensOptions, PlanOptions
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
 
-TYPICAL_SIGMA_PX = 0.15
+LENS_VIEWS = 12
+"""Views of a lens to plan by default; of a calibration NEXT_VIEWS."""
 TYPICAL_RHO = 0.05
-"""What corners of real boards have: so much scatter, and this part of its variance in common in a view (50 corners then
-count like 15)."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlanOptions(NamesFiles):
-    """What is wanted, and where it goes."""
-
-    count: int = NEXT_VIEWS
-    """Views to propose."""
-    check: bool = False
-    """What counts is that `rigkit check` finds what changed with these pictures, not that they improve anything."""
-    length: Task | None = None
-    """A length at a distance that is to be measured well; None: the projection over the image."""
-    reach: Reach = field(default_factory=Reach)
-    """Where boards can be held."""
-    report: Path | None = None
-    """File for a page to look at; None: no page."""
-    force: bool = False
-    """Replace a page that exists."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LensOptions:
-    """A lens that nobody has calibrated yet."""
-
-    hfov_deg: float
-    """What it sees across the width of the image."""
-    size_px: tuple[int, int]
-    boards: tuple[Board, ...]
-    model: str | None = None
-    """Camera model; None: the usual one for such a lens."""
-    sigma_px: float = TYPICAL_SIGMA_PX
-    """Standard deviation of a corner."""
+"""What corners of real boards have in common in a view, as part of their variance: 50 corners count like 15."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -104,6 +70,7 @@ def plan_session(
     in view.
     """
     options, source = options or PlanOptions(), Path(path)
+    count = NEXT_VIEWS if options.count is None else options.count
     rig = is_rig_session(source) if source.suffix == ".toml" else is_rig_file(source)
     if rig and source.suffix == ".toml":
         raise InputError(f"plan: '{source}' is a session of a rig; give the rig that it was calibrated to, rig.json")
@@ -118,9 +85,9 @@ def plan_session(
         if not boards:
             raise InputError(f"plan: '{source}' does not say what boards there are; calibrate it with rigkit")
         if options.check:
-            return _checked(monitored, boards, options, source, bad)
+            return _checked(monitored, boards, count, options, source, bad)
         with about(source):
-            plan = next_frames(monitored, boards, options.count, length=options.length, reach=options.reach)
+            plan = next_frames(monitored, boards, count, length=options.length, reach=options.reach)
         return _shown(plan, options, f"Next images for {source.name}", source, bad)
     if source.suffix == ".toml":
         session = load_session(source)
@@ -138,16 +105,17 @@ def plan_session(
             raise InputError(f"plan: no whole board was seen for '{source}'; give the session that it was made from")
     taken = calibration.corners.used[0]
     if options.check:
-        return _checked(monitored_camera(calibration, source.stem), boards, options, source, bad, taken)
+        return _checked(monitored_camera(calibration, source.stem), boards, count, options, source, bad, taken)
     warn_of_pupil(source, calibration)
     with about(source):
-        plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
+        plan = next_views(calibration, boards, count, length=options.length, reach=options.reach)
     return _shown(plan, options, f"Next images for {source.name}", source, bad, taken)
 
 
 def _checked(
     monitored: Monitored,
     boards: Sequence[Board],
+    count: int,
     options: PlanOptions,
     source: Path,
     bad: Finding | None,
@@ -155,23 +123,24 @@ def _checked(
 ) -> PlannedSession:
     """Return the pictures to check a camera or a rig with."""
     with about(source):
-        plan, powers = informative_views(monitored, boards, options.count, options.reach)
+        plan, powers = informative_views(monitored, boards, count, options.reach)
     found = (power_table(powers, "Changes that these images would reveal"),)
     return _shown(plan, options, f"Images to check {source.name} with", source, bad, taken, found)
 
 
 def plan_lens(lens: LensOptions, options: PlanOptions) -> PlannedSession:
-    """Return what `options.count` well-chosen views of a lens that is only guessed will reach.
+    """Return what `options.count` well-chosen views (by default 12) of a lens that is only guessed will reach.
 
     Raises as `plan_session`.
     """
     ensure_writable(options.report, force=options.force)
+    count = LENS_VIEWS if options.count is None else options.count
     camera = guessed_camera(lens.hfov_deg, lens.size_px, lens.model)
     knowledge = Knowledge.guessed(camera, CornerError(lens.sigma_px, TYPICAL_RHO))
     plan = plan_views(
-        knowledge, lens.boards, goal_of(camera, options.reach, options.length), options.count, reach=options.reach
+        knowledge, lens.boards, goal_of(camera, options.reach, options.length), count, reach=options.reach
     )
-    return _shown(plan, options, f"{options.count} images for a lens of {lens.hfov_deg:g} degrees")
+    return _shown(plan, options, f"{count} images for a lens of {lens.hfov_deg:g} degrees")
 
 
 def _shown(

@@ -17,10 +17,10 @@ from rigkit.cameras.brown import Brown
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.errors import DegenerateError
 from rigkit.core.measurement_task import Quantity, Task
+from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.io.calibrations.history_file import HistoryEntry
-from rigkit.planning.candidates import Reach
 from rigkit.report.pages.check_page import check_facts
 from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.monitoring.epipolar import (

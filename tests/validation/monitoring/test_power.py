@@ -14,9 +14,10 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
+from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.planning.candidates import Reach, board_in_view
+from rigkit.planning.candidates import board_in_view
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import BoardPoses, CornerError, Knowledge
 from rigkit.planning.plan import Plan, plan_views

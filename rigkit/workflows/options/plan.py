@@ -1,0 +1,51 @@
+"""Options of `rigkit plan`, apart from the others because boards need numpy."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rigkit.core.boards import Board
+from rigkit.core.measurement_task import Task
+from rigkit.core.reach import Reach
+from rigkit.workflows.options.base import WrittenFiles
+
+TYPICAL_SIGMA_PX = 0.15
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanOptions(WrittenFiles):
+    """What the images are for, where boards can be held, and the page to write.
+
+    Attributes
+    ----------
+    count : number of images to plan (default: 3; for a lens 12).
+    check : plan images for `rigkit check` that reveal changes best, not images that improve the calibration.
+    length : a length at a distance that is to be measured well; None: the projection over the image.
+    reach : where boards can be held.
+    report : write an HTML report.
+    """
+
+    count: int | None = None
+    check: bool = False
+    length: Task | None = None
+    reach: Reach = field(default_factory=Reach)
+    report: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensOptions:
+    """A lens that nobody has calibrated yet.
+
+    Attributes
+    ----------
+    hfov_deg : field of view across the width of the image.
+    size_px : width and height of the image.
+    boards : boards that will be shown.
+    model : camera model (default: chosen by the field of view).
+    sigma_px : standard deviation of a corner per coordinate, as real boards have it.
+    """
+
+    hfov_deg: float
+    size_px: tuple[int, int]
+    boards: tuple[Board, ...]
+    model: str | None = None
+    sigma_px: float = TYPICAL_SIGMA_PX
