@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 from rigkit.core.findings import most_severe_first
@@ -103,6 +102,8 @@ def _chosen_of(candidate: Candidate) -> str:
 
 def rig_summary(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
     """Return the result as JSON values."""
+    from rigkit.report.rig_tables import angles, baselines, transfers
+
     return {
         "heldout_rms_px": rig.heldout_rms_px,
         "rms_px": rig.rms_px,
@@ -122,39 +123,25 @@ def rig_summary(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
             for camera, alone in zip(rig.cameras, rig.single, strict=True)
         ],
         "baselines": [
-            {"from": a, "to": b, "value_mm": value, "sigma_mm": sigma} for a, b, value, sigma in _baselines(rig)
+            {"from": own.a, "to": own.b, "value_mm": own.value, "sigma_mm": own.sigma} for own in baselines(rig)
         ],
-        "transfers": [{"from": a, "to": b, "median_px": m, "worst_px": w} for a, b, m, w in _transfers(rig)],
-        "angles": [{"a": a, "b": b, "value_deg": value, "sigma_deg": sigma} for a, b, value, sigma in _angles(rig)],
+        "transfers": [
+            {"from": own.a, "to": own.b, "median_px": own.median_px, "worst_px": own.worst_px}
+            for own in filter(None, transfers(rig))
+        ],
+        "angles": [
+            {"a": own.a, "b": own.b, "value_deg": own.value, "sigma_deg": own.sigma}
+            for target in rig.board_rigs
+            for own in angles(target)
+        ],
         "left_out": [{"frame": frame, "board": board, "reason": reason} for frame, board, reason in rig.left_out],
         "checks": [asdict(c) for c in checks],
     }
 
 
-def _baselines(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
-    """Return (from, to, mm, sigma mm) for every two cameras."""
-    names = [c.name for c in rig.cameras]
-    return [(a, b, *rig.baseline_mm(a, b)) for a, b in combinations(names, 2)]
-
-
-def _angles(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
-    """Return (board, board, deg, sigma deg) for every two boards on one mount."""
-    return [(a, b, *t.angle_deg(a, b)) for t in rig.board_rigs for a, b in combinations(t.names, 2)]
-
-
-def _transfers(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
-    """Return (from, to, median px, worst px) of the transfer uncertainty for every two cameras with a common field."""
-    from rigkit.calibration.rig.certainty.uncertainty import transfer_uncertainty
-
-    found = [transfer_uncertainty(rig, a, b) for a, b in combinations([c.name for c in rig.cameras], 2)]
-    return [(t.a, t.b, t.median_px, t.worst_px) for t in found if t is not None]
-
-
 def describe_rig(rig: RigCalibration, checks: Sequence[Check]) -> str:
     """Return the result as text, the headline first."""
-    import numpy as np
-
-    from rigkit.geometry.rotation import log_so3
+    from rigkit.report.rig_tables import angles, baselines, place, transfers
     from rigkit.report.tables import measured_words
 
     held = "held-out RMS not available" if rig.heldout_rms_px is None else f"held-out RMS {rig.heldout_rms_px:.4f} px"
@@ -165,18 +152,20 @@ def describe_rig(rig: RigCalibration, checks: Sequence[Check]) -> str:
     ]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         held = "not available" if alone.heldout_rms_px is None else f"{alone.heldout_rms_px:.4f} px"
-        where = length_words(*camera.cam_from_rig.inverse().translation_mm.tolist(), decimals=2)
-        turned = np.degrees(np.linalg.norm(log_so3(camera.cam_from_rig.rotation)))
+        centre, rotation_deg = place(camera)
         lines.append(
             f"{camera.name}: {camera.camera.model}, calibrated alone held-out RMS {held}, training RMS "
-            f"{alone.rms_px:.4f}; in the rig {camera.rms_px:.4f} px; centre ({where}) mm, rotation {turned:.3f} deg"
+            f"{alone.rms_px:.4f}; in the rig {camera.rms_px:.4f} px; centre "
+            f"({length_words(*centre, decimals=2)}) mm, rotation {rotation_deg:.3f} deg"
         )
-    lines += [f"baseline {a} to {b}: {measured_words(value, sigma, 3)} mm" for a, b, value, sigma in _baselines(rig)]
+    lines += [f"baseline {b.a} to {b.b}: {measured_words(b.value, b.sigma, 3)} mm" for b in baselines(rig)]
     lines += [
-        f"points transferred from {a} to {b}: ±{middle:.3f} px (at worst ±{worst:.3f} px; one standard deviation)"
-        for a, b, middle, worst in _transfers(rig)
+        f"points transferred from {t.a} to {t.b}: ±{t.median_px:.3f} px (at worst ±{t.worst_px:.3f} px; one standard "
+        "deviation)"
+        for t in filter(None, transfers(rig))
     ]
-    lines += [f"angle {a} to {b}: {measured_words(value, sigma, 3)} deg" for a, b, value, sigma in _angles(rig)]
+    for target in rig.board_rigs:
+        lines += [f"angle {a.a} to {a.b}: {measured_words(a.value, a.sigma, 3)} deg" for a in angles(target)]
     for c in checks:
         verdict = "as measured" if c.passed else "NOT as measured"
         lines.append(

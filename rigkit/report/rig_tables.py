@@ -1,21 +1,53 @@
-"""Tables of a calibrated rig: cameras, baselines, mounts, intrinsics, boards, and views left out."""
+"""What a calibrated rig says of its cameras and boards: figures, sentences, and the tables of its page."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from rigkit.calibration.rig.board_rig import BoardRig
-from rigkit.calibration.rig.certainty.uncertainty import transfer_uncertainty
-from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.certainty.uncertainty import Transfer, transfer_uncertainty
+from rigkit.calibration.rig.result import RigCalibration, RigCamera
 from rigkit.calibration.rig.verdicts import lag_words
 from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell
 from rigkit.core.truth import Feature
-from rigkit.geometry.rotation import log_so3
+from rigkit.geometry.rotation import log_so3, rotation_angle
 from rigkit.report.tables import rounded_parameters, rounded_words
 from rigkit.validation.check import Check
+
+
+@dataclass(frozen=True, slots=True)
+class SolvedQuantity:
+    """A length (mm) or angle (deg) between two cameras or boards, with its standard deviation."""
+
+    a: str
+    b: str
+    value: float
+    sigma: float
+
+
+def baselines(rig: RigCalibration) -> list[SolvedQuantity]:
+    """Return the distance of every two cameras, mm."""
+    return [SolvedQuantity(a, b, *rig.baseline_mm(a, b)) for a, b in combinations([c.name for c in rig.cameras], 2)]
+
+
+def transfers(rig: RigCalibration) -> list[Transfer | None]:
+    """Return the uncertainty of points transferred between every two cameras; None for those without a common field."""
+    return [transfer_uncertainty(rig, a, b) for a, b in combinations([c.name for c in rig.cameras], 2)]
+
+
+def angles(target: BoardRig) -> list[SolvedQuantity]:
+    """Return the angle of every two boards on one mount, deg."""
+    return [SolvedQuantity(a, b, *target.angle_deg(a, b)) for a, b in combinations(target.names, 2)]
+
+
+def place(camera: RigCamera) -> tuple[list[float], float]:
+    """Return a camera's centre (mm) and rotation (deg) in the frame of the rig."""
+    centre: list[float] = camera.cam_from_rig.inverse().translation_mm.tolist()
+    return centre, float(np.degrees(rotation_angle(camera.cam_from_rig.rotation)))
 
 
 def rig_tables(rig: RigCalibration, checks: Sequence[Check]) -> tuple[Table, ...]:
@@ -39,10 +71,9 @@ def _cameras(rig: RigCalibration) -> Table:
     )
     rows = []
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
-        centre = camera.cam_from_rig.inverse().translation_mm
-        turned = float(np.degrees(np.linalg.norm(log_so3(camera.cam_from_rig.rotation))))
+        centre, rotation_deg = place(camera)
         errors = (alone.heldout_rms_px, alone.rms_px, camera.calibration.heldout_rms_px, camera.rms_px)
-        rows.append(cells(camera.name, camera.camera.model, *errors, *centre.tolist(), turned))
+        rows.append(cells(camera.name, camera.camera.model, *errors, *centre, rotation_deg))
     return Table("rig", "Cameras of the rig", heads, tuple(rows), "The frame is that of the first camera.")
 
 
@@ -93,19 +124,15 @@ def rig_basis(rig: RigCalibration) -> str:
 def rig_reach(rig: RigCalibration, checks: Sequence[Check]) -> str:
     """Return in words the uncertainty of baselines and of transferred points, and how many measured facts hold."""
     sentences = []
-    names = [camera.name for camera in rig.cameras]
-    pairs = list(combinations(names, 2))
-    if pairs:
-        values = {pair: rig.baseline_mm(*pair) for pair in pairs}
-        (a, b), (value, sigma) = max(values.items(), key=lambda of: of[1][1])
-        least = "" if len(pairs) == 1 else ", the least certain"
-        sentences.append(f"Baseline {a} to {b}{least}: {rounded_words(value, sigma)} mm.")
-        sure = {pair: transfer_uncertainty(rig, *pair) for pair in pairs}
-        known = {pair: transfer for pair, transfer in sure.items() if transfer is not None}
-        if known:
-            (a, b), transfer = max(known.items(), key=lambda of: of[1].worst_px)
+    if len(rig.cameras) > 1:
+        lengths = baselines(rig)
+        worst = max(lengths, key=lambda length: length.sigma)
+        least = "" if len(lengths) == 1 else ", the least certain"
+        sentences.append(f"Baseline {worst.a} to {worst.b}{least}: {rounded_words(worst.value, worst.sigma)} mm.")
+        if known := [transfer for transfer in transfers(rig) if transfer is not None]:
+            t = max(known, key=lambda transfer: transfer.worst_px)
             sentences.append(
-                f"Points transferred from {a} to {b}: ±{transfer.median_px:.2g} px (at worst ±{transfer.worst_px:.2g} "
+                f"Points transferred from {t.a} to {t.b}: ±{t.median_px:.2g} px (at worst ±{t.worst_px:.2g} "
                 "px; one standard deviation)."
             )
     if checks:
@@ -117,12 +144,10 @@ def rig_reach(rig: RigCalibration, checks: Sequence[Check]) -> str:
 def _baselines(rig: RigCalibration, checks: Sequence[Check]) -> Table:
     heads = columns("baseline | solved [mm] | measured [mm] | how | verdict | transfer [px] | transfer at worst [px]")
     rows = []
-    for a, b in combinations([c.name for c in rig.cameras], 2):
-        value, sigma = rig.baseline_mm(a, b)
-        transfer = transfer_uncertainty(rig, a, b)
+    for length, transfer in zip(baselines(rig), transfers(rig), strict=True):
         sure = (None, None) if transfer is None else (transfer.median_px, transfer.worst_px)
-        measured = _measured(checks, f"baseline {a}-{b}", f"baseline {b}-{a}")
-        rows.append(cells(f"{a} to {b}", Cell(value, sigma=sigma), *measured, *sure))
+        measured = _measured(checks, "baseline", length)
+        rows.append(cells(f"{length.a} to {length.b}", Cell(length.value, sigma=length.sigma), *measured, *sure))
     note = (
         "Transfer: standard deviation of a point transferred from one camera's image to the other's, median and worst "
         "of the boards' corners."
@@ -135,17 +160,17 @@ def _angles(target: BoardRig, checks: Sequence[Check]) -> Table:
         "boards | angle [deg] | measured [deg] | how | verdict | between first corners [mm] | between centres [mm]"
     )
     rows = []
-    for a, b in combinations(target.names, 2):
-        value, sigma = target.angle_deg(a, b)
+    for angle in angles(target):
+        a, b = angle.a, angle.b
         both = (target.boards[target.index(name)].board for name in (a, b))
         # A symmetric board has no unique first corner to measure from.
         corners: tuple[float | None, float | None] = (None, None)
         if not any(board.looks_same_turned for board in both):
             corners = target.distance_mm(Feature(a, grid=(0, 0)), Feature(b, grid=(0, 0)))
         centres = target.distance_mm(Feature(a, centre=True), Feature(b, centre=True))
-        measured = _measured(checks, f"angle {a}-{b}", f"angle {b}-{a}")
+        measured = _measured(checks, "angle", angle)
         difference_cells = (Cell(value, sigma=sigma) for value, sigma in (corners, centres))
-        rows.append(cells(f"{a} and {b}", Cell(value, sigma=sigma), *measured, *difference_cells))
+        rows.append(cells(f"{a} and {b}", Cell(angle.value, sigma=angle.sigma), *measured, *difference_cells))
     distances = [c for c in checks if c.kind == "distance"]
     note = f"Solved from {target.image_count} images that show at least two of these boards."
     note += "".join(
@@ -157,8 +182,9 @@ def _angles(target: BoardRig, checks: Sequence[Check]) -> Table:
     return Table(key, "Rigidly mounted boards", heads, tuple(rows), note)
 
 
-def _measured(checks: Sequence[Check], *names: str) -> tuple[Cell, Cell, Cell]:
-    """Return the cells measured, how, and verdict of the check with one of these names; empty cells without one."""
+def _measured(checks: Sequence[Check], kind: str, solved: SolvedQuantity) -> tuple[Cell, Cell, Cell]:
+    """Return the cells measured, how, and verdict of the check of a solved baseline or angle; empty without one."""
+    names = (f"{kind} {solved.a}-{solved.b}", f"{kind} {solved.b}-{solved.a}")
     known = next((c for c in checks if c.name in names), None)
     if known is None:
         return Cell(None), Cell(""), Cell("")

@@ -131,7 +131,21 @@ def certificate_pdf(
     page = certificate_facts(certificate, limit)
     verdict = "" if page.passed is None else f"{page.badge.upper()}. "
     facts = [f"{name}: {fact}" for name, fact in {**basis(certificate), **provenance}.items()]
-    return sheet_pdf(certificate, title, [f"{verdict}{page.headline}.", *page.sentences], facts)
+    figure = new_figure(*A4_INCHES)
+    figure.text(0.09, 0.945, title, fontsize=15, weight="bold", va="top")
+    top = _write(figure, 0.905, [f"{verdict}{page.headline}.", *page.sentences], size=WORDS_SIZE)
+    lines = sum(len(_lines(fact, FACT_SIZE)) + PARAGRAPH_GAP for fact in facts)
+    map_height = min(MAP_HEIGHT, top - 0.09 - lines * _line_height(FACT_SIZE) - SIGNATURE_TOP)
+    left = figure.add_axes((0.11, top - map_height - 0.03, 0.52, map_height))
+    right = figure.add_axes((0.76, top - map_height - 0.01, 0.15, map_height - 0.04))
+    _draw_map(left, certificate)
+    _draw_causes(right, certificate)
+    _write(figure, top - map_height - 0.09, facts, size=FACT_SIZE)
+    for x, words in ((0.09, "Date"), (0.32, "Name"), (0.62, "Signature")):
+        figure.text(x, 0.052, words, fontsize=8, color="0.35")
+    for x, width in ((0.09, 0.19), (0.32, 0.26), (0.62, 0.29)):
+        figure.add_artist(_rule(x, 0.068, width))
+    return as_pdf(figure)
 
 
 def basis(certificate: Certificate) -> dict[str, str]:
@@ -161,25 +175,6 @@ def bound_figure(certificate: Certificate) -> Figure:
     _draw_map(left, certificate)
     _draw_causes(right, certificate)
     return figure
-
-
-def sheet_pdf(certificate: Certificate, title: str, statements: Sequence[str], facts: Sequence[str]) -> bytes:
-    """Return one A4 page with statements, map, causes, basis, and lines for a signature."""
-    figure = new_figure(*A4_INCHES)
-    figure.text(0.09, 0.945, title, fontsize=15, weight="bold", va="top")
-    top = _write(figure, 0.905, statements, size=WORDS_SIZE)
-    lines = sum(len(_lines(fact, FACT_SIZE)) + PARAGRAPH_GAP for fact in facts)
-    map_height = min(MAP_HEIGHT, top - 0.09 - lines * _line_height(FACT_SIZE) - SIGNATURE_TOP)
-    left = figure.add_axes((0.11, top - map_height - 0.03, 0.52, map_height))
-    right = figure.add_axes((0.76, top - map_height - 0.01, 0.15, map_height - 0.04))
-    _draw_map(left, certificate)
-    _draw_causes(right, certificate)
-    _write(figure, top - map_height - 0.09, facts, size=FACT_SIZE)
-    for x, words in ((0.09, "Date"), (0.32, "Name"), (0.62, "Signature")):
-        figure.text(x, 0.052, words, fontsize=8, color="0.35")
-    for x, width in ((0.09, 0.19), (0.32, 0.26), (0.62, 0.29)):
-        figure.add_artist(_rule(x, 0.068, width))
-    return as_pdf(figure)
 
 
 def _draw_map(axis: Any, certificate: Certificate) -> None:
