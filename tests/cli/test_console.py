@@ -1,6 +1,7 @@
 """Arguments made from the fields of option classes."""
 
 import argparse
+import importlib
 import subprocess
 import sys
 from dataclasses import dataclass, fields
@@ -10,12 +11,17 @@ from typing import Literal
 import pytest
 
 from rigkit.cli.console import add_options, options_of, progress_on_stderr
-from rigkit.cli.main import VERBS
+from rigkit.cli.main import VERBS, main
 from rigkit.io.disk.schema_builders import attributes_of
-from rigkit.workflows.options import cameras, clouds
+from rigkit.workflows.options import cameras, check, clouds, coach, plan
 from rigkit.workflows.options.base import WrittenFiles
 
-KINDS = [kind for module in (cameras, clouds) for name, kind in vars(module).items() if name.endswith("Options")]
+KINDS = [
+    kind
+    for module in (cameras, check, clouds, coach, plan)
+    for name, kind in vars(module).items()
+    if name.endswith("Options")
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +95,20 @@ def test_every_field_of_options_is_described_and_nothing_else(kind: type) -> Non
     assert set(attributes_of(kind)) == {field.name for field in fields(kind)}
 
 
+@pytest.mark.parametrize("verb", VERBS)
+def test_without_docstrings_a_verb_has_help(
+    verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(importlib.import_module(f"rigkit.cli.{verb}"), "__doc__", None)
+    monkeypatch.setattr("rigkit.cli.console.attributes_of", lambda kind: {})
+    with pytest.raises(SystemExit, match="0"):
+        main([verb, "--help"])
+    assert "--log-file" in capsys.readouterr().out
+
+
+@pytest.mark.thorough
 def test_without_docstrings_all_verbs_work() -> None:
+    """`python -OO` compiles all packages anew."""
     code = f"from rigkit.cli.main import build_parser\nfor verb in {list(VERBS)}: build_parser(verb).format_help()"
     subprocess.run([sys.executable, "-OO", "-c", code], check=True)
 

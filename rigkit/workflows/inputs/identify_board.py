@@ -191,13 +191,10 @@ def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     for name, image in _pictures(paths, EXPLAINING_IMAGES):
         if isinstance(image, InputError):
             continue
-        straight, flipped = (
-            [found.board_id for found in detect_boards(one, boards) if found.board_id is not None]
-            for one in (image, _flipped(image))
-        )
-        if straight:
+        if any(found.board_id is not None for found in detect_boards(image, boards)):
             return None
-        seen += [(name, board_id) for board_id in flipped]
+        flipped = detect_boards(_flipped(image), boards)
+        seen += [(name, found.board_id) for found in flipped if found.board_id is not None]
     if not seen:
         return None
     name, board_id = seen[0]

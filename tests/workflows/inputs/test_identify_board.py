@@ -104,8 +104,12 @@ def test_a_grid_too_blurred_to_be_believed_is_named(tmp_path: Path, capsys: pyte
     assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
     words = capsys.readouterr().err
     assert "no board is seen in the images (in '0.png' a 8x6 grid is seen" in words and "below" not in words
+
+
+def test_a_folder_below_is_named_where_images_show_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "calib").mkdir()
-    cv2.imwrite(str(tmp_path / "calib" / "1.png"), np.asarray(scene.render(supersample=2)))
+    for path in (tmp_path / "0.png", tmp_path / "calib" / "1.png"):
+        cv2.imwrite(str(path), np.zeros((40, 40), np.uint8))
     assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
     assert f"but '{tmp_path / 'calib'}' below has others: give it instead" in capsys.readouterr().err
 
