@@ -295,6 +295,11 @@ class Reach:
         return float(seconds[np.isfinite(seconds)].sum() + self.shared[self.uses[chosen].any(axis=0)].sum())
 
 
+def function_of(test: str) -> str:
+    """Return the id of a test without its parameters."""
+    return test.partition("[")[0]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--total", type=float, default=200.0, help="seconds that the quick tests may take, of one core")
@@ -317,7 +322,9 @@ def main() -> None:
     if args.further:
         before = {line for line in CHOSEN.read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
         left |= before - set(reach.tests)
-    names = sorted(left)
+    # Of a function that is left out with all its parameters, no test is made.
+    stays = {function_of(test) for test in reach.tests if test not in left}
+    names = sorted({test if function_of(test) in stays else function_of(test) for test in left})
     CHOSEN.write_text(HEAD + "".join(f"{name}\n" for name in names), encoding="utf-8")
     failed = [test for test, (_, started) in zip(reach.tests, reach.seconds, strict=True) if not np.isfinite(started)]
     print(f"tests of more than {limit} s; {len(failed)} failed under coverage and stay {' '.join(failed)}")
