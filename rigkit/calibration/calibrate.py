@@ -243,8 +243,7 @@ def _result(solution: _Solution) -> Calibration:
     if request.pupil == "moving":
         raise DegenerateError(
             "calibration: the images do not determine how the entrance pupil moves; take boards near and far, up to "
-            "the "
-            'rim of the image, or pupil = "auto"'
+            'the rim of the image, or pupil = "auto"'
         )
     central = solution.with_verdicts(central, far)
     return replace(central, candidates=(*central.candidates, *compared))

@@ -116,8 +116,7 @@ def rig_basis(rig: RigCalibration) -> str:
         "Intrinsics and extrinsics are solved jointly; held out: frames not used, with one board pose for all "
         f"cameras. {rig.corner_count} corners, {rig.shared_count} poses shared by several views. Overdispersion "
         f"{rig.overdispersion:.2f}: frames disagree that many times as much as independent corners would (included in "
-        "all "
-        "sigmas)." + "".join(f" {words[0].upper()}{words[1:]}." for words in lag_words(rig))
+        "all sigmas)." + "".join(f" {words[0].upper()}{words[1:]}." for words in lag_words(rig))
     )
 
 

@@ -54,6 +54,7 @@ from rigkit.io.manifests.session import (
     beside_session,
     boards_of,
     images_of,
+    load_session,
     options_of,
 )
 from rigkit.io.manifests.truth_file import measured_value, truth_from_table
@@ -153,6 +154,11 @@ def load_rig_session(path: str | Path) -> RigSession:
         lenses=lenses,
         known_rig=table.path_of(table["rig"]) if "rig" in table else None,
     )
+
+
+def load_any_session(path: str | Path) -> Session | RigSession:
+    """Return the session of a camera or a rig; raises InputError as `load_session` and `load_rig_session`."""
+    return load_rig_session(path) if is_rig_session(path) else load_session(path)
 
 
 def _rigid_boards(table: TomlTable, boards: Sequence[Board]) -> tuple[RigidBoards, ...]:

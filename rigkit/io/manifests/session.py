@@ -131,6 +131,11 @@ class Session:
     __repr__ = brief
 
     @property
+    def cameras(self) -> Mapping[str, Session]:
+        """Itself, where the session of a rig has those of its cameras."""
+        return {"": self}
+
+    @property
     def whose(self) -> str:
         """The words "of camera NAME" after a blank, for messages; "" outside of a rig."""
         return "" if self.camera is None else f" of camera '{self.camera}'"

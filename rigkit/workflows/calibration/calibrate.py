@@ -23,7 +23,7 @@ from rigkit.io.calibrations.calibration_file import calibration_text
 from rigkit.io.calibrations.rig_file import board_rigs_text, rig_text
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_together
-from rigkit.io.manifests.rig_session import RigSession, frames_of_images, is_rig_session, load_rig_session
+from rigkit.io.manifests.rig_session import RigSession, frames_of_images, load_any_session, load_rig_session
 from rigkit.io.manifests.session import Session, files_of_session, load_session
 from rigkit.planning.plan import Plan
 from rigkit.report.pages.calibration_facts import camera_facts, rig_facts
@@ -94,7 +94,7 @@ def calibrate_session(
     calibration = calibration_from(session, corners, pupil=options.pupil, progress=progress)
     files: dict[Path, str] = {}
     if options.output is not None:
-        files[options.output] = calibration_text(calibration, provenance_of(session.path, {"": session.images}))
+        files[options.output] = calibration_text(calibration, provenance_of(session))
         files |= foreign_files(calibration, options.output, options.exports)
     plan = plans_of({"": session}, {"": calibration}).get("") if options.report or options.plan else None
     if options.report is not None:
@@ -114,8 +114,7 @@ def corners_of(session: Session, options: CalibrateOptions, *, progress: Progres
 
 def session_inputs(session: Session | RigSession, options: CalibrateOptions) -> list[Path]:
     """Return all files that a calibration reads; results never replace them."""
-    cameras = session.cameras.values() if isinstance(session, RigSession) else [session]
-    out = [path for own in cameras for path in (*own.images, own.corners_path)]
+    out = [path for own in session.cameras.values() for path in (*own.images, own.corners_path)]
     # A session made in Python need not have a file.
     out += files_of_session(session.path) if session.path.is_file() else [session.path]
     out += options.known.files
@@ -242,7 +241,7 @@ def calibrate_rig_session(
         checks = measured_checks(session, rig)
     files: dict[Path, str] = {}
     if options.output is not None:
-        origin = provenance_of(session.path, {name: own.images for name, own in session.cameras.items()})
+        origin = provenance_of(session)
         if len(session.cameras) > 1:
             files[options.output] = rig_text(rig, origin)
             outlines = {c.name: outline_of_corners(c.calibration) for c in rig.cameras}
@@ -269,8 +268,8 @@ def calibrate_camera(path: Path, *, progress: Progress = silent) -> Calibration:
 
     Raises InputError for a session of several cameras, and as `calibrate_rig_session`.
     """
-    session = load_rig_session(path) if is_rig_session(path) else None
-    if session is None or len(session.cameras) > 1:
+    session = load_any_session(path)
+    if isinstance(session, Session) or len(session.cameras) > 1:
         own = load_session(path)
         return calibration_from(own, session_corners(own, progress=progress), progress=progress)
     require_distinct(session)

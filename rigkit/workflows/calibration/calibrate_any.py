@@ -16,8 +16,8 @@ from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.corners.corner_cache import FoundCorners
 from rigkit.io.disk.reading import about, read_bytes, read_text, usable_path
 from rigkit.io.disk.writing import ensure_writable, write_together
-from rigkit.io.manifests.rig_session import RigSession, is_rig_session, load_rig_session
-from rigkit.io.manifests.session import SESSION_NAME, Session, beside_session, load_session
+from rigkit.io.manifests.rig_session import RigSession, load_any_session
+from rigkit.io.manifests.session import SESSION_NAME, Session, beside_session
 from rigkit.io.media.images import IMAGE_ENDINGS
 from rigkit.io.media.video import is_video, videos_inside
 from rigkit.workflows.calibration.calibrate import (
@@ -86,7 +86,7 @@ def calibrate_session_file(
 
     Raises as `calibrate_session` and `calibrate_rig_session`.
     """
-    listed = load_rig_session(path) if is_rig_session(path) else load_session(path)
+    listed = load_any_session(path)
     if isinstance(listed, Session) and options.known.files:
         raise InputError("one camera has no extrinsics to solve for; `rigkit pose` gives its pose relative to a board")
     output = options.output or listed.result_path
@@ -193,8 +193,7 @@ def _session(
 
 def _keep_corners(path: Path, found: Mapping[Path, FoundCorners]) -> None:
     """Write the corners of images to the caches of a session's cameras."""
-    listed = load_rig_session(path) if is_rig_session(path) else load_session(path)
-    for own in listed.cameras.values() if isinstance(listed, RigSession) else [listed]:
+    for own in load_any_session(path).cameras.values():
         keep_corners(own, found)
 
 

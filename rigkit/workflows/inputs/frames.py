@@ -226,18 +226,17 @@ def with_frames(session: Session | RigSession, progress: Progress = silent) -> S
     Videos of several cameras are synchronised by the timestamps.csv beside them, if it exists, else by frame number.
     """
     place = beside_session(session.path, "frames")
-    own: Mapping[str, Session] = session.cameras if isinstance(session, RigSession) else {"": session}
-    videos = {name: tuple(filter(is_video, camera.images)) for name, camera in own.items()}
+    videos = {name: tuple(filter(is_video, camera.images)) for name, camera in session.cameras.items()}
     if not any(videos.values()):
         return session
     sources = {name: paths[0] for name, paths in videos.items() if paths}
     if any(len(paths) > 1 for paths in videos.values()):
         raise InputError(f"{session.path}: several videos of one camera; keep one")
-    boards = next(iter(own.values())).boards
+    boards = next(iter(session.cameras.values())).boards
     times = timestamps_next_to(list(sources.values()))
     frames = frames_of_videos(sources, place, boards, timestamps=times, progress=progress)
     cameras: dict[str, Session] = {}
-    for name, camera in own.items():
+    for name, camera in session.cameras.items():
         still = [path for path in camera.images if path not in videos[name]]
         cameras[name] = replace(camera, images=(*still, *frames.get(name, ())))
     return replace(session, cameras=cameras) if isinstance(session, RigSession) else cameras[""]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -13,6 +13,8 @@ from typing import Any
 
 from rigkit.core.errors import InputError
 from rigkit.io.corners.corner_cache import image_hash
+from rigkit.io.manifests.rig_session import RigSession
+from rigkit.io.manifests.session import Session
 
 PACKAGES = ("numpy", "opencv-contrib-python-headless")
 """Packages whose versions all results depend on."""
@@ -25,12 +27,12 @@ def software_facts(*packages: str) -> dict[str, str]:
     return facts | {"written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")}
 
 
-def provenance_of(session: Path, images: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
+def provenance_of(session: Session | RigSession) -> dict[str, Any]:
     """Return the provenance that a calibration file states: rigkit's version, the time, the SHA-256 of the session, and
     for each camera the SHA-256 of what `sha256sum` prints for its readable images."""
-    inputs = {} if not session.is_file() else {session.name: hashlib.sha256(session.read_bytes()).hexdigest()}
-    for name, paths in images.items():
-        pairs = _hashes(paths)
+    inputs = {session.path.name: digest_of(session.path)} if session.path.is_file() else {}
+    for name, own in session.cameras.items():
+        pairs = _hashes(own.images)
         if pairs:
             inputs[f"{len(pairs)} images{f' of {name}' if name else ''}"] = _digest_of(pairs)
     written = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
