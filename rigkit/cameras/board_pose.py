@@ -1,4 +1,4 @@
-"""The pose of a flat board from its corners in the image of any camera."""
+"""The pose of a board from its corners in the image of any camera, and what errors of lens and board do to it."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import numpy as np
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import NearCamera
-from rigkit.core.arrays import Pixels, Points
+from rigkit.core.arrays import FloatArray, Pixels, Points
 from rigkit.geometry.board_pose import board_pose, moved_board_poses
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import skew
 
 MAX_PUPIL_ROUNDS, SETTLED_PX = 30, 1e-6
 """Each round multiplies the error by the pupil's movement over the board's distance."""
@@ -48,3 +49,32 @@ def _settled(camera: NearCamera, pixels: Pixels, points_mm: Points) -> tuple[Pix
         if change <= SETTLED_PX:
             break
     return out, pose
+
+
+def pose_covariance_of_lens(
+    camera: Camera,
+    covariance: FloatArray,
+    points_in_cam: Points,
+    origin_in_cam: FloatArray,
+    sigma_px: FloatArray,
+    by_board: FloatArray | None = None,
+) -> FloatArray:
+    """Return the part of a board pose's covariance that comes from the lens and the board: (6, 6) of (w, v),
+    R' = exp([w]x) R, t' = t + v, rad and mm.
+
+    The corners fix the pixels: from dq = A dp + K dk = 0 follows dp = -(A^T W A)^-1 A^T W K dk.
+
+    Parameters
+    ----------
+    covariance : (P + B, P + B) of the camera's parameters and of B unknowns of the board's shape.
+    points_in_cam, origin_in_cam : (N, 3) and (3,) the board's points and its origin, mm.
+    sigma_px : (N,) standard deviations of the corners.
+    by_board : (N, 3, B) derivatives of the points by those unknowns; None for a board that is exactly known.
+    """
+    _, _, d_pixels_d_point, by_known = camera.project_with_jacobians(points_in_cam)
+    if by_board is not None:
+        by_known = np.concatenate([by_known, d_pixels_d_point @ by_board], axis=-1)
+    by_pose = np.concatenate([-d_pixels_d_point @ skew(points_in_cam - origin_in_cam), d_pixels_d_point], axis=-1)
+    weight, count = 1.0 / sigma_px[:, None, None], 2 * len(points_in_cam)
+    step = np.linalg.lstsq((by_pose * weight).reshape(count, -1), (by_known * weight).reshape(count, -1), rcond=None)[0]
+    return np.asarray(step @ covariance @ step.T)

@@ -128,6 +128,8 @@ class Knowledge:
         known = cls.unseen(calibration)
         for shape in calibration.boards:
             views = [v for v in calibration.views if v.board_id == shape.board_id and v.kept.any()]
+            if not views:
+                continue
             board, seen = shape.board, np.zeros((len(views), len(shape.points_mm)), dtype=bool)
             for row, view in zip(seen, views, strict=True):
                 row[board.index(view.grid)[view.kept]] = True

@@ -10,14 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.calibration.board_shape import BoardShape, measured_shape
-from rigkit.calibration.certainty.displaced import uncertain_camera
-from rigkit.calibration.certainty.uncertainty import pose_covariance_of_lens
 from rigkit.calibration.hand_eye import HandEye, hand_eye
+from rigkit.calibration.solving.shape import WARP_UNKNOWNS, warp_of_board
 from rigkit.cameras.base import Camera
-from rigkit.cameras.board_pose import board_with_fixed_pupil
+from rigkit.cameras.board_pose import board_with_fixed_pupil, pose_covariance_of_lens
 from rigkit.cameras.moving_pupil import NearCamera, far_camera
-from rigkit.cameras.uncertain import UncertainCamera
-from rigkit.core.arrays import BoolArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, BoardView
 from rigkit.core.errors import CheckFailed, DegenerateError, InputError
@@ -32,6 +30,8 @@ from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.io.manifests.robot_poses import read_robot_poses
 from rigkit.io.media.images import read_image_of
+from rigkit.validation.monitoring.evidence import Monitored
+from rigkit.validation.monitoring.watch import monitored_camera
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_near_camera
 from rigkit.workflows.inputs.identify_board import why_not_detected
@@ -63,7 +63,7 @@ class PlacedCamera:
     Attributes
     ----------
     pose : with its covariance, from the noise of the corners, the sigma of the squares if the board's file states one,
-        and the covariance of the lens if `lens_known`.
+        and the covariance of the lens if `lens_known`, with that of the board's corners if `board_measured`.
     image : the image that shows the board.
     rms_px : reprojection error of the corners, rms.
     ambiguous : whether a second pose, with the board tilted the other way, fits almost as well.
@@ -159,16 +159,18 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
         if not np.isfinite(found[0].covariance).all() or not np.isfinite(rms):
             raise DegenerateError("the board is outside the camera's field of view; check the camera file")
     ambiguous = len(found) > 1 and found[1].rms_rad < PLANAR_AMBIGUITY * found[0].rms_rad
-    pose, covariance, of_lens = found[0].cam_from_board, found[0].covariance.copy(), _uncertain_camera(camera)
-    if of_lens is not None:
+    pose, covariance, calibrated = found[0].cam_from_board, found[0].covariance.copy(), _calibrated(camera)
+    if calibrated is not None:
+        by_board = pose.rotation @ _by_warps(calibrated, shape, view.grid[valid])
+        near, given = calibrated.cameras[0], calibrated.covariance
         covariance += pose_covariance_of_lens(
-            of_lens.camera, of_lens.covariance, pose.apply(points), pose.translation_mm, view.sigma_px[valid]
+            near, given, pose.apply(points), pose.translation_mm, view.sigma_px[valid], by_board
         )
     if known.square_sigma_mm is not None:
         shift = pose.translation_mm * known.square_sigma_mm / np.sqrt(known.square_x_mm * known.square_y_mm)
         covariance[3:, 3:] += np.outer(shift, shift)
     placed = BoardPose(pose, found[0].rms_rad, covariance)
-    return PlacedCamera(placed, Path(image), rms, ambiguous, of_lens is not None, shape is not None)
+    return PlacedCamera(placed, Path(image), rms, ambiguous, calibrated is not None, shape is not None)
 
 
 def _with_fixed_pupil(camera: Camera, view: BoardView) -> BoardView:
@@ -178,12 +180,24 @@ def _with_fixed_pupil(camera: Camera, view: BoardView) -> BoardView:
     return replace(view, pixels=board_with_fixed_pupil(camera, view.pixels, view.points()))
 
 
-def _uncertain_camera(camera: str | Path) -> UncertainCamera | None:
-    """Return the camera with the covariance of its file; None for another tool's file, which has none."""
+def _calibrated(camera: str | Path) -> Monitored | None:
+    """Return the camera and the warps of its measured boards, with the covariance of its file; None for another tool's
+    file, which has none."""
     try:
-        return uncertain_camera(load_calibration(camera))
+        return monitored_camera(load_calibration(camera), "camera", quoted=True)
     except InputError:
         return None
+
+
+def _by_warps(calibrated: Monitored, shape: BoardShape | None, grid: IntArray) -> FloatArray:
+    """Return the derivatives (N, 3, B) of a board's corners at `grid` (N, 2), in its frame, by the warps of all boards
+    that were measured; `shape` is that board's, None for one that is as declared."""
+    out = np.zeros((len(grid), 3, WARP_UNKNOWNS * len(calibrated.warped)))
+    if shape is not None:
+        first = WARP_UNKNOWNS * calibrated.warped.index(shape.board_id)
+        basis = warp_of_board(shape.points_mm).basis
+        out[..., first : first + WARP_UNKNOWNS] = basis[grid @ np.array([1, shape.column_count])]
+    return out
 
 
 def _boards_in(path: Path, board: Board, camera: Camera, calibration: str | Path) -> Sequence[BoardDetection]:

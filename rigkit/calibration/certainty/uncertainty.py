@@ -31,8 +31,8 @@ from rigkit.calibration.result import Calibration, CalibrationCorners, Rival
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.cameras.moving_pupil import NearCamera
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays, scaled_pinv, symmetric_pinv
-from rigkit.geometry.rotation import exp_so3, skew
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Rays, scaled_pinv, symmetric_pinv
+from rigkit.geometry.rotation import exp_so3
 
 CORNERS = 400
 """Number of corners, spread over all views, at which the uncertainty is evaluated."""
@@ -360,27 +360,6 @@ def step_to_lens(camera: Camera, other: Camera, rays: Rays, sigmas: FloatArray) 
     size = np.where(size > 0.0, size, 1.0)
     step = np.linalg.lstsq(rows / size, (there - pixels)[seen].reshape(-1), rcond=FOLLOWED)[0] / size
     return sigmas * step[:-3], turn @ exp_so3(-step[-3:])
-
-
-def pose_covariance_of_lens(
-    camera: Camera, covariance: FloatArray, points_in_cam: Points, origin_in_cam: FloatArray, sigma_px: FloatArray
-) -> FloatArray:
-    """Return the part of a board pose's covariance that comes from the lens: (6, 6) of (w, v), R' = exp([w]x) R,
-    t' = t + v, rad and mm.
-
-    The corners fix the pixels: from dq = A dp + K dk = 0 follows dp = -(A^T W A)^-1 A^T W K dk.
-
-    Parameters
-    ----------
-    covariance : (P, P) of the camera's parameters.
-    points_in_cam, origin_in_cam : (N, 3) and (3,) the board's points and its origin, mm.
-    sigma_px : (N,) standard deviations of the corners.
-    """
-    _, _, d_pixels_d_point, by_lens = camera.project_with_jacobians(points_in_cam)
-    by_pose = np.concatenate([-d_pixels_d_point @ skew(points_in_cam - origin_in_cam), d_pixels_d_point], axis=-1)
-    weight, count = 1.0 / sigma_px[:, None, None], 2 * len(points_in_cam)
-    step = np.linalg.lstsq((by_pose * weight).reshape(count, -1), (by_lens * weight).reshape(count, -1), rcond=None)[0]
-    return np.asarray(step @ covariance @ step.T)
 
 
 def _spread(corners: CalibrationCorners) -> IntArray:

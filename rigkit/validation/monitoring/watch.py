@@ -20,11 +20,13 @@ from rigkit.planning.information import Knowledge
 from rigkit.validation.monitoring.evidence import Monitored
 
 
-def monitored_camera(calibration: Calibration, name: str, *, beyond_model: bool = True) -> Monitored:
+def monitored_camera(
+    calibration: Calibration, name: str, *, beyond_model: bool = True, quoted: bool = False
+) -> Monitored:
     """Return a calibrated camera, by default with the inadequacy of its model and the warps of its boards among the
-    unknowns; a moving pupil has its covariance from the solution."""
+    unknowns; a moving pupil has its covariance from the solution. `quoted` is as for `uncertain_camera`."""
     known = (
-        uncertain_camera(calibration, quoted=False, near=True)
+        uncertain_camera(calibration, quoted=quoted, near=True)
         if beyond_model
         else UncertainCamera(calibration.near, calibration.near_covariance[:-6, :-6])
     )
