@@ -309,6 +309,42 @@ EXPORT void fit_circles(
     ARRAY(const double, reach, count), ARRAY(const int64_t, beside, count, BESIDE), const circle_rules_t *rules, int64_t most,
     SCRATCH(double, scratch, SPOT, most), RESULT(double, out, count, CIRCLE_OUTCOMES));
 
+/* blobs.c */
+
+/* The constants of detection.circles.blobs: the smallest difference from the local mean, in standard deviations, the range of
+ * the areas of blobs, and their smallest share of their bounding boxes. The columns of a blob: its centroid, its covariance (uu,
+ * uv, vv), area and sign. */
+typedef struct {
+    double deviations, min_filling;
+    int64_t min_area, max_area;
+} blob_rules_t;
+enum { BLOB_COLUMNS = 7 };
+
+EXPORT int64_t blobs_memory(int64_t width);
+EXPORT int64_t find_blobs(
+    ARRAY(const float, off, height, width), ARRAY(const float, variance, height, width), int64_t height, int64_t width,
+    const blob_rules_t *rules, SCRATCH(uint8_t, signs, width), SCRATCH(uint8_t, memory, blobs_memory(width)),
+    RESULT(double, out, height * width / rules.min_area + 1, BLOB_COLUMNS));
+
+/* circle_maps.c */
+
+/* The places around a circle that predict it, and the terms of their polynomials: at most. The columns of the map around a place:
+ * pixel (2), first derivatives (uu, uv, vu, vv of the matrix), second (xx, xy, yy of u, then of v), number of circles used,
+ * whether there is one on every side, and the standard deviations of pixel and first derivatives. */
+enum { MAX_PREDICTORS = 64, PREDICTED_TERMS = 15, PREDICTED_COLUMNS = 16 };
+
+/* The constants of detection.circles.local_map. */
+typedef struct {
+    double sigma_px, min_ridge, slight, min_below;
+    int64_t leave_out;
+} prediction_rules_t;
+
+EXPORT void local_maps(
+    ARRAY(const double, table, rows, columns, 2), int64_t rows, int64_t columns, ARRAY(const int64_t, places, count, 2),
+    int64_t count, ARRAY(const int64_t, offsets, near, 2), ARRAY(const double, plane, near, 2),
+    ARRAY(const double, weights, near), ARRAY(const uint8_t, next, near), int64_t near,
+    ARRAY(const double, typical, PREDICTED_TERMS), const prediction_rules_t *rules, RESULT(double, out, count, PREDICTED_COLUMNS));
+
 /* light.c */
 
 /* The results of a step of the light: u, v of the corner, its standard deviation, direction, position and width of the step, the

@@ -18,7 +18,7 @@ from rigkit.detection.circles.evidence import (
     UNEXPLAINED,
     GridEvidence,
 )
-from rigkit.detection.circles.find import seen_grids
+from rigkit.detection.circles.search import CircleSearch
 
 BOARDS = (
     Board("regular", 10, 8, 25.0, 25.0, pattern=Circles(diameter_mm=15.0)),
@@ -35,7 +35,7 @@ def print_circle_margins(looks: Iterable[tuple[str, bool, NDArray[np.uint8]]]) -
     seen: dict[bool, list[tuple[str, GridEvidence]]] = {True: [], False: []}
     nothing = []
     for name, shows, pixels in looks:
-        grids = sorted(seen_grids(pixels), key=len, reverse=True)
+        grids = sorted(CircleSearch(pixels).seen(), key=len, reverse=True)
         seen[shows] += [(name, grid.evidence) for grid in (grids[:1] if shows else grids)]
         nothing += [name] if shows and not grids else []
     print(f"\ncircles: {len(nothing)} images of grids without a lattice of circles:", "; ".join(nothing[:SHOWN]))

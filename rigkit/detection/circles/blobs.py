@@ -14,10 +14,12 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.saddles.response import BASE_PIXELS, FloatImage, GreyImage
+from rigkit.kernels import circles as kernel
+from rigkit.kernels.front import shrunk
 
 WINDOW_PX = 31
 """Side of the square of the local mean, in pixels of a level."""
-BLOB_AREAS = (12.0, 500.0)
+BLOB_AREAS = (12, 500)
 """Range of the areas of blobs on a level, in its pixels: the window covers the largest and its surroundings, and the
 ranges of adjacent levels overlap by far more than two blobs of a grid differ."""
 DEVIATIONS = 0.2
@@ -74,30 +76,28 @@ class Blobs:
         return int(2 ** max(0.0, np.floor(np.log2(np.median(self.radius_px()) / FIRST_RADIUS_PX))))
 
 
-def find_blobs(grey: GreyImage, *, coarse: bool = False) -> Blobs:
+def find_blobs(grey: GreyImage, *, coarse: bool = False, known: Blobs | None = None) -> Blobs:
     """Return the blobs of `grey`, of both signs and all sizes, without duplicates.
 
-    `coarse`: without those found only on finer levels than one of COARSE_PIXELS.
+    `coarse`: without those found only on finer levels than one of COARSE_PIXELS. `known`: the result of a coarse
+    search, if there was one.
     """
-    level, scale = grey.astype(np.float32), 1.0
-    while level.size > (COARSE_PIXELS if coarse else BASE_PIXELS):
-        level, scale = _halved(level), 2.0 * scale
+    scale, (height, width) = 1, grey.shape
+    while (height // scale) * (width // scale) > (COARSE_PIXELS if coarse else BASE_PIXELS):
+        scale *= 2
+    level = grey.astype(np.float32) if scale == 1 else shrunk(grey, scale)
     found: list[Blobs] = []
-    while min(level.shape) >= SMALLEST_LEVEL or not found:
-        found.append(_of_level(level, scale))
-        level, scale = _halved(level), 2.0 * scale
+    while (min(level.shape) >= SMALLEST_LEVEL or not found) and (known is None or level.size > COARSE_PIXELS):
+        found.append(_of_level(level, float(scale)))
+        level, scale = _halved(level), 2 * scale
+    found += [] if known is None else [known]
     joined = Blobs(*(np.concatenate([getattr(part, name) for part in found]) for name in ("pixels", "shape", "sign")))
     return joined.chosen(_once(joined))
 
 
 def reduced(grey: GreyImage, scale: int) -> GreyImage:
-    """Return the image reduced by `scale`, for a first fit: in 8 bits if it has those."""
-    if scale == 1:
-        return grey
-    height, width = (side // scale for side in grey.shape)
-    inside = grey[: height * scale, : width * scale]
-    small = cv2.resize(inside, (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.uint8) if grey.dtype == np.uint8 else np.asarray(small, np.float32)
+    """Return the image reduced by `scale`."""
+    return grey if scale == 1 else shrunk(grey, scale)
 
 
 def scaled_up(pixels: FloatArray, scale: float) -> FloatArray:
@@ -113,48 +113,23 @@ def _halved(level: FloatImage) -> FloatImage:
 def _of_level(level: FloatImage, scale: float) -> Blobs:
     smooth = cv2.GaussianBlur(level, (0, 0), SMOOTH_PX)
     window = (WINDOW_PX, WINDOW_PX)
-    mean = cv2.blur(smooth, window)
-    off = smooth - mean
-    # Sums of floats may be slightly negative.
-    limit = np.float32(DEVIATIONS) * cv2.sqrt(np.maximum(cv2.blur(off * off, window), 0.0))
-    parts = []
-    for sign, mask in ((1.0, off > limit), (-1.0, off < -limit)):
-        pixels, covariance, area = _moments(mask)
-        shape = _root(4.0 * covariance)
-        root = np.sqrt(np.maximum(np.linalg.det(covariance), 1e-12))
-        filling = area / (4.0 * np.pi * root)
-        half_trace = 0.5 * np.trace(covariance, axis1=1, axis2=2)
-        # Axes with ratio r have half_trace / root = (r + 1 / r) / 2.
-        round_enough = half_trace / root < 0.5 * (MAX_ASPECT + 1.0 / MAX_ASPECT)
-        good = (filling > FILLING[0]) & (filling < FILLING[1]) & round_enough
-        parts.append(Blobs(scaled_up(pixels[good], scale), shape[good] * scale, np.full(int(good.sum()), sign)))
-    return Blobs(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("pixels", "shape", "sign")))
-
-
-def _moments(mask: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return centroids (N, 2), covariances (N, 2, 2) and areas (N,) of regions of suitable area off the border."""
-    count, labels, stats, centroids = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=4)
-    area = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
-    left, top, wide, high = (stats[:, k] for k in range(4))
-    height, width = mask.shape
-    inside = (left > 0) & (top > 0) & (left + wide < width) & (top + high < height)
-    inside &= (area >= BLOB_AREAS[0]) & (area <= BLOB_AREAS[1])
-    # Bounding boxes of thin, long or ragged regions are far larger than these.
-    inside &= area > wide * high * (0.25 * np.pi / MAX_ASPECT)
-    inside[0] = False
-    wanted = np.flatnonzero(inside)
-    number = np.full(count, -1)
-    number[wanted] = np.arange(len(wanted))
-    at = np.flatnonzero(mask)
-    which = number[labels.ravel()[at]]
-    at, which = at[which >= 0], which[which >= 0]
-    v, u = np.divmod(at, width)
-    du, dv = u - centroids[wanted, 0][which], v - centroids[wanted, 1][which]
-    sums = [np.bincount(which, part, len(wanted)) for part in (du * du, du * dv, dv * dv)]
-    uu, uv, vv = (part / np.maximum(area[wanted], 1.0) for part in sums)
-    # The variance of a square pixel is 1/12.
-    covariance = np.stack([uu + 1.0 / 12.0, uv, uv, vv + 1.0 / 12.0], axis=-1).reshape(-1, 2, 2)
-    return np.asarray(centroids[wanted], np.float64), covariance, area[wanted]
+    off = smooth - cv2.blur(smooth, window)
+    rules = kernel.BlobRules.of(
+        deviations=DEVIATIONS,
+        # Bounding boxes of thin, long or ragged regions are far larger than these.
+        min_filling=0.25 * np.pi / MAX_ASPECT,
+        min_area=int(BLOB_AREAS[0]),
+        max_area=int(BLOB_AREAS[1]),
+    )
+    rows = kernel.find_blobs(off, np.asarray(cv2.blur(off * off, window), np.float32), rules)
+    pixels, (uu, uv, vv), area, sign = rows[:, :2], rows[:, 2:5].T, rows[:, 5], rows[:, 6]
+    root = np.sqrt(np.maximum(uu * vv - uv * uv, 1e-12))
+    filling = area / (4.0 * np.pi * root)
+    # Axes with ratio r have half_trace / root = (r + 1 / r) / 2.
+    round_enough = 0.5 * (uu + vv) / root < 0.5 * (MAX_ASPECT + 1.0 / MAX_ASPECT)
+    good = (filling > FILLING[0]) & (filling < FILLING[1]) & round_enough
+    shape = _root(4.0 * rows[good][:, [2, 3, 3, 4]].reshape(-1, 2, 2))
+    return Blobs(scaled_up(pixels[good], scale), shape * scale, sign[good])
 
 
 def _root(matrix: FloatArray) -> FloatArray:

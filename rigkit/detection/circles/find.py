@@ -1,4 +1,4 @@
-"""Detection of all grids of circles in an image: blobs, their lattices, the fit of circles, growth, and evidence."""
+"""The grid of circles of a lattice of blobs: the fit of circles, growth, and evidence."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.detection.circles.blobs import Blobs, find_blobs, reduced
+from rigkit.detection.circles.blobs import Blobs, reduced
 from rigkit.detection.circles.certainty import centre_sigmas
 from rigkit.detection.circles.evidence import GridEvidence
-from rigkit.detection.circles.fit import CircleFit, edge_reach, fit_circles
+from rigkit.detection.circles.fit import PLAIN_RULES, RULES, CircleFit, edge_reach, fit_circles
 from rigkit.detection.circles.grid import CircleGrid
 from rigkit.detection.circles.local_map import (
     CORNER,
@@ -22,14 +22,18 @@ from rigkit.detection.circles.local_map import (
     steps,
     with_smooth_curvatures,
 )
-from rigkit.detection.circles.rows import joined, rows_of
+from rigkit.detection.circles.rows import joined, rows_of, with_rows
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS
+from rigkit.kernels.circles import CircleRules
 
 if TYPE_CHECKING:
     from rigkit.detection.circles.lattices import LabelledBlobs
 
 FIRST_EDGE_BLUR = 0.8
+FINE_BLUR_PX = 1.25
+"""Blur, in px of a reduced image, above which a finer one adds hardly any information: its pixels sharpen edges by 2 %
+and with them centres by 1 %."""
 MIN_SIDE = 3
 """Smallest number of rows and columns: smaller lattices are too often no grids."""
 MIN_CIRCLES = MIN_SIDE**2
@@ -46,6 +50,8 @@ MAX_CIRCLE_RESIDUAL = 3.0
 """Largest ratio of residual to contrast relative to the typical one: a circle above it is partly covered."""
 MIN_TYPICAL_CIRCLE = 0.03
 """Lower limit of the typical ratio of residual to contrast."""
+UNSETTLED = 2.0
+"""Factor of the limits of place and contrast for fits that have not converged."""
 SUPPORT = 5
 """Smallest number of neighbours that predict a circle without a blob."""
 MAX_GAIN = 10.0
@@ -66,38 +72,6 @@ MIN_UNEVEN, MAX_UNEVEN = 0.1, 0.9
 move centres (REAL, hexagonal: within 0.0003 px); the largest is a blur four times as wide one way as across."""
 MAX_NEW_RINGS = 40
 """Largest number of rings of circles by which a grid grows: around a centre, circles are neighbours without end."""
-
-
-def find_grids(
-    grey: GreyImage, min_circles: int = MIN_CIRCLES, *, quick: bool = False, coarse: bool = False
-) -> list[CircleGrid]:
-    """Return the grids of circles in `grey`, the largest first.
-
-    `quick`: from blobs only, each fitted once. `coarse`: not those of small circles (`find_blobs`).
-    """
-    seen = seen_grids(grey, quick=quick, coarse=coarse)
-    found = [grid for grid in seen if len(grid) >= min_circles and grid.evidence.convincing]
-    return sorted(found, key=lambda grid: -len(grid))
-
-
-def seen_grids(grey: GreyImage, *, quick: bool = False, coarse: bool = False) -> list[CircleGrid]:
-    """Return all lattices in `grey` that may be grids, with their evidence."""
-    # scipy's graphs are imported here because they slow down the start of rigkit by a quarter.
-    from rigkit.detection.circles.lattices import blob_lattices
-
-    blobs = find_blobs(grey, coarse=coarse)
-    out = []
-    for found in blob_lattices(blobs):
-        if len(found.index) >= MIN_CIRCLES and _wide(found.label):
-            grid = _grown(grey, blobs.chosen(found.index), found, quick=quick)
-            if grid is not None:
-                out.append(grid)
-    return out
-
-
-def _wide(label: IntArray) -> bool:
-    """Return whether circles are in at least MIN_SIDE rows and columns."""
-    return bool((np.ptp(label, axis=0) >= MIN_SIDE - 1).all())
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -123,44 +97,47 @@ class _Draft:
 
     def enlarged(self, scale: int) -> _Draft:
         """Return the draft in an image that is `scale` times as large."""
-        return replace(self, fit=self.fit.enlarged(scale), around=self.around.enlarged(scale))
+        larger = {"fit": self.fit.enlarged(scale), "around": self.around.enlarged(scale)}
+        return replace(self, **larger, uneven_px2=scale**2 * self.uneven_px2)
 
 
-def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool) -> CircleGrid | None:
+def grid_of(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool = False) -> CircleGrid | None:
     """Return the grid of the `blobs` of a lattice, or None. Large circles are found in a smaller image."""
     scale = blobs.reduction()
-    small = reduced(grey, scale)
-    draft = _first(small, blobs.reduced(scale), found)
-    for step in () if quick else (_again, _with_all):
-        if _enough(draft):
-            draft = step(small, draft)
-    draft = draft.enlarged(scale) if quick else _in_the_image(grey, draft, scale)
-    if not (_enough(draft) or quick):
-        draft = _mixed(grey, _first(grey, blobs, found, beside=True))
+    draft = _first(reduced(grey, scale), blobs.reduced(scale), found)
+    if not quick:
+        draft, scale = _in_finer_images(grey, draft, scale)
+        if not _enough(draft):
+            draft, scale = _mixed(grey, _first(grey, blobs, found, beside=True)), 1
     if not _enough(draft):
         return None
     evidence = _evidence(draft)
-    if scale > 1 and not (evidence.convincing or quick or draft.mixed):
-        # Sizes of much blurred circles are not yet those of the image itself.
-        again = _again(grey, draft)
-        if _enough(again):
-            draft, evidence = again, _evidence(again)
+    # Sizes of much blurred circles are not yet those of the image itself.
+    for _ in range(0 if quick or draft.mixed or blobs.reduction() == 1 else 1 if scale == 1 else 2):
+        again = draft if evidence.convincing else _again(grey, draft.enlarged(scale))
+        if again is not draft and _enough(again):
+            draft, evidence, scale = again, _evidence(again), 1
     if evidence.convincing and not quick:
-        draft = _through_its_blur(grey, draft)
-    return _finished(draft, evidence, (grey.shape[1], grey.shape[0]))
+        draft = _through_its_blur(reduced(grey, scale), draft)
+    return _finished(draft.enlarged(scale), evidence, (grey.shape[1], grey.shape[0]))
 
 
-def _in_the_image(grey: GreyImage, draft: _Draft, scale: int) -> _Draft:
-    """Return the draft of an image reduced by `scale` fitted in `grey`, and before that in images of sizes between.
+def _in_finer_images(grey: GreyImage, draft: _Draft, scale: int) -> tuple[_Draft, int]:
+    """Return the draft of an image reduced by `scale`, extended, and fitted in one reduced by less, and the last scale.
 
     Each fit has its maps from the last centres; with those of a much smaller image, slants scatter by up to five times
     as much (RENDERED, circles of 200 px), and with them the stated sigmas.
     """
-    if not _enough(draft):
-        return draft
-    finer = max(scale // 2, 1)
-    draft = _again(reduced(grey, finer), draft.enlarged(scale // finer))
-    return draft if finer == 1 else _in_the_image(grey, draft, finer)
+    for step in (_again, _with_all):
+        if _enough(draft):
+            draft = step(reduced(grey, scale), draft)
+    while _enough(draft):
+        last = scale == 1 or bool(np.median(draft.fit.blur_px) > FINE_BLUR_PX)
+        finer = scale if last else scale // 2
+        draft, scale = _again(reduced(grey, finer), draft.enlarged(scale // finer)), finer
+        if last or scale == 1:
+            break
+    return draft, scale
 
 
 def _first(grey: GreyImage, own: Blobs, found: LabelledBlobs, *, beside: bool = False) -> _Draft:
@@ -194,8 +171,13 @@ def _with_all(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft
     return draft
 
 
+def enough(label: IntArray) -> bool:
+    """Return whether there are MIN_CIRCLES, in at least MIN_SIDE rows and columns."""
+    return len(label) >= MIN_CIRCLES and bool((np.ptp(label, axis=0) >= MIN_SIDE - 1).all())
+
+
 def _enough(draft: _Draft) -> bool:
-    return len(draft.label) >= MIN_CIRCLES and _wide(draft.label)
+    return enough(draft.label)
 
 
 def _fitted(
@@ -207,13 +189,14 @@ def _fitted(
     blur_px: FloatArray,
     uneven_px2: FloatArray,
     beside: IntArray | None = None,
-    known: int = 0,
+    only: BoolArray | None = None,
+    rules: CircleRules = RULES,
 ) -> CircleFit:
-    """Return the fitted circles, except for the first `known`, which are only used as neighbours of the others."""
+    """Return the fitted circles; those that are not among `only` are only used as neighbours of the others."""
     maps = radius.seen * around.first
     reach = edge_reach(maps, 0.5 / radius.seen, blur_px, around.surrounded, corner)
-    reach[:known] = 0.0
-    return fit_circles(grey, pixels, maps, radius.printed**2 * around.second, blur_px, reach, beside, uneven_px2)
+    reach = reach if only is None else np.where(only, reach, 0.0)
+    return fit_circles(grey, pixels, maps, radius.printed**2 * around.second, blur_px, reach, beside, uneven_px2, rules)
 
 
 def like_contrast(fit: CircleFit, contrast: float, share: float) -> BoolArray:
@@ -336,14 +319,22 @@ def _larger(grey: GreyImage, draft: _Draft, *, beside: bool) -> _Draft | None:
 
 def _tried(grey: GreyImage, draft: _Draft, places: IntArray, around: PlaneMap, *, beside: bool) -> CircleFit:
     """Return the circles fitted at places beside those of the draft."""
-    pixels, blur = around.pixels, np.full(len(places), float(np.median(draft.fit.blur_px)))
-    if not beside:
-        return _fitted(grey, pixels, around, draft.radius, draft.corner, blur, draft.uneven_px2)
-    others = beside_each(np.concatenate([draft.label, places]), draft.hexagonal)
-    pixels, blur = np.concatenate([draft.fit.pixels, pixels]), np.concatenate([draft.fit.blur_px, blur])
-    every, known = joined(draft.around, around), len(draft.label)
-    fit = _fitted(grey, pixels, every, draft.radius, draft.corner, blur, draft.uneven_px2, others, known)
-    return rows_of(fit, np.arange(len(pixels)) >= known)
+    typical, known = draft.fit, len(draft.label) if beside else 0
+    pixels, blur, every, others = around.pixels, np.full(len(places), float(np.median(typical.blur_px))), around, None
+    if beside:
+        others = beside_each(np.concatenate([draft.label, places]), draft.hexagonal)
+        pixels, blur = np.concatenate([typical.pixels, pixels]), np.concatenate([typical.blur_px, blur])
+        every = joined(draft.around, around)
+    at = (grey, pixels, every, draft.radius, draft.corner, blur, draft.uneven_px2, others)
+    only = np.arange(len(pixels)) >= known
+    fit = _fitted(*at, only, PLAIN_RULES)
+    # Where there is no circle, a fit would use all its steps.
+    near = np.linalg.norm(fit.pixels - pixels, axis=1) < UNSETTLED * OFF_PLACE * _spacing(every)
+    parts = [np.abs(fit.contrast) / np.median(np.abs(typical.contrast)), fit.share / np.median(typical.share)]
+    unsettled = only & ~fit.valid & near & (np.maximum(*parts) > MIN_CIRCLE_CONTRAST / UNSETTLED)
+    if unsettled.any():
+        fit = with_rows(fit, unsettled, _fitted(*at, unsettled))
+    return rows_of(fit, only)
 
 
 def _beside(draft: _Draft, size_px: tuple[int, int]) -> tuple[IntArray, PlaneMap]:

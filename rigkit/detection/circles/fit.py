@@ -18,23 +18,27 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS
 from rigkit.kernels import circles as kernel
 
-RULES = kernel.CircleRules.of(
-    near_sigmas=4.0,
-    near_px=3.0,
-    min_blur=0.25,
-    max_blur=12.0,
-    max_move_px=1.0,
-    max_growth=0.2,
-    max_light=1.5,
-    converged_px=1e-3,
-    converged_sigmas=0.05,
-    near_beside=TAIL_SIGMAS,
-    iterations=30,
-    plain_iterations=5,
-    min_pixels=16,
-)
+PLAIN_ITERATIONS, ITERATIONS = 5, 30
 """Fits of edges that follow the model converge in five steps; those of others (sharpened, moved) take up to thirty, the
 later ones relaxed. They end when steps are below 0.001 px, or a twentieth of the sigma of the centre."""
+RULES, PLAIN_RULES = (
+    kernel.CircleRules.of(
+        near_sigmas=4.0,
+        near_px=3.0,
+        min_blur=0.25,
+        max_blur=12.0,
+        max_move_px=1.0,
+        max_growth=0.2,
+        max_light=1.5,
+        converged_px=1e-3,
+        converged_sigmas=0.05,
+        near_beside=TAIL_SIGMAS,
+        iterations=iterations,
+        plain_iterations=PLAIN_ITERATIONS,
+        min_pixels=16,
+    )
+    for iterations in (ITERATIONS, PLAIN_ITERATIONS)
+)
 RIM_SIGMAS = 4.0
 """Distance from its edge, in sigmas of the blur, up to which a circle without a neighbour on some side has pixels: with
 2.5 its error is a quarter above the Cramer-Rao bound, with 4 a tenth."""
@@ -124,6 +128,7 @@ def fit_circles(
     reach: FloatArray,
     beside: IntArray | None = None,
     uneven_px2: FloatArray | None = None,
+    rules: kernel.CircleRules = RULES,
 ) -> CircleFit:
     """Return the fit of circles to their pixels.
 
@@ -146,7 +151,7 @@ def fit_circles(
     capacity = min(capacity, grey.size)
     beside = np.full((len(pixels), kernel.BESIDE), -1) if beside is None else beside
     uneven = np.zeros((len(pixels), 2)) if uneven_px2 is None else np.tile(uneven_px2, (len(pixels), 1))
-    rows = kernel.fit_circles(grey, pixels, maps, curvatures, blur_px, uneven, reach, beside, capacity, RULES)
+    rows = kernel.fit_circles(grey, pixels, maps, curvatures, blur_px, uneven, reach, beside, capacity, rules)
     found = rows[:, 2:6].reshape(-1, 2, 2)
     covariance = rows[:, [6, 7, 7, 8]].reshape(-1, 2, 2) * (rows[:, 12] ** 2)[:, None, None]
     covariance = covariance + MODEL_SIGMA_PX**2 * np.eye(2)

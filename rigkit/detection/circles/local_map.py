@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import factorial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import scaled_up
 from rigkit.detection.tags.surface import SmoothMap, wide_perspective
+from rigkit.kernels import circles as kernel
 from rigkit.kernels.circles import BESIDE
 
 SQUARE_BASIS = np.eye(2)
@@ -39,7 +39,8 @@ SLIGHT = 1e-4
 """Regularisation of a homography's perspective terms, relative to the weight of its neighbours, which may be few."""
 MIN_SMOOTH, MIXED_STEP = 20, 0.3
 """Smallest number of circles for a map of the whole board, and half the step of its mixed derivative."""
-POWERS = tuple((order - k, k) for order in range(len(TYPICAL_DERIVATIVES)) for k in range(order + 1))
+MIN_BELOW = 0.1
+"""Smallest divisor of a homography, which is 0 at the horizon: near it nothing can be predicted."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -141,42 +142,28 @@ def local_maps(
     side = int(np.ceil(MAP_REACH * 1.2)) + 1
     offset = np.stack(np.meshgrid(np.arange(-side, side + 1), np.arange(-side, side + 1)), axis=-1).reshape(-1, 2)
     plane = offset @ step.T
-    near = np.hypot(*plane.T) < MAP_REACH
-    offset, plane = offset[near], plane[near]
+    distance = np.hypot(*plane.T)
+    near = distance < MAP_REACH
+    offset, plane, distance = offset[near], plane[near], distance[near]
     low = np.minimum(label.min(axis=0), places.min(axis=0)) - side
     size = np.maximum(label.max(axis=0), places.max(axis=0)) + side + 1 - low
     table = np.full((*size, 2), np.nan)
     table[tuple((label - low).T)] = pixels
-    around = table[tuple((places[:, None, :] + offset - low).transpose(2, 0, 1))]
-    known: BoolArray = np.isfinite(around[..., 0])
-    centre = (offset == 0).all(axis=1)
-    if leave_out:
-        known = known & ~centre
-    x, y = plane.T
-    terms = np.stack([x**i * y**j / (factorial(i) * factorial(j)) for i, j in POWERS], axis=1)
-    weight = np.where(known, np.exp(-0.5 * (x * x + y * y) / MAP_WIDTH**2), 0.0)
-    # Relative to the mean of the neighbours, so that the prior of derivatives does not act on image coordinates.
-    middle = np.nansum(np.where(known[..., None], around, 0.0), axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
-    values = np.where(known[..., None], around - middle[:, None], 0.0)
-    pitch = np.sqrt(np.nanmean(np.where(known[..., None], values, np.nan) ** 2) / np.mean(x * x + y * y))
-    ridge = np.array([(sigma_px / (pitch * TYPICAL_DERIVATIVES[i + j])) ** 2 for i, j in POWERS]) + MIN_RIDGE
-    homography, own = _homographies(plane, values, weight)
-    rest = np.where(known[..., None], values - homography, 0.0)
-    # Many places have the same pattern of neighbours, and with it the same matrix of the normal equations.
-    _, first, kind = np.unique(known @ (1 << np.arange(len(offset))), return_index=True, return_inverse=True)
-    inverse = np.linalg.inv(_sums(weight[first], terms, terms) + np.diag(ridge))
-    solved = inverse[kind] @ np.swapaxes((weight[..., None] * rest).swapaxes(1, 2) @ terms, 1, 2)
-    parts = solved + np.pad(own, ((0, 0), (0, len(POWERS) - own.shape[1]), (0, 0)))
-    # Weights of each circle in the first three terms, the value and its derivatives.
-    gain, *sides = np.linalg.norm(weight[first, None] * (inverse[:, :3] @ terms.T), axis=2)[kind].T
+    # One for each term x^i y^j of the polynomial, order by order.
+    typical = np.repeat(TYPICAL_DERIVATIVES, np.arange(1, len(TYPICAL_DERIVATIVES) + 1))
+    weights = np.exp(-0.5 * distance**2 / MAP_WIDTH**2)
+    rules = kernel.PredictionRules.of(
+        sigma_px=sigma_px, min_ridge=MIN_RIDGE, slight=SLIGHT, min_below=MIN_BELOW, leave_out=int(leave_out)
+    )
+    rows = kernel.local_maps(table, places - low, offset, plane, weights, distance < NEXT, typical, rules)
     return PlaneMap(
-        pixels=parts[:, 0] + middle,
-        first=np.swapaxes(parts[:, 1:3], 1, 2),
-        second=np.swapaxes(parts[:, 3:6], 1, 2),
-        support=(known & ~centre).sum(axis=1),
-        surrounded=(known | centre)[:, np.hypot(x, y) < NEXT].all(axis=1),
-        gain=gain,
-        slope_gain=np.sqrt(np.mean(np.square(sides), axis=0)),
+        pixels=rows[:, :2],
+        first=rows[:, 2:6].reshape(-1, 2, 2),
+        second=rows[:, 6:12].reshape(-1, 2, 3),
+        support=rows[:, 12].astype(np.int64),
+        surrounded=rows[:, 13] > 0.0,
+        gain=rows[:, 14],
+        slope_gain=rows[:, 15],
     )
 
 
@@ -199,43 +186,3 @@ def with_smooth_curvatures(
     second = np.stack([here.curvatures[:, 0], mixed, here.curvatures[:, 1]], axis=2)
     known = np.isfinite(second).all(axis=(1, 2), keepdims=True)
     return replace(around, second=np.where(known, second, around.second))
-
-
-def _sums(weight: FloatArray, one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the sums (M, I, J) of `weight` (M, K) times products of `one` (K, I) and `other` (K, J)."""
-    products = (one[:, :, None] * other[:, None, :]).reshape(len(one), -1)
-    return np.asarray((weight @ products).reshape(len(weight), one.shape[1], other.shape[1]))
-
-
-def _homographies(plane: FloatArray, values: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return M homographies through `values` (M, K, 2) over `plane` (K, 2), at the K places, and their derivatives
-    (M, 6, 2) of order 0 to 2 at the origin.
-
-    Polynomials of low degree cannot model a strong slant, but they can model the residuals of the homography.
-    """
-    count = len(values)
-    x, y = plane.T
-    # x' (1 + g . w) = c + A w is linear in c, A and g.
-    simple = np.stack([np.ones_like(x), x, y], axis=1)
-    u, v = weight * values[..., 0], weight * values[..., 1]
-    squares = u * values[..., 0] + v * values[..., 1]
-    normal, right = np.zeros((count, 8, 8)), np.zeros((count, 8, 1))
-    normal[:, 0:3, 0:3] = normal[:, 3:6, 3:6] = _sums(weight, simple, simple)
-    normal[:, 0:3, 6:], normal[:, 3:6, 6:] = -_sums(u, simple, plane), -_sums(v, simple, plane)
-    normal[:, 6:, 6:] = _sums(squares, plane, plane)
-    normal[:, 6:, :6] = np.swapaxes(normal[:, :6, 6:], 1, 2)
-    right[:, :, 0] = np.concatenate([u @ simple, v @ simple, -squares @ plane], axis=1)
-    scale = np.maximum((weight[..., None] * values**2).mean(axis=(1, 2)), 1e-9)
-    pull = np.zeros((count, 8))
-    pull[:, :6], pull[:, 6:] = MIN_RIDGE, (scale * SLIGHT)[:, None]
-    found = np.linalg.solve(normal + pull[:, :, None] * np.eye(8), right)[..., 0]
-    offset, matrix, bend = found[:, [0, 3]], found[:, [1, 2, 4, 5]].reshape(count, 2, 2), found[:, 6:]
-    below = 1.0 + bend @ plane.T
-    # Near a horizon nothing can be predicted.
-    below = np.where(below > 0.1, below, 0.1)
-    at = (offset[:, None] + np.einsum("mij,kj->mki", matrix, plane)) / below[..., None]
-    first = matrix - offset[:, :, None] * bend[:, None, :]
-    second = -first[:, :, :, None] * bend[:, None, None, :]
-    second = second + np.swapaxes(second, 2, 3)
-    parts = [offset, first[..., 0], first[..., 1], second[..., 0, 0], second[..., 0, 1], second[..., 1, 1]]
-    return at, np.stack(parts, axis=1)

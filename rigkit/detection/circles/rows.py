@@ -1,4 +1,4 @@
-"""Selection and concatenation of the rows of classes whose members are arrays with one row per circle."""
+"""Selection, replacement and concatenation of the rows of classes whose members are arrays with one row per circle."""
 
 from __future__ import annotations
 
@@ -17,6 +17,15 @@ Rows = TypeVar("Rows", CircleFit, PlaneMap)
 def rows_of(table: Rows, which: BoolArray) -> Rows:
     """Return the rows `which` of a class of arrays."""
     return type(table)(**{name: getattr(table, name)[which] for name in _names(table)})
+
+
+def with_rows(table: Rows, which: BoolArray, others: Rows) -> Rows:
+    """Return a class of arrays with the rows `which` from `others`, which has as many."""
+    rows = {}
+    for name in _names(table):
+        rows[name] = getattr(table, name).copy()
+        rows[name][which] = getattr(others, name)[which]
+    return type(table)(**rows)
 
 
 def joined(one: Rows, two: Rows) -> Rows:

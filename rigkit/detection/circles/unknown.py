@@ -10,9 +10,10 @@ import numpy as np
 
 from rigkit.core.boards import Board
 from rigkit.core.patterns.circles import NEIGHBOUR_DISTANCES, STAGGERS, Circles
-from rigkit.detection.circles.find import MIN_SIDE, find_grids
+from rigkit.detection.circles.find import MIN_SIDE
 from rigkit.detection.circles.grid import CircleGrid
 from rigkit.detection.circles.place import may_be_part, placed_on
+from rigkit.detection.circles.search import find_grids
 from rigkit.detection.saddles.response import GreyImage
 
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.circles.blobs import COARSE_PIXELS
-from rigkit.detection.circles.find import find_grids
 from rigkit.detection.circles.place import boards_meant, lone_part
+from rigkit.detection.circles.search import CircleSearch
 from rigkit.detection.circles.through_lens import seen_through
 from rigkit.detection.targets.base import Finder, Search
 
@@ -20,19 +20,22 @@ class CirclesFinder(Finder):
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
         """Return the detections. In a large image, a search for large circles that finds all boards whole is enough.
         A quick search may miss faint circles: if it finds no board, a full one follows."""
+        look = CircleSearch(search.grey)
         if search.grey.size > COARSE_PIXELS:
-            found = self._seen(search, boards, quick=search.quick, coarse=True)
+            found = self._seen(search, look, boards, quick=search.quick, coarse=True)
             if {item.board_id for item in found if item.complete} >= {board.board_id for board in boards}:
                 return found
-        found = self._seen(search, boards, quick=True) if search.quick else []
-        return found or self._seen(search, boards, quick=False)
+        found = self._seen(search, look, boards, quick=True) if search.quick else []
+        return found or self._seen(search, look, boards, quick=False)
 
     @staticmethod
-    def _seen(search: Search, boards: Sequence[Board], *, quick: bool, coarse: bool = False) -> list[BoardDetection]:
+    def _seen(
+        search: Search, look: CircleSearch, boards: Sequence[Board], *, quick: bool, coarse: bool = False
+    ) -> list[BoardDetection]:
         fewest = min([search.min_corners, *(board.corner_count for board in boards)])
         out: list[BoardDetection] = []
         names: list[str | None] = []
-        for grid in find_grids(search.grey, fewest, quick=quick, coarse=coarse):
+        for grid in look.grids(fewest, quick=quick, coarse=coarse):
             fits = boards_meant(grid, boards)
             if fits:
                 board, placed = fits[0]

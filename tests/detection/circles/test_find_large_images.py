@@ -24,11 +24,11 @@ def looks_coarse(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     """Return a list to which each search for blobs appends whether it is a coarse one."""
     said: list[bool] = []
 
-    def search(grey: GreyImage, *, coarse: bool) -> Blobs:
+    def search(grey: GreyImage, *, coarse: bool, known: Blobs | None) -> Blobs:
         said.append(coarse)
-        return find_blobs(grey, coarse=coarse)
+        return find_blobs(grey, coarse=coarse, known=known)
 
-    monkeypatch.setattr("rigkit.detection.circles.find.find_blobs", search)
+    monkeypatch.setattr("rigkit.detection.circles.search.find_blobs", search)
     return said
 
 

@@ -17,7 +17,7 @@ from helpers.detection_scenes import errors_by_place
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.circles import Circles
-from rigkit.detection.circles.find import find_grids
+from rigkit.detection.circles.search import find_grids
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
 from rigkit.geometry.rigid3 import Rigid3
