@@ -96,18 +96,32 @@ function viewer(canvas, scene) {
           line(tip, corner, wire);
           line(corner, base[(i + 1) % base.length], wire);
         });
-        const p = project(tip);
-        pen.fillStyle = wire;
-        pen.font = `${12 * ratio}px sans-serif`;
-        // Beside the tip: on its left where the right has no room.
-        const gap = 6 * ratio, wide = pen.measureText(camera.name).width;
-        const x = p[0] + gap + wide > canvas.width ? p[0] - gap - wide : p[0] + gap;
-        pen.fillText(camera.name, x, Math.max(p[1], 12 * ratio));
       }
+      names(pen, ratio, wire);
     }
     scaleBar(pen, ratio, wire);
     legend(pen, ratio, wire);
     canvas.dataset.view = `${view.yaw.toFixed(3)} ${view.pitch.toFixed(3)} ${view.zoom.toFixed(3)}`;
+  }
+
+  // Each camera's name behind its tip, where it covers no line of it, and below names that are there already.
+  function names(pen, ratio, wire) {
+    const high = 12 * ratio, taken = [];
+    pen.fillStyle = wire;
+    pen.font = `${high}px sans-serif`;
+    for (const camera of scene.cameras) {
+      const [tip, ...base] = camera.corners.map(project);
+      const behind = [0, 1].map((k) => tip[k] - base.reduce((s, q) => s + q[k], 0) / base.length);
+      const scale = 8 * ratio / (Math.hypot(...behind) || 1), wide = pen.measureText(camera.name).width;
+      const left = tip[0] + scale * behind[0] - (behind[0] < 0 ? wide : 0);
+      const x = Math.max(0, Math.min(left, canvas.width - wide));
+      let y = Math.max(high, tip[1] + scale * behind[1] + (behind[1] > 0 ? 0.8 : 0.3) * high);
+      while (taken.some((other) => Math.abs(other.y - y) < high && x < other.x + other.wide && other.x < x + wide)) {
+        y += 0.25 * high;
+      }
+      taken.push({x, y, wide});
+      pen.fillText(camera.name, x, y);
+    }
   }
 
   // A round length that is some SCALE_PX long: true at the middle of the scene.

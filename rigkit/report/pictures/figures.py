@@ -18,6 +18,7 @@ from rigkit.core.arrays import FloatArray, Pixels, in_8_bits
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.pictures.scene_view import PYRAMID
+from rigkit.report.svg import round_down
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,6 +29,8 @@ BOARD_COLOURS = ("#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#d6b300", "#17becf
 MIN_SHOWN_PX = 1e-4
 """Smaller differences of cameras are not drawn."""
 DPI = 110
+MAP_PROPORTION = 0.62 / 0.77
+"""Beside its scale a map has this part of the figure's width, and of its height: no bands remain."""
 NORMAL_LENGTH_SQUARES = 0.8
 BARE_NORMAL = 0.08
 """Length of a drawn normal without boards, relative to the median distance of the points."""
@@ -203,22 +206,24 @@ def pair_pictures(
 
 def difference_png(difference: CameraDifference) -> bytes:
     """Draw the difference of two cameras over the image, with length as colour and arrows."""
-    figure = new_figure(8, 5.6, dpi=DPI)
-    axis: Any = figure.subplots()
     u, v = difference.pixels[..., 0], difference.pixels[..., 1]
+    figure = new_figure(8, float(np.clip(8 * MAP_PROPORTION * np.ptp(v) / np.ptp(u), 2.5, 12.0)), dpi=DPI)
+    axis: Any = figure.subplots()
     # Rounding errors must not look like a pattern.
     top = max(float(difference.max_px), MIN_SHOWN_PX)
     mesh = axis.pcolormesh(u, v, difference.map_px, shading="nearest", cmap="viridis", vmin=0.0, vmax=top)
     some = np.s_[::3, ::3]
     arrows = difference.difference_px[some]
+    words = ""
     if difference.max_px > MIN_SHOWN_PX:
-        axis.quiver(u[some], v[some], arrows[..., 0], arrows[..., 1], angles="xy", color="white", width=0.002)
+        times = round_down(6.0 * float(u[0, 1] - u[0, 0]) / difference.max_px)
+        drawn: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / times}
+        axis.quiver(u[some], v[some], *np.moveaxis(arrows, -1, 0), color="white", width=0.002, **drawn)
+        words = f" (arrows magnified {times:g} times)"
     axis.set_aspect("equal")
     axis.invert_yaxis()
-    figure.colorbar(mesh, ax=axis, label="px", shrink=0.85)
-    axis.set_title(
-        f"difference {difference.rms_px:.4f} px rms, {difference.max_px:.4f} px at most (arrows magnified)", fontsize=9
-    )
+    figure.colorbar(mesh, ax=axis, label="px")
+    axis.set_title(f"difference {difference.rms_px:.4f} px rms, {difference.max_px:.4f} px at most{words}", fontsize=9)
     return as_png(figure)
 
 

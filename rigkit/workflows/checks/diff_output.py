@@ -66,8 +66,11 @@ def write_diff_page(path: Path, pair: Pair, files: tuple[Path, Path], *, force: 
         (f"{name} difference over the image".strip(), partial(difference_png, own.difference))
         for name, own in _cameras_of(pair).items()
     ]
-    provenance = software_facts() | {f"{which} {p.name}": digest_line(p) for which, p in zip("AB", files, strict=True)}
-    title = f"rigkit diff: {files[0].name} and {files[1].name}"
+    alike = files[0].name == files[1].name
+    names = [str(Path(p.resolve().parent.name, p.name)) if alike else p.name for p in files]
+    digests = zip("AB", names, map(digest_line, files), strict=True)
+    provenance = software_facts() | {f"{which} {name}": digest for which, name, digest in digests}
+    title = f"rigkit diff: {names[0]} and {names[1]}"
     write_atomic(path, build_facts_page(title, facts_of(pair), provenance, pictures=pictures), force=force)
 
 

@@ -12,10 +12,20 @@ from helpers.calibration_scenes import lens, random_views
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.cameras.compare import compare_cameras
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.report.pages.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
 from rigkit.report.pages.calibration_drawings import coverage_svg, pattern_svg, residuals_svg
-from rigkit.report.pictures.figures import as_pdf, as_png, cloud_figure, corners_figure, in_dark_colours, new_figure
+from rigkit.report.pictures.figures import (
+    as_pdf,
+    as_png,
+    cloud_figure,
+    corners_figure,
+    difference_png,
+    in_dark_colours,
+    new_figure,
+)
 from rigkit.report.render import asset, data_uri
 
 
@@ -44,6 +54,16 @@ def test_pictures_of_dark_pages_are_dark_and_the_next_one_is_light_again() -> No
     )
     assert ground == 255 and dark_ground < 40
     assert again == light
+
+
+@pytest.mark.parametrize("size_px", [(640, 480), (1280, 400), (480, 640)])
+def test_the_map_of_a_difference_fills_its_picture(size_px: tuple[int, int]) -> None:
+    one, two = (Pinhole(size_px, np.array([f, f, 300.0, 200.0])) for f in (500.0, 501.0))
+    picture = cv2.imdecode(np.frombuffer(difference_png(compare_cameras(one, two)), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    rows, columns = (np.flatnonzero((np.asarray(picture) < 250).any(axis=axis)) for axis in (1, 0))
+    for inked, length in ((rows, picture.shape[0]), (columns, picture.shape[1])):
+        assert inked[0] < 0.15 * length and inked[-1] > 0.85 * length
 
 
 @pytest.mark.parametrize("baseline_mm", [(300.0, 0.0, 0.0), (0.0, 0.0, 900.0), (0.0, 1500.0, 0.0)])

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from helpers.calibration_scenes import lens
 
 from rigkit.calibration.compare import CalibrationComparison
 from rigkit.cameras.compare import compare_cameras
 from rigkit.workflows.checks.diff import CameraPair
-from rigkit.workflows.checks.diff_output import words_of
+from rigkit.workflows.checks.diff_output import words_of, write_diff_page
 
 
 @pytest.mark.parametrize(("typical_times", "surer"), [((0.5, 5.0), True), ((0.1, 0.5), False)])
@@ -21,3 +23,15 @@ def test_another_camera_that_differs_by_no_more_than_usual(typical_times: tuple[
     words = words_of(CameraPair(difference, judged))[-1]
     assert "another camera or a moved lens" in words
     assert ("but where both are more certain (p = 0.001)" in words) == surer
+
+
+def test_a_page_of_files_with_one_name_names_their_folders(tmp_path: Path) -> None:
+    camera = lens("reg")
+    pair = CameraPair(compare_cameras(camera, camera.with_parameters(camera.parameters * [1.002, *[1.0] * 8])), None)
+    files = tmp_path / "before" / "calibration.json", tmp_path / "after" / "calibration.json"
+    for path in files:
+        path.parent.mkdir()
+        path.touch()
+    write_diff_page(tmp_path / "page.html", pair, files, force=False)
+    page = (tmp_path / "page.html").read_text()
+    assert "rigkit diff: before/calibration.json and after/calibration.json" in page and "B after/" in page
