@@ -17,6 +17,7 @@ import yaml
 from helpers.data import REPOSITORY
 from helpers.stereo_pictures import CAMERA as BROWN
 
+from rigkit.calibration.pupil import SolvedPupil
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
@@ -62,6 +63,17 @@ def test_losses_of_a_format_are_reported(tmp_path: Path, caplog: pytest.LogCaptu
         files = foreign_files(load_calibration(CALIBRATION), tmp_path / "fish.json", ["kalibr"])
     assert [path.name for path in files] == ["fish-kalibr.yaml"]
     assert "fish-kalibr.yaml: " in caplog.text
+
+
+def test_a_moving_pupil_is_left_out_of_all_files_in_one_message(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    calibration = load_calibration(CALIBRATION)
+    rows = len(calibration.frame_covariance)
+    pupil = SolvedPupil(terms=np.array([1.0, 0.0]), covariance=np.eye(2), with_frame=np.zeros((rows, 2)))
+    foreign_files(replace(calibration, pupil=pupil), tmp_path / "fish.json", ["kalibr", "ros"])
+    (words,) = (record.getMessage() for record in caplog.records if "left out here" in record.getMessage())
+    assert "fish-kalibr.yaml, " in words and "fish-ros.yaml'" in words
 
 
 def test_a_lossless_format_reports_no_loss(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -73,13 +73,15 @@ def _views_scene(
     cameras: Mapping[str, Rigid3], views: Sequence[tuple[ViewResult, Rigid3]], boards: Sequence[BoardShape]
 ) -> dict[str, Any]:
     shapes = {board.board_id: board.points_mm for board in boards}
-    names = list(shapes)
+    # Parts of a board, each a board of its own in one image, are drawn as that board.
+    wholes = {name: min((w for w in shapes if w == name or name.startswith(f"{w} part ")), key=len) for name in shapes}
+    names = list(dict.fromkeys(wholes.values()))
     outlines = {name: _outline(points) for name, points in shapes.items()}
     planes = []
     for view, world_from_cam in views[:: -(-len(views) // MAX_BOARDS) or 1]:
         corners = (world_from_cam @ view.cam_from_board).apply(outlines[view.board_id])
         name = f"{view.image}, {view.board_id}: {view.rms_px:.3f} px"
-        planes.append({"board": names.index(view.board_id), "corners": _rounded(corners, 2), "name": name})
+        planes.append({"board": names.index(wholes[view.board_id]), "corners": _rounded(corners, 2), "name": name})
     far = [np.linalg.norm(view.cam_from_board.apply(outlines[view.board_id]), axis=1).mean() for view, _ in views]
     return _scene(cameras, far, names, planes)
 

@@ -167,9 +167,11 @@ def foreign_files(calibration: Calibration, result: Path, kinds: Sequence[str]) 
     Raises InputError for a format that cannot represent the camera.
     """
     files = {}
+    paths = foreign_paths(result, kinds)
     outline = outline_of_corners(calibration) if kinds else None
-    for kind, path in zip(kinds, foreign_paths(result, kinds), strict=True):
-        warn_of_pupil(path, calibration)
+    if paths:
+        warn_of_pupil(", ".join(map(str, paths)), calibration)
+    for kind, path in zip(kinds, paths, strict=True):
         done = _written_camera(calibration.camera, kind, outline)
         files[path] = done.text
         if done.note:
