@@ -125,8 +125,8 @@ def _chosen_moments(
     # Ctrl-C ends the capture of a live camera.
     with suppress(*((KeyboardInterrupt,) if live else ())):
         for number, pictures in _moments(videos, moments):
+            progress(SEARCHING, looked_at, max(total, looked_at + 1))
             looked_at += 1
-            progress(SEARCHING, looked_at, max(total, looked_at))
             if (frame := _described(number, pictures, boards)) is not None:
                 choice.offer(frame)
                 if live:

@@ -28,7 +28,7 @@ from rigkit.workflows.detect import detect_in_images
 from rigkit.workflows.inputs import frames
 from rigkit.workflows.inputs.folder_session import boards_seen
 from rigkit.workflows.inputs.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
-from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos
+from rigkit.workflows.inputs.frames import SEARCHING, frames_of_videos, moments_of_videos
 from rigkit.workflows.inputs.identify_board import identify_board
 from rigkit.workflows.options.cameras import CalibrateOptions, FolderOptions
 
@@ -134,8 +134,12 @@ def test_a_folder_of_videos_is_a_camera_each(tmp_path: Path) -> None:
     for name in ("left", "right"):
         video(tmp_path / f"{name}.avi", [np.full((240, 320), 90, np.uint8)] * 2)
     (tmp_path / "notes.txt").write_text("of two cameras")
+    said: list[tuple[str, int, int]] = []
     with pytest.raises(InputError, match=r"left\.avi', '.*right\.avi': no board in 2 frames"):
-        calibrate_folders([tmp_path], FolderOptions(boards=("7x5x20",)), CalibrateOptions())
+        calibrate_folders(
+            [tmp_path], FolderOptions(boards=("7x5x20",)), CalibrateOptions(), progress=lambda *step: said.append(step)
+        )
+    assert [step for step in said if step[0] == SEARCHING] == [(SEARCHING, k, 2) for k in range(3)]
 
 
 def test_results_in_one_folder_have_frames_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
