@@ -13,6 +13,7 @@ from pathlib import Path
 
 from rigkit.cli.aim_arguments import add_board_argument, add_reach_arguments, length_of, reach_of
 from rigkit.cli.console import add_options, options_of, progress_on_stderr
+from rigkit.coach.guide import GuideOptions
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.workflows.options.coach import CoachOptions
 
@@ -25,28 +26,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "folder", type=Path, metavar="FOLDER", help="folder of the session: a new one, or one to continue"
     )
     add_board_argument(parser, "such as 9x6x25 (repeatable)", required=True)
-    parser.add_argument(
-        "--lens", type=float, default=70.0, metavar="DEG", help="approximate horizontal field of view (default: 70)"
-    )
-    parser.add_argument(
-        "--goal", type=float, default=0.1, metavar="PX", help="projection uncertainty to reach, rms (default: 0.1)"
-    )
+    add_options(parser, GuideOptions, hfov_deg="--lens DEG", goal_px="--goal PX")
     add_reach_arguments(parser)
     parser.add_argument("--length", type=float, metavar="MM", help="also reach --goal-mm for a length of MM")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance")
-    parser.add_argument("--goal-mm", type=float, metavar="MM", help="standard deviation to reach for that length")
+    add_options(parser, GuideOptions, goal_mm="MM")
     source = parser.add_mutually_exclusive_group()
     add_options(source, CoachOptions, cameras="N", watch="FOLDER", video="FILE", device="N")
     add_options(parser, CoachOptions, lan="", port="")
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.coach.guide import GuideOptions
     from rigkit.io.boards.board_words import board_of_words
     from rigkit.workflows.capture.coach import run_coach
 
-    if not 0.0 < args.goal < float("inf"):
-        raise InputError(f"--goal {args.goal}: it must be positive")
+    if not 0.0 < args.goal_px < float("inf"):
+        raise InputError(f"--goal {args.goal_px}: it must be positive")
     given = [args.length, args.distance, args.goal_mm]
     if any(value is not None for value in given) and None in given:
         raise InputError("coach: --length, --distance and --goal-mm belong together")
@@ -54,13 +49,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--cameras {args.cameras}: 1 to {MAX_CAMERAS}")
     if args.goal_mm is not None and not 0.0 < args.goal_mm < float("inf"):
         raise InputError(f"--goal-mm {args.goal_mm}: it must be positive")
-    guide = GuideOptions(
-        boards=tuple(board_of_words(words) for words in args.board),
-        hfov_deg=args.lens,
-        goal_px=args.goal,
-        goal_mm=args.goal_mm,
-        reach=reach_of(args),
-    )
+    boards = tuple(board_of_words(words) for words in args.board)
+    guide = options_of(GuideOptions, args, boards=boards, measured=None, reach=reach_of(args))
     known = {"boards": tuple(args.board), "guide": guide, "length": length_of(args, "coach")}
     options = options_of(CoachOptions, args, **known)
     run_coach(options, lambda words: print(words, flush=True), progress_on_stderr())

@@ -9,9 +9,9 @@ import re
 import sys
 import time
 from contextlib import suppress
-from dataclasses import MISSING, Field, fields
+from dataclasses import MISSING, fields
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from rigkit.core.errors import InputError, printable
 from rigkit.core.progress import Progress
@@ -82,13 +82,14 @@ def add_options(parser: argparse._ActionsContainer, kind: type, /, **spelled: st
     flags (--name if there is no long one) and the placeholders of values: output="-o FILE", before="IMAGE...". With the
     dots a list takes several values at once, without them the argument is repeated.
     """
-    own, words = {field.name: field for field in fields(kind)}, attributes_of(kind)
+    defaults = {field.name: field.default for field in fields(kind)}
+    types, words = get_type_hints(kind), attributes_of(kind)
     for name, spelling in spelled.items():
         flags = [word for word in spelling.split() if word.startswith("-")]
         places = [word for word in spelling.split() if word not in flags]
         if not any(flag.startswith("--") for flag in flags):
             flags.append(f"--{name.replace('_', '-')}")
-        given = _argument_of(own[name], places)
+        given = _argument_of(types[name], defaults[name], places)
         # python -OO removes docstrings.
         text = words.get(name, "").rstrip(".")
         if given.get("action") == "append":
@@ -98,14 +99,14 @@ def add_options(parser: argparse._ActionsContainer, kind: type, /, **spelled: st
         parser.add_argument(*flags, dest=name, help=text.replace("%", "%%"), **given)
 
 
-def _argument_of(field: Field[Any], places: list[str]) -> dict[str, Any]:
-    """Return type, number of values, choices and default of the argument for a field, with placeholders of values."""
-    own = field.type
+def _argument_of(own: Any, default: Any, places: list[str]) -> dict[str, Any]:
+    """Return type, number of values, choices and default of the argument for a field of type `own`, with placeholders
+    of values."""
     if get_origin(own) in (Union, UnionType):
         own = next(one for one in get_args(own) if one is not NoneType)
     if own is bool:
-        return {"action": argparse.BooleanOptionalAction if field.default is None else "store_true"}
-    out: dict[str, Any] = {"default": field.default} if field.default is not MISSING else {"required": True}
+        return {"action": argparse.BooleanOptionalAction if default is None else "store_true"}
+    out: dict[str, Any] = {"default": default} if default is not MISSING else {"required": True}
     if places:
         out["metavar"] = tuple(places) if len(places) > 1 else places[0].removesuffix("...")
     if get_origin(own) is tuple:

@@ -56,8 +56,8 @@ class GuideOptions:
     ----------
     boards : those that may be shown.
     hfov_deg : approximate horizontal field of view, used until the first calibration.
-    goal_px : rms error of the projection at which there are enough; for a rig also with the mounts included.
-    goal_mm : error of `measured` that must be reached as well; None: only the projection counts.
+    goal_px : projection uncertainty to reach, rms; for a rig also with the mounts included.
+    goal_mm : standard deviation to reach for the measured length as well.
     measured : returns the goals, in mm, of what will be measured with cameras at their poses in the rig; raises
         DegenerateError where that is outside all fields of view.
     reach : where boards can be held.
