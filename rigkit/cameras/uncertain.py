@@ -18,10 +18,12 @@ from rigkit.geometry.rotation import exp_so3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class UncertainCamera:
-    """A camera and the covariance (P, P) of its parameters."""
+    """A camera and the covariance (P, P) of its parameters: of their errors about zero. Its part `expected` (P, P) is
+    that of errors whose mean is not zero; None: all means are zero."""
 
     camera: Camera
     covariance: FloatArray
+    expected: FloatArray | None = None
 
     def moved(self) -> list[Camera]:
         """Return the camera changed by one standard deviation along each principal axis of the covariance. The axes are

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
+from rigkit.calibration.certainty.departures import with_own_noise
 from rigkit.calibration.certainty.displaced import lens_modes, uncertain_camera
 from rigkit.calibration.choosing.candidate_fits import CandidateFits, fit_candidates
 from rigkit.calibration.choosing.models_tried import Request
@@ -65,7 +66,7 @@ def full_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> Fu
         candidate_fits = fit_candidates("", named, request)
         (found,) = calibrate_together([("", named, request)], known=[candidate_fits])
         modes = lens_modes(found)
-        known = Knowledge.of(found).with_model_inadequacy(modes)
+        known = Knowledge.of(with_own_noise(found)).with_model_inadequacy(modes)
         return FullCalibration(found, known, uncertain_camera(found, modes=modes), candidate_fits)
     except (InputError, DegenerateError):
         return None

@@ -33,11 +33,12 @@ EXPORT void displace_by(
 EXPORT int64_t lens_memory(int64_t parameters);
 EXPORT void lens_products(
     const lens_corners_t *corners, SCRATCH(double, memory, lens_memory(corners.parameters)),
-    RESULT(double, with_pose, corners.views, POSE + corners.parameters + DISPLACEMENTS + 1, POSE),
-    RESULT(double, products, corners.parameters + DISPLACEMENTS + 1, corners.parameters + DISPLACEMENTS + 1));
+    RESULT(double, products, corners.views, POSE + corners.parameters + DISPLACEMENTS + 1,
+        POSE + corners.parameters + DISPLACEMENTS + 1));
 EXPORT void average_amounts(
     ARRAY(const double, information, DISPLACEMENTS, DISPLACEMENTS), ARRAY(const double, score, DISPLACEMENTS),
-    ARRAY(const double, sizes, count), int64_t count, RESULT(double, out, DISPLACEMENTS, DISPLACEMENTS));
+    ARRAY(const double, sizes, count), int64_t count, RESULT(double, out, DISPLACEMENTS, DISPLACEMENTS),
+    RESULT(double, average, DISPLACEMENTS));
 
 /* board_pose.c */
 

@@ -83,13 +83,11 @@ int64_t lens_memory(int64_t parameters)
     return rows_memory(POSE + parameters + DISPLACEMENTS + 1);
 }
 
-EXPORT FOR_EACH_PROCESSOR void lens_products(const lens_corners_t *c, double *memory, double *with_pose, double *products)
+EXPORT FOR_EACH_PROCESSOR void lens_products(const lens_corners_t *c, double *memory, double *products)
 {
     const int64_t all = POSE + c->parameters + DISPLACEMENTS + 1, across = padded(all);
-    const int64_t kept = all - POSE;
     const double scale = 2.0 / sqrt((double)(c->width * c->width + c->height * c->height));
     double *sums = memory, *rows = memory + across * across;
-    memset(products, 0, (size_t)(kept * kept) * sizeof(double));
     memset(rows, 0, (size_t)(2 * CORNERS * across) * sizeof(double));
     for (int64_t view = 0, n = 0; view < c->views; view++) {
         const int64_t stop = n + c->counts[view];
@@ -101,25 +99,20 @@ EXPORT FOR_EACH_PROCESSOR void lens_products(const lens_corners_t *c, double *me
                     write_rows(c, scale, n, across, rows + 2 * across * used++);
             add_products(rows, 2 * used, across, sums);
         }
-        double *own = with_pose + all * POSE * view;
-        for (int64_t k = 0; k < all; k++)
-            for (int64_t a = 0; a < POSE; a++)
-                own[k * POSE + a] = k < a ? sums[k * across + a] : sums[a * across + k];
-        for (int64_t i = 0; i < kept; i++)
-            for (int64_t j = i; j < kept; j++)
-                products[i * kept + j] += sums[(POSE + i) * across + POSE + j];
+        double *own = products + all * all * view;
+        for (int64_t i = 0; i < all; i++)
+            for (int64_t j = i; j < all; j++)
+                own[i * all + j] = own[j * all + i] = sums[i * across + j];
     }
-    for (int64_t i = 0; i < kept; i++)
-        for (int64_t j = 0; j < i; j++)
-            products[i * kept + j] = products[j * kept + i];
 }
 
 EXPORT FOR_EACH_PROCESSOR void average_amounts(
-    const double *information, const double *score, const double *sizes, int64_t count, double *out)
+    const double *information, const double *score, const double *sizes, int64_t count, double *out, double *average)
 {
     enum { N = DISPLACEMENTS };
     double best = -INFINITY, total = 0.0;
     memset(out, 0, N * N * sizeof(double));
+    memset(average, 0, N * sizeof(double));
     for (int64_t pair = 0; pair < count * count; pair++) {
         const double along = sizes[pair % count], other = sizes[pair / count];
         /* L L' = 1 + D F D with the information F and the sizes D; E = L^-1 D. */
@@ -150,14 +143,18 @@ EXPORT FOR_EACH_PROCESSOR void average_amounts(
             total *= less;
             for (int64_t k = 0; k < N * N; k++)
                 out[k] *= less;
+            for (int64_t k = 0; k < N; k++)
+                average[k] *= less;
             best = evidence;
         }
         const double weight = exp(evidence - best);
         total += weight;
         /* The covariance is E' E. */
-        for (int64_t i = 0; i < N; i++)
+        for (int64_t i = 0; i < N; i++) {
+            average[i] += weight * mean[i];
             for (int64_t j = 0; j < N; j++)
                 out[N * i + j] += weight * mean[i] * mean[j];
+        }
         for (int64_t k = 0; k < N; k++)
             for (int64_t i = 0; i <= k; i++)
                 for (int64_t j = 0; j <= k; j++)
@@ -165,4 +162,6 @@ EXPORT FOR_EACH_PROCESSOR void average_amounts(
     }
     for (int64_t k = 0; k < N * N; k++)
         out[k] /= total;
+    for (int64_t k = 0; k < N; k++)
+        average[k] /= total;
 }

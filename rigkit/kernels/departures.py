@@ -54,25 +54,24 @@ class LensCorners(Struct):
             height=size_px[1],
         )
 
-    def products(self) -> tuple[FloatArray, FloatArray]:
-        """Return the products of the columns of the usable corners' rows: per view those of all K + 6 with its pose
-        (V, K + 6, 6), and summed over all views those of the other K (K, K).
+    def products(self) -> FloatArray:
+        """Return the products (V, K + 6, K + 6) of the columns of the usable corners' rows, view by view.
 
         The columns are, in this order: the pose (w, t), the P parameters in units of `sigmas`, the displacements, the
         residual.
         """
-        products: tuple[FloatArray, FloatArray] = kernels().lens_products(self)
-        return products
+        return np.asarray(kernels().lens_products(self))
 
 
-def averaged_amounts(information: FloatArray, score: FloatArray, sizes: FloatArray) -> FloatArray:
-    """Return the posterior mean of a a^T (J, J) for the amounts a of displacements, px, from information (J, J) and
-    score (J,) of images.
+def averaged_amounts(information: FloatArray, score: FloatArray, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the posterior means of a a^T (J, J) and of a (J,) for the amounts a of displacements, px, from information
+    (J, J) and score (J,) of images.
 
     The prior of a is normal with mean zero, with one of the `sizes` (S,) as standard deviation of radial displacements
     and one of the others; all pairs have equal prior probability and are averaged by their posterior probability.
     """
-    return np.asarray(kernels().average_amounts(information, score, sizes))
+    second, mean = kernels().average_amounts(information, score, sizes)
+    return np.asarray(second), np.asarray(mean)
 
 
 def displacements(pixels: Pixels, size_px: tuple[int, int]) -> FloatArray:

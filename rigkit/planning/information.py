@@ -161,7 +161,7 @@ class Knowledge:
         """Return the same with the amounts of the model's inadequacy as further parameters, which new views also
         estimate."""
         p, count = self.camera.parameters.size, modes.modes.shape[1]
-        (camera,), _ = with_modes((self.camera,), np.zeros((p, p)), (modes,))
+        (camera,), *_ = with_modes((self.camera,), np.zeros((p, p)), (modes,))
         # The information is that of n = x - moves a, with x the parameters and a amounts of variance one.
         back = np.zeros((len(self.information), len(self.information) + count))
         own, amounts = np.r_[0:p, p + count : back.shape[1]], np.arange(p, p + count)

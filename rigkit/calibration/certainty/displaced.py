@@ -23,6 +23,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigkit.calibration.certainty.departures import Departures
 from rigkit.calibration.certainty.uncertainty import Along, FarProjection
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera, image_center
@@ -163,11 +164,13 @@ class LensModes:
     ----------
     modes : (J, M) px, the amounts of the displacements.
     moves : (G, M) error of all unknowns with each mode.
+    means : (M,) expected amount of each mode, in standard deviations about zero.
     turns : (3, M) rad, rotation of the rays of a single camera with each mode; None: no rotation.
     """
 
     modes: FloatArray
     moves: FloatArray
+    means: FloatArray
     turns: FloatArray | None = None
 
 
@@ -182,31 +185,35 @@ def uncertain_camera(
     errors of lens and pupil are correlated. `modes` are those of `lens_modes`, where they are known already.
     """
     pupil = calibration.pupil if near else None
-    known = calibration.covariance if pupil is None else calibration.near_covariance[:-6, :-6]
-    known = known * (calibration.widening**2 if quoted else 1.0)
+    departures = Departures.of(calibration)
+    known = departures.near_covariance * (departures.noise.widening**2 if quoted else 1.0)
+    p = calibration.camera.parameters.size if pupil is None else -6
     modes = lens_modes(calibration, near=near) if modes is None else modes
-    (camera,), covariance = with_modes((calibration.camera,), known, (modes,))
-    return UncertainCamera(camera if pupil is None else NearCamera.of(camera, pupil.terms), covariance)
+    (camera,), covariance, expected = with_modes((calibration.camera,), known[:p, :p], (modes,))
+    return UncertainCamera(camera if pupil is None else NearCamera.of(camera, pupil.terms), covariance, expected)
 
 
 def lens_modes(calibration: Calibration, *, near: bool = False) -> LensModes:
     """Return the model inadequacy of a calibrated lens, with the errors of its parameters, and with `near` those of its
     pupil."""
     far = FarProjection.of(calibration)
-    modes, changes = significant_modes(far), far.departures.parameter_changes
+    changes = far.departures.parameter_changes
+    modes, means = significant_modes(far)
     if near:
         changes = np.concatenate([changes, far.departures.pupil_changes])
-    return LensModes(modes, -changes @ modes, -far.departure_compensation @ modes)
+    return LensModes(modes, -changes @ modes, means, -far.departure_compensation @ modes)
 
 
 def with_modes(
     cameras: Sequence[Camera], covariance: FloatArray, modes: Sequence[LensModes]
-) -> tuple[tuple[Camera, ...], FloatArray]:
-    """Return cameras with the amounts of their modes as further parameters, and the covariance of all unknowns: the
-    parameters of each camera, then the rest, in the order of `covariance` (G, G), which is that without modes. Without
-    any `modes` both are returned unchanged."""
+) -> tuple[tuple[Camera, ...], FloatArray, FloatArray]:
+    """Return cameras with the amounts of their modes as further parameters, the covariance of the errors of all
+    unknowns about zero, and the part (T, T) of it that is the square of the error expected: the parameters of each
+    camera, then the rest, in the order of `covariance` (G, G), which is that without modes. Without any `modes` cameras
+    and covariance are returned unchanged.
+    """
     if not modes:
-        return tuple(cameras), covariance
+        return tuple(cameras), covariance, np.zeros_like(covariance)
     out: list[Camera] = []
     known, amounts, end = [], [], 0
     for camera, own in zip(cameras, modes, strict=True):
@@ -218,13 +225,25 @@ def with_modes(
     known.append(np.arange(end, end + len(covariance) - sum(len(own) for own in known)))
     at = np.concatenate(known)
     size = len(at) + sum(len(own) for own in amounts)
-    whole = np.zeros((size, size))
+    whole, expected = np.zeros((size, size)), np.zeros(size)
     whole[np.ix_(at, at)] = covariance
     for where, own in zip(amounts, modes, strict=True):
         move = np.zeros((size, len(where)))
         move[at], move[where] = own.moves, np.eye(len(where))
-        whole += move @ move.T
-    return tuple(out), whole
+        mean = move @ own.means
+        # Modes of two lenses are independent about their means.
+        whole += move @ move.T + np.outer(expected, mean) + np.outer(mean, expected)
+        expected += mean
+    return tuple(out), whole, np.outer(expected, expected)
+
+
+def variance_of_modes(rows: FloatArray, modes: Sequence[LensModes]) -> FloatArray:
+    """Return what the modes of lenses add to the variance (K,) about zero of combinations `rows` (K, G) of the
+    unknowns."""
+    each = [rows @ own.moves for own in modes]
+    means = np.array([moved @ own.means for moved, own in zip(each, modes, strict=True)]).reshape(-1, len(rows))
+    square = np.sum([(moved**2).sum(axis=1) for moved in each], axis=0) - (means**2).sum(axis=0)
+    return np.asarray(square + means.sum(axis=0) ** 2)
 
 
 def with_amounts(camera: Camera, modes: FloatArray, turns: FloatArray | None = None) -> Camera:
@@ -233,9 +252,10 @@ def with_amounts(camera: Camera, modes: FloatArray, turns: FloatArray | None = N
     return DisplacedCamera(camera.size_px, parameters, camera, modes, turns) if modes.shape[1] else camera
 
 
-def significant_modes(far: FarProjection) -> FloatArray:
-    """Return independent modes (J, M) px of displacements, one standard deviation each: those of the model inadequacy,
-    rivals included, that are significant against the uncertainty of the parameters."""
+def significant_modes(far: FarProjection) -> tuple[FloatArray, FloatArray]:
+    """Return independent modes (J, M) px of displacements, one standard deviation about zero each, and their means
+    (M,): those of the model inadequacy, rivals included, that are significant against the uncertainty of the
+    parameters."""
     pixels = grid_pixels(far.camera.size_px, MODES_GRID).reshape(-1, 2)
     rays, valid = far.camera.unproject(pixels)
     rays = rays[valid]
@@ -243,7 +263,7 @@ def significant_modes(far: FarProjection) -> FloatArray:
     whole = np.sqrt(np.trace(far.covariance(rays), axis1=1, axis2=2))
     known = np.isfinite(whole) & (whole > 0.0)
     if not known.any():
-        return np.zeros((DISPLACEMENTS, 0))
+        return np.zeros((DISPLACEMENTS, 0)), np.zeros(0)
     # In units of the total sigma, so that places count alike.
     at, whole = at[known], whole[known]
     relative = far.unabsorbed(at).transpose(1, 2, 0) / whole[:, None]
@@ -253,13 +273,15 @@ def significant_modes(far: FarProjection) -> FloatArray:
         amounts = _amounts_like(far, at, whole, fields, shift_px)
         covariance += np.outer(amounts, amounts)
     values, axes = np.linalg.eigh(covariance)
-    root = axes * np.sqrt(np.maximum(values, 0.0))
+    sizes = np.sqrt(np.maximum(values, 0.0))
+    root = axes * sizes
     flat = root.T @ fields
     # From the smallest on: parts of the variance add up until they matter at some pixel.
     turn = np.linalg.eigh(flat @ flat.T)[1]
     share = ((turn.T @ flat) ** 2).reshape(DISPLACEMENTS, -1, 2).sum(axis=-1)
     matters = np.cumsum(share, axis=0).max(axis=1) > MAX_LEFT_OUT
-    return np.asarray((root @ turn)[:, matters])
+    means = turn.T @ (axes.T @ far.departures.mean / np.maximum(sizes, np.finfo(float).tiny))
+    return np.asarray((root @ turn)[:, matters]), np.asarray(means[matters])
 
 
 def _amounts_like(

@@ -71,7 +71,7 @@ def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm
     if np.isinf(range_mm):
         found = far.covariance(flat)
     else:
-        known = calibration.widening**2 * calibration.near_covariance
+        known = far.departures.noise.widening**2 * far.departures.near_covariance
         found = _propagated(known, projection_design(calibration.near, calibration.along(flat, range_mm), 1.0))
         found += far.beyond_model(Along.of(calibration.camera, flat))
     covariance = found.reshape(*valid.shape, 2, 2)
@@ -111,7 +111,7 @@ class FarProjection:
     Attributes
     ----------
     calibration, camera : the calibration and its camera.
-    correlation, sigmas : (P, P) and (P,) of its parameters.
+    correlation, sigmas : (P, P) and (P,) of its parameters, given the departures.
     rays_valid : (M,) which of up to 400 corners, spread over all views, have a ray.
     corners : the projection along those N rays.
     compensation : (3, P) the rotation that compensates a step of one standard deviation of each parameter.
@@ -149,10 +149,10 @@ class FarProjection:
             rays, valid = camera.unproject(corners.pixels[chosen])
             rays = rays[valid]
         p = camera.parameters.size
-        # Parameters have different units; in standard deviations they are comparable.
-        known = calibration.widening**2 * calibration.covariance
-        sigmas = np.sqrt(np.maximum(np.diag(known), 0.0))
         at, departures = Along.of(camera, rays), Departures.of(calibration)
+        # Parameters have different units; in standard deviations they are comparable.
+        known = departures.noise.widening**2 * departures.near_covariance[:p, :p]
+        sigmas = np.sqrt(np.maximum(np.diag(known), 0.0))
         left = np.concatenate([sigmas[:, None] * at.design[:, :p], departures.unabsorbed(at.pixels, at.design)], axis=1)
         turned = at.design[:, p:]
         compensation = _compensating_rotations(turned, left)
@@ -214,7 +214,8 @@ class FarProjection:
         """The lens and its rivals, each with its own covariance."""
         rays = self.corners.rays
         lenses = [(self.camera, np.eye(3)), *((rival.camera, turn) for rival, turn in self._others)]
-        return [_Alone.of(self.calibration, camera, turn, rays) for camera, turn in lenses]
+        sigma_px = self.departures.noise.between_images_px
+        return [_Alone.of(self.calibration, camera, turn, rays, sigma_px) for camera, turn in lenses]
 
     def _beyond(self, left: FloatArray, at: Along) -> FloatArray:
         out = _propagated(self.departures.covariance, left)
@@ -283,14 +284,13 @@ class _Alone:
     compensation: FloatArray
 
     @classmethod
-    def of(cls, calibration: Calibration, camera: Camera, turn: Mat3, rays: Rays) -> _Alone:
-        """Return that of a `camera`; `rays` (N, 3) are those to corners in the calibrated camera, and `turn` rotates
-        them to those of `camera`."""
+    def of(cls, calibration: Calibration, camera: Camera, turn: Mat3, rays: Rays, sigma_px: float) -> _Alone:
+        """Return that of a `camera` with corners of `sigma_px`; `rays` (N, 3) are those to corners in the calibrated
+        camera, and `turn` rotates them to those of `camera`."""
         # A rival may leave a parameter undetermined.
         covariance = scaled_pinv(information_of_lens(calibration, camera, turn))
-        sigma = calibration.sigma_px * calibration.overdispersion * calibration.widening
         design, p = projection_design(camera, rays @ turn.T), len(covariance)
-        return cls(camera, covariance * sigma**2, _compensating_rotations(design[:, p:], design[:, :p]))
+        return cls(camera, covariance * sigma_px**2, _compensating_rotations(design[:, p:], design[:, :p]))
 
     def along(self, rays: Rays) -> FloatArray:
         """Return the covariance (M, 2, 2) of the projection along rays (M, 3) of the lens itself."""

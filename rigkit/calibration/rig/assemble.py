@@ -61,14 +61,18 @@ def assemble_rig(
     # All boards were measured with one ruler: its error does not average out.
     scale = max((b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards)
     far = [FarProjection.of(camera.calibration) for camera in cameras]
+    departures, corners, frames = lens_modes(observations, joint.solution, far, reported, joint.frames, sigma)
+    # Of the noise only what is left without the lenses' departures, which are stated beside it.
+    frames = min(max(frames, corners / overdispersion**2), 1.0)
+    given = covariance - (1.0 - frames) * known.covariance
     rig = RigCalibration(
         cameras=tuple(cameras),
         rms_px=float(np.sqrt(everything.mean())),
         heldout_rms_px=heldout[0],
-        covariance=covariance[np.ix_(reported, reported)],
-        pupils=_pupils(joint, layout, covariance, reported),
-        sigma_px=sigma,
-        overdispersion=overdispersion,
+        covariance=given[np.ix_(reported, reported)],
+        pupils=_pupils(joint, layout, given, reported),
+        sigma_px=sigma * float(np.sqrt(corners)),
+        overdispersion=max(overdispersion * float(np.sqrt(frames / corners)), 1.0),
         freedom=known.clustered.freedom,
         single=joint.views.single,
         convergence=joint.solution.convergence,
@@ -76,7 +80,7 @@ def assemble_rig(
         shared_count=joint.shared_count,
         left_out=joint.left_out,
         scale_sigma=scale,
-        departures=lens_modes(observations, joint.solution, far, reported),
+        departures=departures,
         board_rigs=_board_rigs(joint, layout, boards, shapes, covariance, scale, known.clustered),
     )
     lags = lags_of(joint.views.names, state, rig.widening**2 * covariance, layout.lags)

@@ -32,6 +32,7 @@ class MountedCameras:
     freedom : degrees of freedom of the covariance.
     overdispersion : ratio of the scatter of frames to that of independent corners.
     departures : modes of each lens beyond its model; empty if unknown.
+    expected : part of the covariance from errors that are expected, of cameras with departures among the parameters.
     pupils : moving entrance pupils by name.
     """
 
@@ -42,6 +43,7 @@ class MountedCameras:
     freedom: float = math.inf
     overdispersion: float = 1.0
     departures: tuple[LensModes, ...] = ()
+    expected: FloatArray | None = None
     pupils: Mapping[str, SolvedPupil] = field(default_factory=dict)
 
     @property
@@ -72,9 +74,9 @@ class MountedCameras:
         """The same with the modes of the lenses as further parameters; unchanged without a covariance."""
         if self.covariance is None:
             return self
-        lenses, covariance = with_modes(self.lenses, self.covariance, self.departures)
+        lenses, covariance, expected = with_modes(self.lenses, self.covariance, self.departures)
         cameras = dict(zip(self.cameras, zip(lenses, self.poses, strict=True), strict=True))
-        return replace(self, cameras=cameras, covariance=covariance, departures=())
+        return replace(self, cameras=cameras, covariance=covariance, expected=expected, departures=())
 
     @property
     def quoted(self) -> UncertainRig | None:

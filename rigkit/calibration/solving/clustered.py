@@ -143,13 +143,9 @@ def clustered_covariance(
     if len(score) < MIN_CLUSTERS or not sigma_px > 0.0:
         return Clustered(unit * sigma_px**2, 1.0, float("inf"))
     data = information.sum(axis=0)
-    # Scaled to a unit diagonal: parameters differ by many powers of ten.
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(data + prior), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh((data + prior) * scale[:, None] * scale)
-    known = values > RANK * values[-1]
-    root = scale[:, None] * vectors[:, known] / np.sqrt(values[known])
+    root = root_of_inverse(data + prior)
     leverage = root.T @ information @ root
-    pull = _without_leverage(leverage, score @ root / sigma_px)
+    pull = without_leverage(leverage, score @ root / sigma_px)
     expected = root.T @ data @ root
     # Images of high leverage count for several.
     share = np.einsum("vii->v", leverage)
@@ -165,7 +161,34 @@ def clustered_covariance(
     return Clustered(0.5 * (covariance + covariance.T), float(np.sqrt(factor)), freedom)
 
 
-def _without_leverage(leverage: FloatArray, pull: FloatArray) -> FloatArray:
+def root_of_inverse(information: FloatArray) -> FloatArray:
+    """Return R (n, r) with R R^T the inverse of an information (n, n) of rank r, in the directions that it has."""
+    # Scaled to a unit diagonal: parameters differ by many powers of ten.
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
+    known = values > RANK * values[-1]
+    return np.asarray(scale[:, None] * vectors[:, known] / np.sqrt(values[known]))
+
+
+def products_between(root: FloatArray, information: FloatArray, score: FloatArray) -> FloatArray:
+    """Return the sums (K, K) over N clusters of products of K scores with unit information, z = R^T s, corrected for
+    the clusters' leverages.
+
+    `root` R (n, r) is that of the inverse of all information, `information` (N, n, n) that of each cluster, and `score`
+    (N, n, K) its scores: of residuals, and of displacements that they may contain.
+    """
+    leverage = root.T @ information @ root
+    pull = np.stack([without_leverage(leverage, own @ root) for own in np.moveaxis(score, -1, 0)], axis=-1)
+    return np.asarray(np.einsum("vpj,vpk->jk", pull, pull))
+
+
+def square_of_rest(products: FloatArray, second: FloatArray, mean: FloatArray) -> float:
+    """Return the expected square of residuals less displacements, from the `products` (J + 1, J + 1) of J displacements
+    and residuals, and the moments of the displacements' amounts: of second order (J, J), and means (J,)."""
+    return float(products[-1, -1] - 2.0 * mean @ products[:-1, -1] + np.sum(products[:-1, :-1] * second))
+
+
+def without_leverage(leverage: FloatArray, pull: FloatArray) -> FloatArray:
     """Return (I - M)^-1/2 z (N, n) of clusters with leverages M (N, n, n) and z (N, n)."""
     out, size = np.empty_like(pull), np.sqrt((leverage * leverage).sum(axis=(1, 2)))
     # The Frobenius norm bounds the eigenvalues of M. Where it is well below one, a series is faster than all of them.

@@ -44,7 +44,7 @@ RIG_SCHEMA = "rigkit.rig/1"
 BOARDS_SCHEMA = "rigkit.board_rig/1"
 RIG_KEYS = keys_of(RIG_FILE)
 RIG_CAMERA_KEYS = keys_of(RIG_FILE, "cameras")
-_NO_MODES: dict[str, Any] = {"modes": [], "moves": []}
+_NO_MODES: dict[str, Any] = {"modes": [], "moves": [], "means": []}
 PLACED_KEYS = keys_of(BOARD_RIG_FILE, "rigs", "boards")
 
 
@@ -158,18 +158,22 @@ def load_saved_rig(path: str | Path) -> SavedRig:
 
 
 def _modes_to_json(own: LensModes) -> dict[str, Any]:
-    return {"modes": own.modes.T.tolist(), "moves": own.moves.T.tolist()}
+    return {"modes": own.modes.T.tolist(), "moves": own.moves.T.tolist(), "means": own.means.tolist()}
 
 
 def _modes(entry: dict[str, Any], size: int) -> LensModes:
     """Return the modes of a lens beyond its model, from rows of modes and of the parameter changes with them."""
-    if set(entry) != set(_NO_MODES):
+    if set(entry) | {"means"} != set(_NO_MODES):
         raise ValueError(f"departures have the keys {', '.join(_NO_MODES)}, no others")
     modes, moves = reals(entry["modes"]), reals(entry["moves"])
     count = len(modes)
     if not count:
-        return LensModes(np.zeros((DISPLACEMENTS, 0)), np.zeros((size, 0)))
-    return LensModes(as_array(modes.T, (DISPLACEMENTS, count), "modes"), as_array(moves.T, (size, count), "moves"))
+        return LensModes(np.zeros((DISPLACEMENTS, 0)), np.zeros((size, 0)), np.zeros(0))
+    return LensModes(
+        as_array(modes.T, (DISPLACEMENTS, count), "modes"),
+        as_array(moves.T, (size, count), "moves"),
+        as_array(reals(entry.get("means", [0.0] * count)), (count,), "means"),
+    )
 
 
 def is_rig_file(path: str | Path) -> bool:

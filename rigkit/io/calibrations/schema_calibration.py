@@ -141,9 +141,9 @@ RIG_FILE = file(
                 "rms_px": described(NUMBER, "training error in the rig"),
                 "outline_px?": described(matrix(columns=2), "convex, around all corners that it saw"),
                 "departures?": described(
-                    obj({"modes": matrix(), "moves": matrix()}),
-                    "lens errors beyond the model: independent displacements of the image of one sigma each, and the "
-                    "changes that each makes to the quantities of `covariance`",
+                    obj({"modes": matrix(), "moves": matrix(), "means?": array(NUMBER)}),
+                    "lens errors beyond the model: independent displacements of the image of one sigma each, the "
+                    "changes that each makes to the quantities of `covariance`, and the amount expected of each",
                 ),
                 "pupil?": _PUPIL,
                 "lag?": described(

@@ -162,7 +162,7 @@ def basis(certificate: Certificate) -> dict[str, str]:
         facts["board scale"] = f"{100.0 * i.scale_sigma:.3g} %" if i.scale_sigma else "not stated: treated as exact"
     percent = f"{100.0 * certificate.task.confidence:g} %"
     freedom = f", {i.freedom:.3g} degrees of freedom of the calibration" if np.isfinite(i.freedom) else ""
-    facts["bound"] = f"{percent}, Student's quantile of the root of the summed variances{freedom}; to first order"
+    facts["bound"] = f"{percent}, by Student's distribution from the summed variances{freedom}; to first order"
     return facts
 
 

@@ -3,6 +3,14 @@
 The calibration's covariance is estimated from about a dozen images, to about a quarter of itself. So a bound of 95 % is
 not 1.96 standard deviations but Student's quantile with effective degrees of freedom (Welch-Satterthwaite; JCGM 100
 "GUM", annex G.4). The standard deviations of the other causes count as known.
+
+How a lens departs from its model is partly known: the images tell its mean error b at each place, which is not
+corrected, and a standard deviation s about it. The root of b^2 + s^2 is what is stated as the lenses' sigma; but an
+error of known size does not vary, so the bound U is not a multiple of that root:
+
+    P(|b + s t| <= U) = confidence,     t of Student's distribution.
+
+It is 1.96 s without a mean error, and |b| + 1.64 s where that is large (GUM, F.2.4.5, on corrections not applied).
 """
 
 from __future__ import annotations
@@ -11,7 +19,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import ndtri, stdtrit
+from scipy.special import stdtr, stdtrit
 
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
@@ -27,6 +35,7 @@ from rigkit.validation.certificate.propagation import (
     OF_SCALE,
     gradients,
     measured_points,
+    systematic,
     variances,
 )
 from rigkit.validation.certificate.result import Certificate
@@ -38,6 +47,10 @@ is relied upon. SIMULATED corner noise, lengths, depths, planes and angles: up t
 within a bound of 95 %, beyond 1 97 to 100 % (2026-11-29). The calibration's errors are propagated linearly."""
 AS_NORMAL = 1e6
 """Degrees of freedom from which Student's distribution counts as normal."""
+TINY = 1e-300
+"""Least variance, so that ratios of variances exist."""
+BISECTIONS = 50
+"""Of the interval of a bound: to rounding."""
 
 
 def certify(instrument: Monitored, task: Task, *, cells: tuple[int, int] = MAP_CELLS) -> Certificate:
@@ -74,8 +87,8 @@ def certify(instrument: Monitored, task: Task, *, cells: tuple[int, int] = MAP_C
         cause: np.where(seen, factor * np.sqrt(value[chosen, worst]), np.nan).reshape(shape)
         for cause, value in variance.items()
     }
-    quantile = _quantile(sigma, instrument.freedom, task.confidence)
-    bound = quantile * np.sqrt(sum(s**2 for s in sigma.values()))
+    expected = systematic(instrument, by_calibration)[chosen, worst].reshape(shape)
+    bound, quantile = _bound(sigma, factor * np.sqrt(expected), instrument.freedom, task.confidence)
     whole = factor * (1.0 if task.quantity is Quantity.ANGLE else task.size_mm)
     # Largest displacement of any of the points by an error of one pixel, mm.
     farthest = np.linalg.norm(by_pixel, ord=2, axis=(-2, -1)).max(axis=1)
@@ -93,15 +106,26 @@ def certify(instrument: Monitored, task: Task, *, cells: tuple[int, int] = MAP_C
     return replace(certificate, findings=tuple(_findings(certificate)))
 
 
-def _quantile(sigma: Mapping[str, FloatArray], freedom: float, confidence: float) -> FloatArray:
-    """Return the bound over the total standard deviation at each place."""
-    upper = 0.5 + 0.5 * confidence
-    whole = np.sum([s**2 for s in sigma.values()], axis=0)
-    if not np.isfinite(freedom):
-        return np.full(whole.shape, float(ndtri(upper)))
+def _bound(
+    sigma: Mapping[str, FloatArray], expected: FloatArray, freedom: float, confidence: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the bound (R, C) at each place, and the quantile of Student's distribution, from the standard deviations
+    by each cause and the size of the `expected` error, which is a part of the lenses'."""
+    square = np.sum([s**2 for s in sigma.values()], axis=0)
+    whole = np.maximum(square - expected**2, TINY)
     calibration = np.sum([sigma[cause] ** 2 for cause in (OF_LENSES, OF_MOUNTS) if cause in sigma], axis=0)
-    known = freedom * (whole / np.maximum(calibration, np.finfo(float).tiny)) ** 2
-    return np.asarray(stdtrit(np.minimum(known, AS_NORMAL), upper))
+    calibration = np.maximum(calibration - expected**2, TINY)
+    known = np.full(whole.shape, AS_NORMAL)
+    if np.isfinite(freedom):
+        known = np.minimum(freedom * (whole / calibration) ** 2, AS_NORMAL)
+    quantile = stdtrit(known, 0.5 + 0.5 * confidence)
+    shift, spread = expected / np.sqrt(whole), np.sqrt(whole)
+    low, high = np.zeros_like(shift), shift + quantile
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        enough = stdtr(known, middle - shift) - stdtr(known, -middle - shift) >= confidence
+        low, high = np.where(enough, low, middle), np.where(enough, middle, high)
+    return spread * high, quantile
 
 
 def _findings(certificate: Certificate) -> list[Finding]:

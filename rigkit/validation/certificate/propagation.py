@@ -187,6 +187,11 @@ def variances(
     return {cause: np.maximum(value, 0.0) for cause, value in variance.items()}
 
 
+def systematic(instrument: Monitored, by_calibration: FloatArray) -> FloatArray:
+    """Return the square (N, M) of the error that is expected, from `gradients`: a part of the lenses' variance."""
+    return np.maximum(np.einsum("nmi,ij,nmj->nm", by_calibration, instrument.means, by_calibration), 0.0)
+
+
 def _second_order(bent: FloatArray, by_pixel: FloatArray, sigma_px: float) -> FloatArray:
     """Return the mean square (N, M) of the second-order change by the corners' noise, from the `hessians` and d point /
     d pixel (N, K, 3, 2 C)."""

@@ -29,14 +29,25 @@ def instrument_of(known: Monitored, pair: tuple[str, str] | None = None) -> Moni
         )
     chosen = [known.names.index(name) for name in names]
     cameras = tuple(known.cameras[k] for k in chosen)
+    both = (known.covariance, known.means)
     if len(chosen) == 1:
-        own = known.layout.cameras[0]
-        return replace(known, cam_from_rig=(Rigid3.identity(),), covariance=known.covariance[own, own], warped=())
-    rig = UncertainRig(cameras=known.cameras, cam_from_rig=known.cam_from_rig, covariance=known.covariance)
-    both = rig.pair(chosen[0], chosen[1])
-    poses = (Rigid3.identity(), both.posed.cam2_from_cam1)
+        own, poses = known.layout.cameras[0], (Rigid3.identity(),)
+        covariance, expected = (part[own, own] for part in both)
+    else:
+        rigs = [
+            UncertainRig(cameras=known.cameras, cam_from_rig=known.cam_from_rig, covariance=part).pair(*chosen)
+            for part in both
+        ]
+        poses = (Rigid3.identity(), rigs[0].posed.cam2_from_cam1)
+        covariance, expected = (pair.covariance for pair in rigs)
     return replace(
-        known, names=tuple(names), cameras=cameras, cam_from_rig=poses, covariance=both.covariance, warped=()
+        known,
+        names=tuple(names),
+        cameras=cameras,
+        cam_from_rig=poses,
+        covariance=covariance,
+        expected=expected,
+        warped=(),
     )
 
 

@@ -50,7 +50,9 @@ class Monitored:
     names, cameras, cam_from_rig : of one camera or of all cameras of a rig, whose frame is that of the first. Cameras
         take points in mm; a `NearCamera` has a moving pupil. The parameters of a camera are those of the model, then
         those of the model's inadequacy (`rigkit.calibration.certainty.displaced`), then those of the pupil.
-    covariance : (T, T) of theta.
+    covariance : (T, T) of the errors of theta about zero.
+    expected : (T, T) part of the covariance from errors whose mean is not zero: the products of the means; None: all
+        means are zero.
     sigma_px, overdispersion : standard deviation of a corner, and the factor by which images disagree more than
         independent corners would.
     scale_sigma : relative standard deviation of all lengths, from the tolerance of the boards' squares; 0 where not
@@ -68,8 +70,14 @@ class Monitored:
     overdispersion: float = 1.0
     freedom: float = float("inf")
     scale_sigma: float = 0.0
+    expected: FloatArray | None = None
     boards_mm: Mapping[str, Points] = field(default_factory=dict)
     warped: tuple[str, ...] = ()
+
+    @property
+    def means(self) -> FloatArray:
+        """`expected`, zeros for None."""
+        return np.zeros_like(self.covariance) if self.expected is None else self.expected
 
     @property
     def is_rig(self) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rigkit.calibration.certainty.departures import with_own_noise
 from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
@@ -30,17 +31,19 @@ def monitored_camera(
         if beyond_model
         else UncertainCamera(calibration.near, calibration.near_covariance[:-6, :-6])
     )
+    own = with_own_noise(calibration) if beyond_model else calibration
     camera = Monitored(
         names=(name,),
         cameras=(known.camera,),
         cam_from_rig=(Rigid3.identity(),),
         covariance=known.covariance,
-        sigma_px=calibration.sigma_px,
-        overdispersion=calibration.overdispersion,
+        expected=known.expected,
+        sigma_px=own.sigma_px,
+        overdispersion=own.overdispersion,
         freedom=calibration.freedom,
         boards_mm={shape.board_id: shape.points_mm for shape in calibration.boards},
     )
-    return _with_warps(camera, Knowledge.of(calibration)) if beyond_model else camera
+    return _with_warps(camera, Knowledge.of(own)) if beyond_model else camera
 
 
 def _with_warps(camera: Monitored, known: Knowledge) -> Monitored:
@@ -56,9 +59,9 @@ def _with_warps(camera: Monitored, known: Knowledge) -> Monitored:
     follows = np.zeros((len(rest), len(camera.covariance)))
     follows[:, :p] = -rest @ known.information[p:, :p]
     through = np.concatenate([np.eye(len(camera.covariance)), follows])
-    covariance = through @ camera.covariance @ through.T
+    covariance, expected = (through @ part @ through.T for part in (camera.covariance, camera.means))
     covariance[-len(rest) :, -len(rest) :] += rest
-    return replace(camera, covariance=covariance, warped=known.warped)
+    return replace(camera, covariance=covariance, expected=expected, warped=known.warped)
 
 
 def monitored_rig(rig: MountedCameras) -> Monitored:
@@ -71,6 +74,7 @@ def monitored_rig(rig: MountedCameras) -> Monitored:
         cameras=whole.lenses,
         cam_from_rig=rig.poses,
         covariance=whole.covariance,
+        expected=whole.expected,
         sigma_px=rig.sigma_px,
         overdispersion=rig.overdispersion,
         freedom=rig.freedom,
@@ -102,8 +106,14 @@ def _with_moving_pupils(central: Monitored, pupils: Mapping[str, SolvedPupil]) -
             cameras[k] = NearCamera.of(cameras[k], pupils[name].terms)
     order.append(np.arange(layout.cameras[-1].stop, layout.count))
     through, at = np.concatenate(follows), np.concatenate(order)
-    covariance = (through @ central.covariance @ through.T + _blocks(rest))[np.ix_(at, at)]
-    return replace(central, cameras=tuple(cameras), covariance=covariance)
+    covariance, expected = (through @ part @ through.T for part in (central.covariance, central.means))
+    covariance += _blocks(rest)
+    return replace(
+        central,
+        cameras=tuple(cameras),
+        covariance=covariance[np.ix_(at, at)],
+        expected=expected[np.ix_(at, at)],
+    )
 
 
 def _blocks(parts: list[FloatArray]) -> FloatArray:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rigkit.calibration.certainty.departures import with_own_noise
 from rigkit.calibration.certainty.displaced import lens_modes, uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.solving.layout import Layout
@@ -44,7 +45,7 @@ def next_views(
     """
     reach = reach or Reach()
     modes = lens_modes(calibration)
-    known = Knowledge.of(calibration).with_model_inadequacy(modes)
+    known = Knowledge.of(with_own_noise(calibration)).with_model_inadequacy(modes)
     last = calibration.views[-1].cam_from_board
     goal, stated = goal_of(known.camera, reach, length), uncertain_camera(calibration, modes=modes).covariance
     return plan_views(known, boards, goal, count, reach=reach, last=last).stated(float(goal.error(stated)))

@@ -71,6 +71,29 @@ def test_model_inadequacy_widens_the_projection_uncertainty() -> None:
     assert 0.6 < now < 1.3
 
 
+def test_departures_are_no_noise_of_corners_or_images() -> None:
+    """Decentring makes corners less sure than they are, and images disagree; it is stated once, as a departure."""
+    departs, found = np.zeros(DISPLACEMENTS), []
+    departs[5:7] = 0.3, -0.2
+    for amounts in (np.zeros(DISPLACEMENTS), departs):
+        views, _, _ = random_views(lens("fish"), 20, np.random.default_rng(3), reach_deg=80.0, noise_px=NOISE_PX)
+        views = [replace(view, pixels=view.pixels + departed(view.pixels, amounts)) for view in views]
+        found.append(calibrate(views, SIZE, model="kannala_brandt", board="flat", folds=0))
+    central, decentred = found
+    assert decentred.sigma_px > 1.03 * NOISE_PX and decentred.overdispersion > 2.0
+    plain, given = (Departures.of(one) for one in found)
+    for one in (plain, given):
+        assert one.noise.sigma_px == pytest.approx(NOISE_PX, rel=0.04)
+        assert one.noise.overdispersion < 1.25
+    # The parameters are nearly as sure as those of the lens without departures, and the amounts are found.
+    p = central.camera.parameters.size
+    as_calibrated = np.sqrt(np.diag(decentred.covariance) / np.diag(central.covariance))
+    known = np.sqrt(np.diag(given.near_covariance) / np.diag(plain.near_covariance))[:p]
+    assert as_calibrated.min() > 2.0 and known.min() > 0.8 and known.max() < 1.6
+    assert np.linalg.eigvalsh(given.near_covariance / np.sqrt(np.outer(*[np.diag(given.near_covariance)] * 2)))[0] > 0.0
+    assert np.linalg.norm(given.mean[5:7]) > 0.1 > np.linalg.norm(plain.mean[5:7])
+
+
 def test_a_lens_that_is_its_model_is_hardly_less_sure(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("fish"), 30, rng, reach_deg=REACH_DEG["fish"], noise_px=0.1)
     found = calibrate(views, SIZE, model="kannala_brandt", board="flat", folds=0)

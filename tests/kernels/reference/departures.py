@@ -18,8 +18,8 @@ def displacements(pixels: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     return np.moveaxis(np.array([*radial, *decentring, *prisms, (x, -y), (y, x)]), 0, 1)
 
 
-def averaged_amounts(information: np.ndarray, score: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return E[a a^T] (J, J), averaged over all pairs of sizes."""
+def averaged_amounts(information: np.ndarray, score: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return E[a a^T] (J, J) and E[a] (J,), averaged over all pairs of sizes."""
     along, others = (size.ravel() for size in np.meshgrid(sizes, sizes))
     prior = np.where(np.arange(len(score)) < len(RADIAL_POWERS), along[:, None], others[:, None])
     scaled = np.eye(len(score)) + prior[:, :, None] * information * prior[:, None, :]
@@ -28,7 +28,8 @@ def averaged_amounts(information: np.ndarray, score: np.ndarray, sizes: np.ndarr
     evidence = 0.5 * (mean @ score - np.linalg.slogdet(scaled)[1])
     weight = np.exp(evidence - evidence.max())
     weight /= weight.sum()
-    return np.asarray(np.einsum("h,hij->ij", weight, variance + mean[:, :, None] * mean[:, None]))
+    second = np.einsum("h,hij->ij", weight, variance + mean[:, :, None] * mean[:, None])
+    return second, weight @ mean
 
 
 def products(
@@ -41,13 +42,12 @@ def products(
     usable: np.ndarray,
     view: np.ndarray,
     size_px: tuple[int, int],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return of every view (V,) the products of all rows with its pose (V, K + 6, 6), and of the others (K, K); `view`
-    (N,) is that of each corner, `pixels` are (N, 2)."""
+) -> np.ndarray:
+    """Return of every view (V,) the products of all rows (V, K + 6, K + 6); `view` (N,) is that of each corner,
+    `pixels` are (N, 2)."""
     turn = np.cross(lever.T[:, None], d_pixels_d_point.transpose(2, 0, 1)).transpose(1, 2, 0)
     beyond = displacements(pixels, size_px)
     lens = sigmas[:, None] * d_pixels_d_parameters
     rows = np.concatenate([turn, d_pixels_d_point, lens, beyond, residuals.T[:, None]], axis=1)
     each = [rows[..., usable & (view == k)] for k in range(view.max() + 1)]
-    with_pose = np.array([np.einsum("ikn,ijn->kj", part, part[:, :6]) for part in each])
-    return with_pose, np.asarray(sum(np.einsum("ikn,ijn->kj", part[:, 6:], part[:, 6:]) for part in each))
+    return np.array([np.einsum("ikn,ijn->kj", part, part) for part in each])

@@ -232,6 +232,27 @@ def test_what_is_said_of_the_worst_place_is_said_of_a_certified_one(rng: np.rand
     assert nowhere.worst == whole.worst and nowhere.worst_place == whole.worst_place
 
 
+@pytest.mark.parametrize("times", [0.5, 4.0])
+def test_an_error_that_is_expected_does_not_vary(times: float, rng: np.random.Generator) -> None:
+    """The bound holds as often as it says; 1.96 times the root of all squares would hold more often."""
+    joint, task = rig_covariance(lens("brown"), rng), Task(quantity=Quantity.DEPTH, size_mm=150.0, distance_mm=1500.0)
+    error = times * np.linalg.cholesky(joint + 1e-12 * np.diag(np.diag(joint))) @ rng.normal(size=len(joint))
+    square = np.outer(error, error)
+    rig = replace(rig_of("brown", joint, scale_sigma=0.0), covariance=joint + square, expected=square)
+    certificate = certify(rig, task, cells=(5, 4))
+    points, weights = measured_points(rig.cameras[0].unproject(certificate.pixels[certificate.in_view])[0], task, True)
+    by_corner, by_calibration, by_pixel, _ = gradients(rig.cameras, rig.cam_from_rig, points, weights)
+    about = variances(replace(rig, covariance=joint), task, points, by_corner, by_calibration, by_pixel)
+    drawn = np.sqrt(sum(about.values())[:, 0, None]) * rng.normal(size=(len(points), 4000))
+    drawn += (by_calibration @ error)[:, :1]
+    inside = (np.abs(drawn) <= certificate.bound[certificate.in_view][:, None]).mean()
+    assert inside == pytest.approx(0.95, abs=0.005)
+    plain = certify(replace(rig, expected=None), task, cells=(5, 4))
+    assert plain.sigma[OF_LENSES] == pytest.approx(certificate.sigma[OF_LENSES], nan_ok=True)
+    wider = (np.abs(drawn) <= plain.bound[plain.in_view][:, None]).mean()
+    assert wider > (0.985 if times > 1.0 else 0.95)
+
+
 def test_what_is_not_counted_in_is_said(rng: np.random.Generator) -> None:
     rig = rig_of("brown", rig_covariance(lens("brown"), rng), scale_sigma=0.0)
     certificate = certify(rig, Task(quantity=Quantity.DEPTH, size_mm=100.0, distance_mm=900.0), cells=(5, 4))

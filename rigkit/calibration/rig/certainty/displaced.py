@@ -12,23 +12,38 @@ from dataclasses import replace
 
 import numpy as np
 
+from rigkit.calibration.certainty.departures import NOISE_ROUNDS
 from rigkit.calibration.certainty.displaced import LensModes, significant_modes, with_amounts
 from rigkit.calibration.certainty.uncertainty import FarProjection
+from rigkit.calibration.rig.solving.pose_jacobians import pose_products
 from rigkit.calibration.rig.solving.solver import rig_data
 from rigkit.calibration.rig.solving.state import RigObservations, RigState
+from rigkit.calibration.solving.clustered import products_between, reduced_by_cluster, root_of_inverse, square_of_rest
 from rigkit.calibration.solving.solver import Solution
 from rigkit.cameras.moving_pupil import far_camera, with_pupil_of
-from rigkit.core.arrays import IntArray
+from rigkit.core.arrays import FloatArray, IntArray
+
+TINY = 1e-300
+"""Least variance, so that ratios of variances exist."""
 
 
 def lens_modes(
-    observations: RigObservations, solution: Solution[RigState], far: Sequence[FarProjection], reported: IntArray
-) -> tuple[LensModes, ...]:
-    """Return the model inadequacy of each lens, with the error of the globals `reported` (G,), intrinsics and mounts;
-    `far` are the uncertainties of the cameras' projections in the rig."""
+    observations: RigObservations,
+    solution: Solution[RigState],
+    far: Sequence[FarProjection],
+    reported: IntArray,
+    frames: IntArray,
+    sigma_px: float,
+) -> tuple[tuple[LensModes, ...], float, float]:
+    """Return the model inadequacy of each lens, with the error of the globals `reported` (G,), intrinsics and mounts,
+    and which parts of the variances of corners and between `frames` are left without it.
+
+    `far` are the uncertainties of the cameras' projections in the rig, `frames` (F,) the frame of each pose, and
+    `sigma_px` is the standard deviation of a corner from all residuals.
+    """
     state, normal = solution.state, solution.normal
     n = state.layout(observations).shape.start
-    modes = [significant_modes(one) for one in far]
+    modes, means = zip(*(significant_modes(one) for one in far), strict=True)
     lenses = [with_amounts(far_camera(camera), own) for camera, own in zip(state.cameras, modes, strict=True)]
     cameras = tuple(with_pupil_of(lens, camera) for lens, camera in zip(lenses, state.cameras, strict=True))
     held = replace(observations, shape=observations.shape.held(state.unknowns))
@@ -42,6 +57,41 @@ def lens_modes(
         normal = replace(normal, gg=normal.gg[:n, :n], gp=normal.gp[:, :n], points_from=None)
     inverse, back, _ = normal.covariance
     by_pose = np.tensordot(back, data.gp[:, amounts], axes=((0, 1), (0, 2)))
-    moves = -(inverse @ (data.gg[np.ix_(known, amounts)] - by_pose))[reported]
-    parts = np.split(moves, np.cumsum([len(own) for own in each])[:-1], axis=1)
-    return tuple(LensModes(own, part) for own, part in zip(modes, parts, strict=True))
+    moves = -(inverse @ (data.gg[np.ix_(known, amounts)] - by_pose))
+    parts = np.split(moves[reported], np.cumsum([len(own) for own in each])[:-1], axis=1)
+    products = reduced_by_cluster(pose_products(held, displaced, data.products), layout.count, frames)
+    rest = _variances_left(*products, known, moves, max(float(data.costs.sum()), TINY), sigma_px)
+    return tuple(LensModes(*own) for own in zip(modes, parts, means, strict=True)), *rest
+
+
+def _variances_left(
+    information: FloatArray, score: FloatArray, known: IntArray, moves: FloatArray, square: float, sigma_px: float
+) -> tuple[float, float]:
+    """Return which parts of the variances of corners and between frames are left when the lenses' departures are taken
+    out of the residuals, which have the sum of squares `square` and the standard deviation `sigma_px`.
+
+    `information` (N, T, T) and `score` (N, T) are those of each frame, `moves` (K, M) the changes of the unknowns
+    `known` (K,) with the amounts of the modes, which are the other unknowns. Where cameras share the boards' poses,
+    residuals tell more of the amounts than each camera's own do: they are estimated anew, a priori with unit variance.
+    """
+    count = moves.shape[1]
+    along = np.zeros((information.shape[1], count))
+    along[known] = moves
+    along[np.setdiff1d(np.arange(len(along)), known)] = np.eye(count)
+    own, by_amount = information[:, known[:, None], known], information @ along
+    scores = np.concatenate([by_amount[:, known], score[:, known, None]], axis=2)
+    between = products_between(root_of_inverse(own.sum(axis=0)), own, scores)
+    whole = np.empty((count + 1, count + 1))
+    whole[:-1, :-1] = along.T @ by_amount.sum(axis=0)
+    whole[:-1, -1] = whole[-1, :-1] = along.T @ score.sum(axis=0)
+    whole[-1, -1] = square
+    amounts, at_all = whole[:-1, :-1], between[-1, -1] / own.shape[1]
+    variance, rest, frames = max(sigma_px**2, at_all), square, at_all
+    for _ in range(NOISE_ROUNDS):
+        covariance = np.linalg.inv(amounts / variance + np.eye(count))
+        mean = covariance @ whole[:-1, -1] / variance
+        second = covariance + np.outer(mean, mean)
+        rest = float(np.clip(square_of_rest(whole, second, mean), 0.0, square))
+        frames = float(np.clip(square_of_rest(between, second, mean) / own.shape[1], 0.0, at_all))
+        variance = max(sigma_px**2 * rest / square, frames, TINY)
+    return rest / square, frames / max(at_all, TINY)

@@ -1,0 +1,45 @@
+"""Departures of a rig's lenses from their models count once: not as noise of corners and frames as well."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.rig_scenes import MODELS, NOISE_PX, SIGMAS, mounts, rig_views, sizes
+
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.io.calibrations.rig_file import load_saved_rig, rig_text
+from rigkit.kernels.departures import DISPLACEMENTS, displacements
+from rigkit.validation.monitoring.watch import monitored_rig
+
+DECENTRED_PX = 2.0
+
+
+def test_departures_of_two_lenses_are_no_noise_of_frames(tmp_path: Path) -> None:
+    amounts, views = np.zeros(DISPLACEMENTS), rig_views(np.random.default_rng(2), 12)
+    amounts[5:7] = DECENTRED_PX, -DECENTRED_PX
+    for name in ("wide", "fish"):
+        size = sizes()[name]
+        moved = [np.einsum("ijn,j->ni", displacements(view.pixels, size), amounts) for _, view in views[name]]
+        views[name] = [
+            (frame, replace(view, pixels=np.clip(view.pixels + by, 0.0, np.array(size) - 1.0)))
+            for (frame, view), by in zip(views[name], moved, strict=True)
+        ]
+    rig = calibrate_rig(views, sizes(), model=MODELS, folds=0)
+    # Its cameras have the scatter of all residuals, the rig that of the rest.
+    assert all(camera.calibration.overdispersion > 1.4 for camera in rig.cameras)
+    assert rig.overdispersion < 1.15
+    assert rig.sigma_px == pytest.approx(NOISE_PX, rel=0.03)
+    length, sigma = rig.baseline_mm("reg", "fish")
+    assert abs(length - np.linalg.norm(mounts()["fish"][1].inverse().translation_mm)) < SIGMAS * sigma
+    (tmp_path / "rig.json").write_text(rig_text(rig), encoding="utf-8")
+    again = load_saved_rig(tmp_path / "rig.json")
+    one, other = (monitored_rig(own) for own in (rig.mounted, again))
+    for name in ("covariance", "expected"):
+        assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-9, abs=1e-30)
+    # What is expected is a part of the covariance.
+    assert 0.0 < np.trace(one.means) < np.trace(one.covariance)
+    scale = 1.0 / np.sqrt(np.diag(one.covariance))
+    assert np.linalg.eigvalsh((one.covariance - one.means) * scale[:, None] * scale)[0] > -1e-9
