@@ -59,16 +59,17 @@ CHANGES = {
         "switch autofocus and zoom off (fix the focus with a screw or tape), and retake all images",
     ),
     "lens": Finding.look(
-        "focal length and principal point differ from image to image (focus, zoom, stabilisation or cropping)",
-        "switch autofocus, zoom and image stabilisation off, and retake all images, unless a program cropped, rotated "
-        "or resized some",
+        "focal length and principal point differ from image to image (focus, zoom, stabilisation, cropping, or images "
+        "of another camera)",
+        "switch autofocus, zoom and image stabilisation off, and retake all images, unless some are another camera's, "
+        "or a program cropped, rotated or resized some",
     ),
     "shift": Finding.look(
         # After its pose a board determines two parameters of the image's change at first order: those of a shear.
-        "the principal point differs from image to image (stabilisation or cropping), or images are sheared by a "
-        "rolling shutter",
-        "switch image stabilisation off, hold camera and board still, and retake all images, unless a program rotated "
-        "or cropped some",
+        "the principal point differs from image to image (stabilisation, cropping, or images of another camera), or "
+        "images are sheared by a rolling shutter",
+        "switch image stabilisation off, hold camera and board still, and retake all images, unless some are another "
+        "camera's, or a program rotated or cropped some",
     ),
     "rows": Finding.look(
         "boards are sheared as by motion with a rolling shutter",

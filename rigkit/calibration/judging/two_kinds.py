@@ -9,14 +9,15 @@ error of the lens model, too, differs with the boards' position, distance and ti
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rigkit.calibration.judging.view_evidence import CHANGE_COLUMNS, COMMON, ViewEvidence, columns_of
 from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.core.findings import Finding
+from rigkit.core.findings import Finding, Severity
 
 MIN_OF_A_KIND, MIN_SHARE_OF_A_KIND = 3, 0.1
 """Smallest number, and part, of images of a kind; fewer are reported one by one."""
@@ -63,6 +64,14 @@ class Kinds:
 def min_of_a_kind(images: int) -> float:
     """Return the smallest number of images of a kind, for so many `images`."""
     return max(MIN_OF_A_KIND, MIN_SHARE_OF_A_KIND * images)
+
+
+def contradicting_images(verdicts: Sequence[Finding]) -> Finding | None:
+    """Return the headline of a calibration whose images contradict each other, without its error; None for others."""
+    first = verdicts[0]
+    if first.severity is not Severity.BAD or SIGMAS_DO_NOT_HOLD not in first.message:
+        return None
+    return replace(first, message=first.message.partition(", but ")[2])
 
 
 def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | None:

@@ -333,7 +333,8 @@ def _pattern(c: Calibration, correlation: float, in_force: Collection[str], name
     elif not named:
         yield Finding.look(
             what + "no lens model or board shape explains it, so something changes between images",
-            "fix the focus, switch stabilisation off, hold camera and board still, use a stiff board",
+            "fix the focus, switch stabilisation off, hold camera and board still, use a stiff board, and leave out "
+            "images of another camera",
         )
 
 

@@ -17,6 +17,7 @@ from rigkit.calibration.calibrate import FOLDS, calibrate_together
 from rigkit.calibration.choosing.candidate_fits import CandidateFits, camera_named_in_errors
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.judging.pupil import pupil_is_significant
+from rigkit.calibration.judging.two_kinds import contradicting_images
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig
@@ -29,6 +30,7 @@ from rigkit.calibration.rig.verdicts import diagnose_rig
 from rigkit.calibration.rig.views.board_places import board_places
 from rigkit.calibration.rig.views.mispaired import duplicate_images, mixup_of_all_frames, mixups_of_frames
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews, frame_observations
+from rigkit.calibration.rig.views.slipped import MIN_FRAMES_OF_PART, slipped_camera
 from rigkit.calibration.with_pupil import require_known
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
@@ -96,7 +98,7 @@ def calibrate_rig(
     with _mistakes_named(every):
         joint, heldout = _best_timing(every, known, folds, progress)
     rig, far = assemble_rig(joint, heldout)
-    notes = (*same, *_mispaired(rig, every, joint.cost_sigmas), *notes, *joint.notes)
+    notes = (*same, *_mistakes(rig, every, joint.cost_sigmas), *notes, *joint.notes)
     in_force = [n for n, v in (("model", set(models.values())), ("board_shape", {board})) if v == {"auto"}]
     return replace(rig, verdicts=diagnose_rig(rig, far, notes, in_force=in_force))
 
@@ -147,12 +149,20 @@ def _mistakes_named(views: RigViews) -> Iterator[None]:
         raise error if cause is None else DegenerateError(f"rig: {cause.text} ({error})") from error
 
 
-def _mispaired(rig: RigCalibration, views: RigViews, cost_sigmas: float) -> list[Finding]:
-    """Return findings on file mix-ups that explain the frames left out, or all frames if most of them disagree."""
-    if cost_sigmas > BAD_COST_SIGMAS and (cause := mixup_of_all_frames(views)):
+def _mistakes(rig: RigCalibration, views: RigViews, cost_sigmas: float) -> list[Finding]:
+    """Return findings on file mix-ups that explain the frames left out, or all frames if most of them disagree, and on
+    cameras whose own images contradict each other; without either, on a camera that slipped."""
+    disagree = cost_sigmas > BAD_COST_SIGMAS
+    if disagree and (cause := mixup_of_all_frames(views)):
         return [cause]
     mounts, left_out = [camera.cam_from_rig for camera in rig.cameras], [key[:2] for key in rig.left_out]
-    return mixups_of_frames(views, mounts, left_out)
+    found = mixups_of_frames(views, mounts, left_out)
+    for name, single in zip(views.names, views.single, strict=True):
+        own = contradicting_images(single.verdicts)
+        found += [] if own is None else [replace(own, message=f"camera '{name}': {own.message}")]
+    if not found and (disagree or len(left_out) >= MIN_FRAMES_OF_PART):
+        found += filter(None, [slipped_camera(views)])
+    return found
 
 
 def _require_entries(views: Views, **given: object) -> None:

@@ -318,8 +318,8 @@ def test_a_sheared_picture_is_told_from_a_shifted_one_by_nobody(rng: np.random.G
         views.append(replace(view, pixels=np.clip(pixels, -0.5, np.array(SIZE) - 0.5)))
     found = changing_in(calibrate(views, SIZE, model="brown", board="flat", folds=0))
     assert [finding.message.split(":")[0] for finding in found] == [
-        "the principal point differs from image to image (stabilisation or cropping), or images are sheared by a "
-        "rolling shutter"
+        "the principal point differs from image to image (stabilisation, cropping, or images of another camera), or "
+        "images are sheared by a rolling shutter"
     ]
     assert found[0].remedy is not None and "still" in found[0].remedy
 

@@ -7,6 +7,7 @@ be corrected without new images:
 - an image that is missing in one camera, so that all later ones are off by one frame
 - images rotated by 180 degrees by a program
 - mirrored images of one camera, which a chessboard does not show
+- one image of a camera under the names of two frames
 
 Each is tried, and reported if it resolves the disagreement.
 """
@@ -34,6 +35,8 @@ from rigkit.geometry.rigid3 import Rigid3
 SAME_IMAGE_PX = 0.1
 """RMS difference of corners up to which two images are copies, perhaps compressed again: two cameras have at least
 different noise."""
+MOVED_PX = 1.0
+"""RMS difference of corners from which a board was elsewhere."""
 MAX_LEFT_OF_DISTANCE = 0.1
 """Distance between views after correcting a mix-up, over that before, up to which it explains the disagreement. Before,
 it is the movement of the boards between frames, a hundred pixels and more; after, the error of lenses calibrated from
@@ -53,12 +56,12 @@ def _all(frames: int) -> str:
 
 
 def duplicate_images(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> list[Finding]:
-    """Return a finding for every two cameras with copies of one image in some frames; `views` are (frame, view) by
-    camera.
+    """Return a finding for every two cameras with copies of one image in some frames, and for every two frames with
+    copies of one camera's image whose other cameras saw the board elsewhere; `views` are (frame, view) by camera.
 
-    Raises InputError where they are copies in all frames.
+    Raises InputError where two cameras have copies in all frames.
     """
-    out = []
+    out: list[Finding] = []
     shown = {name: {(frame, view.board.board_id): view for frame, view in own} for name, own in views.items()}
     for (a, own), (b, other) in combinations(shown.items(), 2):
         shared = own.keys() & other.keys()
@@ -76,7 +79,24 @@ def duplicate_images(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> li
                 "give each camera its own images, and calibrate again",
             )
         )
-    return out
+    return [*out, *_repeated_images(shown)]
+
+
+def _repeated_images(shown: Mapping[str, Mapping[Key, BoardView]]) -> Iterator[Finding]:
+    """Yield a finding for every two frames with copies of one camera's image; a board that nobody moved looks the same
+    to all cameras."""
+    for name, own in shown.items():
+        others = [other for camera, other in shown.items() if camera != name]
+        for one, again in combinations(own, 2):
+            if one[1] != again[1] or one[0] == again[0] or not _same_image(own[one], own[again]):
+                continue
+            both = [other for other in others if one in other and again in other]
+            if any(not _same_image(other[one], other[again], MOVED_PX) for other in both):
+                yield Finding.bad(
+                    f"the images of '{name}' in frames '{one[0]}' and '{again[0]}' are copies of one image, while the "
+                    "board moved for another camera",
+                    "replace the wrong one or leave its frame out, and calibrate again",
+                )
 
 
 def mixups_of_frames(views: RigViews, mounts: Sequence[Rigid3], left_out: Iterable[Key]) -> list[Finding]:
@@ -152,15 +172,21 @@ def mixup_of_all_frames(views: RigViews) -> Finding | None:
                     f"the images of {who} are mirrored: undoing that makes the cameras agree",
                     "use the image files as the camera wrote them",
                 )
-        turned = _flipped(seen[k], camera, Flip(FLIP_SIGNS["rotated by 180 degrees"]))
-        for sides in _frames_better_changed(views, k, turned):
-            some = {key: turned[key] if key[0] in sides else entry for key, entry in seen[k].items()}
-            if sides and typical_px(views.with_camera(k, some)) <= limit:
-                return Finding.bad(
-                    f"the images of '{names[k]}' are rotated by 180 degrees in {_frames_in_words(_in_order(sides))}, "
-                    "or in all others: undoing that makes the cameras agree",
-                    "use the image files as the camera wrote them",
-                )
+        turned = views.with_camera(k, _flipped(seen[k], camera, Flip(FLIP_SIGNS["rotated by 180 degrees"])))
+        if sides := _frames_to_change(views, turned, limit):
+            return Finding.bad(
+                f"the images of '{names[k]}' are rotated by 180 degrees in {_frames_in_words(sides)}, "
+                "or in all others: undoing that makes the cameras agree",
+                "use the image files as the camera wrote them",
+            )
+    for i, j in combinations(range(len(seen)), 2):
+        exchanged = views.with_camera(i, seen[j]).with_camera(j, seen[i])
+        if sides := _frames_to_change(views, exchanged, limit):
+            return Finding.bad(
+                f"the images of '{names[i]}' and '{names[j]}' are exchanged in {_frames_in_words(sides)}, or in all "
+                "others: undoing that makes the cameras agree",
+                "correct their names",
+            )
     return None
 
 
@@ -174,11 +200,25 @@ def typical_px(views: RigViews) -> float:
     return float(np.median(list(off.values()))) if len(_by_frame(off)) >= MIN_FRAMES_CORRECTED else np.inf
 
 
-def _frames_better_changed(views: RigViews, k: int, changed: FrameObservations) -> Iterator[set[str]]:
-    """Yield for each frame, with the mounts that it alone gives, the frames in which camera k agrees better
-    `changed`."""
-    trial = views.with_camera(k, changed)
-    for frame in _in_order({frame for frame, _ in views.seen[k]}):
+def _frames_to_change(views: RigViews, changed: RigViews, limit_px: float) -> list[str]:
+    """Return the frames, in order, with the views `changed` of which all frames agree within `limit_px`; none if there
+    are none, or all."""
+    every = _frames_of(views.seen)
+    for sides in _frames_better_changed(views, changed):
+        if sides and sides != every:
+            some = [
+                _of_frames(own, every - sides) | _of_frames(other, sides)
+                for own, other in zip(views.seen, changed.seen, strict=True)
+            ]
+            if typical_px(views.with_seen(some)) <= limit_px:
+                return _in_order(sides)
+    return []
+
+
+def _frames_better_changed(views: RigViews, trial: RigViews) -> Iterator[set[str]]:
+    """Yield for each frame, with the mounts that it alone gives, the frames in which cameras agree better in the
+    `trial`."""
+    for frame in _in_order(_frames_of(views.seen)):
         try:
             mounts, _ = mounts_of(views.with_seen([_of_frames(own, {frame}) for own in views.seen]))
         except InputError:
@@ -235,11 +275,11 @@ def _flipped(own: FrameObservations, camera: Camera, flip: Flip) -> FrameObserva
     }
 
 
-def _same_image(one: BoardView, other: BoardView) -> bool:
+def _same_image(one: BoardView, other: BoardView, within_px: float = SAME_IMAGE_PX) -> bool:
     """Return whether two views have the same corners at the same pixels."""
     if one.grid.shape != other.grid.shape or (one.grid != other.grid).any():
         return False
-    return bool(np.sqrt(np.mean(np.sum((one.pixels - other.pixels) ** 2, axis=1))) <= SAME_IMAGE_PX)
+    return bool(np.sqrt(np.mean(np.sum((one.pixels - other.pixels) ** 2, axis=1))) <= within_px)
 
 
 def _offset_in_words(step: int) -> str:

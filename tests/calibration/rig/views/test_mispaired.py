@@ -180,3 +180,27 @@ def test_one_picture_under_two_names(rng: np.random.Generator) -> None:
     assert rig.verdicts[0].severity is Severity.BAD
     assert "'left' and 'right' have identical images in frames '4', '5' of 10 frames" in rig.verdicts[0].message
     assert not any("identical images" in str(finding) for finding in calibrated(views).verdicts)
+
+
+def test_one_picture_of_a_camera_in_two_frames(rng: np.random.Generator) -> None:
+    """A board that nobody moved looks the same to both cameras, which is no mistake."""
+    views = pair(rng)
+    left = dict(views["left"])
+    again = replace(left["2"], image="left8.png", pixels=left["2"].pixels + 0.02)
+    views["left"] = [(f, again if f == "8" else view) for f, view in views["left"]]
+    rig = calibrated(views)
+    assert rig.verdicts[0].severity is Severity.BAD
+    assert "the images of 'left' in frames '2' and '8' are copies of one image" in rig.verdicts[0].message
+    right = dict(views["right"])
+    views["right"] = [(f, replace(right["2"], image=v.image) if f == "8" else v) for f, v in views["right"]]
+    assert not any("copies" in str(finding) for finding in calibrated(views).verdicts)
+
+
+def test_half_of_the_pictures_exchanged(rng: np.random.Generator) -> None:
+    views = pair(rng)
+    both = dict(views["left"]), dict(views["right"])
+    odd: Views = {
+        name: [(f, replace(both[k if int(f) % 2 else 1 - k][f], image=f"{name}{f}.png")) for f, _ in own]
+        for k, (name, own) in enumerate(views.items())
+    }
+    assert re.search(r"'left' and 'right' are exchanged in frames '[12]', '[34]', '[56]' and 2 more", cause(odd))
