@@ -56,7 +56,16 @@ def test_a_rig(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 def test_diff_certify_check_and_plan(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     known = str(calibrated / "calibration.json")
-    images = [str(path) for path in sorted(calibrated.glob("*.JPG"))[:2]]
+    own = sorted(calibrated.glob("*.JPG"))[:3]
+    # Saved again, as other files.
+    images = [str(tmp_path / path.name) for path in own[:2]]
+    for path in own[:2]:
+        (tmp_path / path.name).write_bytes(path.read_bytes() + b"again")
+    assert main(["check", known, *map(str, own)]) == 2
+    assert "was made from these very images" in capsys.readouterr().err
+    assert main(["check", known, *images, str(own[2])]) == 0
+    left_out = capsys.readouterr().err
+    assert f"{own[2]}" in left_out and "the calibration was made from it, and fits it" in left_out
     for given in ([str(calibrated)], [str(path) for path in sorted(calibrated.glob("*.JPG"), reverse=True)]):
         assert main(["check", known, *given]) == 2
         assert "was made from these very images" in capsys.readouterr().err

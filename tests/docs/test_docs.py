@@ -32,6 +32,10 @@ def set_up(needs: str, folder: Path, images: Path) -> None:
             (folder / "photos").mkdir()
             for k, path in enumerate(sorted(images.glob("left*.jpg"))[:FRAMES]):
                 shutil.copy(path, folder / "photos" / f"{k}.jpg")
+            # Stand for pictures taken later: other files with the same content.
+            (folder / "new").mkdir()
+            for name in ("0.jpg", "1.jpg"):
+                (folder / "new" / name).write_bytes((folder / "photos" / name).read_bytes() + b"later")
         elif need == "rig":
             of_two_cameras(images, folder, FRAMES)
         else:

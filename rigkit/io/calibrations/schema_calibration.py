@@ -57,6 +57,7 @@ _MADE = obj(
         "rigkit": described(TEXT, "version"),
         "written": described({"type": "string", "format": "date-time"}, "when, UTC"),
         "inputs": described(table(TEXT), "SHA-256 of what it was made from: the session, and all images together"),
+        "images?": described(array(TEXT), "first digits of the SHA-256 of each image"),
     },
     "by what, when, and from what it was made",
 )

@@ -50,10 +50,17 @@ from rigkit.validation.monitoring.watch import monitored_camera, monitored_rig
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad
 from rigkit.workflows.inputs.identify_board import why_not_detected
-from rigkit.workflows.moments import moments_of
+from rigkit.workflows.moments import ImagesByMoment, moments_of
 from rigkit.workflows.options.check import CheckOptions
-from rigkit.workflows.outputs.provenance import digest_line, digest_of, digest_of_images, software_facts
+from rigkit.workflows.outputs.provenance import (
+    digest_line,
+    digest_of,
+    digest_of_images,
+    is_one_of,
+    software_facts,
+)
 
+OWN_IMAGE = "the calibration was made from it, and fits it even if the camera has changed"
 NO_PARTNER = "the other cameras have no image of its name or number"
 _log = logging.getLogger(__name__)
 
@@ -96,7 +103,7 @@ def check_pictures(
     both = {path for frame in now for path in frame} & {path for frame in before for path in frame}
     if both:
         raise InputError(f"check: '{min(both)}' is given both as a new image and with --before")
-    _refuse_own_images(source, now)
+    now, own = _without_own_images(source, now)
     goals = [] if options.length is None else length_goals(monitored.cameras, monitored.cam_from_rig, options.length)
     boards = _replaced_by_known(options.boards, known) or known
     pictures = _Pictures(source=source, monitored=monitored, boards=boards, known=known, progress=progress)
@@ -110,6 +117,7 @@ def check_pictures(
         if views and not check.holds:
             check = replace(check, flipped=flipped_pictures(check.monitored, views))
             _require_right_order(check, views)
+    pictures.left_out.extend((f"{path}", OWN_IMAGE) for path in own)
     files = _files(source, check, options)
     write_together(files, force=options.force)
     if options.history is not None:
@@ -124,17 +132,23 @@ def check_pictures(
     )
 
 
-def _refuse_own_images(source: Path, frames: Sequence[Sequence[Path]]) -> None:
-    """Raise InputError for all images of a camera, in any order, from which the calibration in `source` was made."""
-    made = json.loads(read_text(source)).get("made")
-    inputs = made.get("inputs") if isinstance(made, dict) else None
-    known = list(inputs.values()) if isinstance(inputs, dict) else []
-    for camera in zip(*frames, strict=True):
-        if _digest_alone(sorted(camera)) in known:
-            raise InputError(
-                f"check: '{source}' was made from these very images, which fit it even if the camera has changed; "
-                "give new ones"
-            )
+def _without_own_images(source: Path, frames: ImagesByMoment) -> tuple[ImagesByMoment, list[Path]]:
+    """Return the frames without those that have an image from which the calibration in `source` was made, and these
+    images.
+
+    Raises InputError where no frame is left, or all are those of a camera of a file that does not list its images.
+    """
+    stated = json.loads(read_text(source)).get("made")
+    made = stated if isinstance(stated, dict) else {}
+    known = list(made["inputs"].values()) if isinstance(made.get("inputs"), dict) else []
+    own = [path for frame in frames for path in frame if is_one_of(path, made)]
+    new = [frame for frame in frames if not any(path in own for path in frame)]
+    if not new or any(_digest_alone(sorted(camera)) in known for camera in zip(*frames, strict=True)):
+        raise InputError(
+            f"check: '{source}' was made from these very images, which fit it even if the camera has changed; "
+            "give new ones"
+        )
+    return new, own
 
 
 def _digest_alone(images: Sequence[Path]) -> str:

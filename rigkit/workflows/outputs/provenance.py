@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -16,6 +16,8 @@ from rigkit.io.corners.corner_cache import image_hash
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.io.manifests.session import Session
 
+SHORT_HASH = 16
+"""Hexadecimal digits of an image's SHA-256 that a calibration keeps: two different images never share them."""
 PACKAGES = ("numpy", "opencv-contrib-python-headless")
 """Packages whose versions all results depend on."""
 
@@ -28,15 +30,17 @@ def software_facts(*packages: str) -> dict[str, str]:
 
 
 def provenance_of(session: Session | RigSession) -> dict[str, Any]:
-    """Return the provenance that a calibration file states: rigkit's version, the time, the SHA-256 of the session, and
-    for each camera the SHA-256 of what `sha256sum` prints for its readable images."""
+    """Return the provenance that a calibration file states: rigkit's version, the time, the SHA-256 of the session, for
+    each camera the SHA-256 of what `sha256sum` prints for its readable images, and the first digits of each image's."""
     inputs = {session.path.name: digest_of(session.path)} if session.path.is_file() else {}
+    every: list[str] = []
     for name, own in session.cameras.items():
         pairs = _hashes(own.images)
+        every += [digest[:SHORT_HASH] for _, digest in pairs]
         if pairs:
             inputs[f"{len(pairs)} images{f' of {name}' if name else ''}"] = _digest_of(pairs)
     written = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-    return {"rigkit": version("rigkit"), "written": written, "inputs": inputs}
+    return {"rigkit": version("rigkit"), "written": written, "inputs": inputs, "images": every}
 
 
 def digest_line(source: Path | str | bytes) -> str:
@@ -55,6 +59,12 @@ def digest_of_images(paths: Sequence[Path]) -> str | None:
     """Return one SHA-256 of all readable images, with how to compute it in words; None if none is readable."""
     pairs = _hashes(paths)
     return f"{len(pairs)} files; SHA-256 of what `sha256sum` prints of them: {_digest_of(pairs)}" if pairs else None
+
+
+def is_one_of(image: Path, made: Mapping[str, Any]) -> bool:
+    """Return whether a calibration with the provenance `made` states that it was made from this image, by content."""
+    listed, known = made.get("images"), _hashes([image])
+    return isinstance(listed, list) and bool(known) and known[0][1][:SHORT_HASH] in listed
 
 
 def _hashes(paths: Sequence[Path]) -> list[tuple[str, str]]:
