@@ -169,7 +169,7 @@ def describe_rig(rig: RigCalibration, checks: Sequence[Check]) -> str:
     for c in checks:
         verdict = "as measured" if c.passed else "NOT as measured"
         lines.append(
-            f"{c.name} {verdict}: {c.ours:.3f} {c.unit}, measured {c.measured:g} +- {c.measured_sigma:g} {c.unit} "
+            f"{c.name} {verdict}: {c.ours:.3f} {c.unit}, measured {c.measured:g} ± {c.measured_sigma:g} {c.unit} "
             f"({c.how}), off by {c.k:.1f} combined sigmas"
         )
     # The verdicts on the rig come before their consequences for its cameras.

@@ -11,7 +11,6 @@ import numpy as np
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.rig.certainty.uncertainty import Transfer, transfer_uncertainty
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
-from rigkit.calibration.rig.verdicts import lag_words
 from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell
 from rigkit.core.truth import Feature
 from rigkit.geometry.rotation import log_so3, rotation_angle
@@ -116,7 +115,7 @@ def rig_basis(rig: RigCalibration) -> str:
         "Intrinsics and extrinsics are solved jointly; held out: frames not used, with one board pose for all "
         f"cameras. {rig.corner_count} corners, {rig.shared_count} poses shared by several views. Overdispersion "
         f"{rig.overdispersion:.2f}: frames disagree that many times as much as independent corners would (included in "
-        "all sigmas)." + "".join(f" {words[0].upper()}{words[1:]}." for words in lag_words(rig))
+        "all sigmas)."
     )
 
 
@@ -173,7 +172,7 @@ def _angles(target: BoardRig, checks: Sequence[Check]) -> Table:
     distances = [c for c in checks if c.kind == "distance"]
     note = f"Solved from {target.image_count} images that show at least two of these boards."
     note += "".join(
-        f" {c.name}: {c.ours:.3f} +- {c.our_sigma:.3f} mm, measured {c.measured:g} +- {c.measured_sigma:g} ({c.how}): "
+        f" {c.name}: {c.ours:.3f} ± {c.our_sigma:.3f} mm, measured {c.measured:g} ± {c.measured_sigma:g} ({c.how}): "
         + ("pass." if c.passed else f"FAIL, off by {c.k:.1f} combined sigmas.")
         for c in distances
     )

@@ -233,7 +233,7 @@ def modelled_pupil(calibration: Calibration) -> Iterator[Finding]:
     nearest, farthest, rim = _distances_and_rim(calibration)
     mm, sigma = calibration.pupil.shift_mm(rim)
     yield Finding.good(
-        f"{NOT_CENTRAL}, which is modelled: its entrance pupil moves by {mm:.2f} +- "
+        f"{NOT_CENTRAL}, which is modelled: its entrance pupil moves by {mm:.2f} ± "
         f"{calibration.widening * sigma:.2f} mm between the optical axis and the outermost corners "
         f"({np.degrees(rim):.0f} degrees; boards {nearest:.0f} to {farthest:.0f} mm away); exports to central "
         "models omit it and are exact for distant points only"

@@ -50,17 +50,17 @@ def _lags(rig: RigCalibration) -> Iterator[Finding]:
     """Yield a finding with the estimated lags and readouts."""
     if not rig.lags:
         return
-    words = [*lag_words(rig), *_readout_words(rig)]
+    words = [*_lag_words(rig), *_readout_words(rig)]
     yield Finding.good(f"{'; '.join(words)}; board poses are interpolated to these times")
 
 
-def lag_words(rig: RigCalibration) -> list[str]:
+def _lag_words(rig: RigCalibration) -> list[str]:
     """Return words for the lag of each camera."""
     first, out = rig.cameras[0].name, []
     for name, lag in rig.lags.items():
         when = "after" if lag.frames >= 0.0 else "before"
         out.append(
-            f"camera '{name}' exposes {abs(lag.frames):.3f} +- {lag.sigma:.3f} frame periods {when} '{first}' (jitter "
+            f"camera '{name}' exposes {abs(lag.frames):.3f} ± {lag.sigma:.3f} frame periods {when} '{first}' (jitter "
             f"{lag.scatter:.3f})"
         )
     return out
@@ -68,7 +68,7 @@ def lag_words(rig: RigCalibration) -> list[str]:
 
 def _readout_words(rig: RigCalibration) -> list[str]:
     return [
-        f"the rolling shutter of camera '{name}' reads an image in {own.frames:.3f} +- {own.sigma:.3f} frame periods"
+        f"the rolling shutter of camera '{name}' reads an image in {own.frames:.3f} ± {own.sigma:.3f} frame periods"
         for name, own in rig.readouts.items()
     ]
 

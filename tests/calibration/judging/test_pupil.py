@@ -150,7 +150,7 @@ def test_a_pupil_that_moves_is_solved_for(folds: int) -> None:
     assert off_far_away(session(NEAR, MM_PER_RAD2, 0)) > 1.0
     assert found.rms_px < 1.1 * NOISE_PX * np.sqrt(2.0)
     (printed,) = (one for one in found.verdicts if MESSAGE in one.message)
-    assert printed.severity is Severity.GOOD and f"{found.pupil.shift_mm(_rim(found))[0]:.2f} +- " in printed.message
+    assert printed.severity is Severity.GOOD and f"{found.pupil.shift_mm(_rim(found))[0]:.2f} ± " in printed.message
     assert any(one.name == MOVING and one.chosen for one in found.candidates)
 
 
