@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -69,6 +70,18 @@ def left_out(calibration: Calibration) -> list[str]:
         images.setdefault(("left out of" if image in used else "dropped", reason), []).append(image)
     return [
         f"{how} {_first_names(some)}: {reason}" for (how, reason), some in sorted(images.items(), key=lambda i: i[0][0])
+    ]
+
+
+def frames_left_out(targets: Sequence[tuple[str, str, str]]) -> list[str]:
+    """Return one line for each board and reason why (frame, board, reason) are left out, whatever its figures."""
+    groups: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for frame, board, reason in targets:
+        groups.setdefault((board, re.sub(r"[\d.]+", "", reason)), []).append((frame, reason))
+    return [
+        f"frame{'s' if len(some) > 1 else ''} {_first_names([frame for frame, _ in some])}, board '{board}' left out: "
+        f"{some[0][1]}{' (figures of the first)' if len(some) > 1 else ''}"
+        for (board, _), some in groups.items()
     ]
 
 
@@ -174,7 +187,7 @@ def describe_rig(rig: RigCalibration, checks: Sequence[Check]) -> str:
         )
     # The verdicts on the rig come before their consequences for its cameras.
     lines += map(str, most_severe_first(rig.verdicts))
-    lines += [f"frame {frame}, board '{board}' left out: {reason}" for frame, board, reason in rig.left_out]
+    lines += frames_left_out(rig.left_out)
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         lines += [f"{camera.name}: {line}" for line in left_out(alone)]
         lines += [f"{camera.name} alone: {verdict}" for verdict in most_severe_first(alone.verdicts)]

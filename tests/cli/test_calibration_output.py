@@ -8,7 +8,7 @@ import numpy as np
 from helpers.calibration_scenes import SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.cli.calibration_output import left_out
+from rigkit.cli.calibration_output import frames_left_out, left_out
 
 
 def test_a_reason_is_said_once_with_its_first_images() -> None:
@@ -20,4 +20,14 @@ def test_a_reason_is_said_once_with_its_first_images() -> None:
         "dropped one.png, two.png: is damaged",
         "dropped f000.png, f001.png, f002.png and 197 more: no board found",
         "left out of 000.png: board 'b' lies beside",
+    ]
+
+
+def test_frames_left_out_for_one_reason_are_one_line() -> None:
+    """Of a video with loose triggers there may be dozens, which differ in their figures only."""
+    targets = [(f"{k:06d}", "wall", f"the cameras disagree ({10.5 + k} times)") for k in range(5)]
+    assert frames_left_out([*targets, ("000009", "floor", "its boards disagree")]) == [
+        "frames 000000, 000001, 000002 and 2 more, board 'wall' left out: the cameras disagree (10.5 times) (figures "
+        "of the first)",
+        "frame 000009, board 'floor' left out: its boards disagree",
     ]
