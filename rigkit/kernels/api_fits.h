@@ -296,11 +296,12 @@ EXPORT void block_products(
  * move (2) of the centre by a gradient of added light, with its covariance (uu, uv, vv) at noise of variance 1. */
 enum { CIRCLE_OUTCOMES = 36, SPOT = 3, BESIDE = 6 };
 
-/* The constants of detection.circles.fit, under their names there. */
+/* The constants of detection.circles.fit, under their names there. `brief`: residual and variances are those at the last step, and
+ * what is not needed for a further fit stays 0: harmonics, anisotropic blur and added light. */
 typedef struct {
     double near_sigmas, near_px, min_blur, max_blur, max_move_px, max_growth, max_light, converged_px,
         converged_sigmas, near_beside;
-    int64_t iterations, plain_iterations, min_pixels;
+    int64_t iterations, plain_iterations, min_pixels, brief;
 } circle_rules_t;
 
 EXPORT void fit_circles(
@@ -311,14 +312,14 @@ EXPORT void fit_circles(
 
 /* blobs.c */
 
-/* The constants of detection.circles.blobs: the smallest difference from the local mean, in standard deviations, the range of
- * the areas of blobs, and their smallest share of their bounding boxes. The columns of a blob: its centroid, its covariance (uu,
- * uv, vv), area and sign. */
+/* The constants of detection.circles.blobs: the smallest difference from the local mean, in standard deviations, the range of the
+ * areas of blobs and of their ratios to those of the ellipses, and the largest ratio of axes. The columns of a blob: its centroid,
+ * its covariance (uu, uv, vv) and sign. */
 typedef struct {
-    double deviations, min_filling;
+    double deviations, min_filling, max_filling, max_aspect;
     int64_t min_area, max_area;
 } blob_rules_t;
-enum { BLOB_COLUMNS = 7 };
+enum { BLOB_COLUMNS = 6 };
 
 EXPORT int64_t blobs_memory(int64_t width);
 EXPORT int64_t find_blobs(

@@ -69,25 +69,23 @@ INLINE region_t of_run(int64_t first, int64_t last, int64_t v, int64_t sign, int
     return (region_t){sign, n, first, last, v, v, u, n * v, uu, u * v, n * v * v, name};
 }
 
-/* Write a region that is complete, if its area and the filling of its bounding box are those of a blob off the image's border;
- * return whether it is one. */
+/* Write a region that is complete if it is an ellipse off the image's border; return whether it is one. */
 INLINE int written(const region_t *at, int64_t width, int64_t height, const blob_rules_t *rules, double *out)
 {
-    const int64_t wide = at->right - at->left + 1, high = at->bottom - at->top + 1;
-    if (at->left == 0 || at->top == 0 || at->right == width - 1 || at->bottom == height - 1)
+    if (at->left == 0 || at->top == 0 || at->right == width - 1 || at->bottom == height - 1 || at->area < rules->min_area
+        || at->area > rules->max_area)
         return 0;
-    if (at->area < rules->min_area || at->area > rules->max_area
-        || !((double)at->area > rules->min_filling * (double)(wide * high)))
-        return 0;
-    const double per_area = 1.0 / (double)at->area, u = (double)at->u * per_area, v = (double)at->v * per_area;
+    const double area = (double)at->area, u = (double)at->u / area, v = (double)at->v / area;
     /* The variance of a square pixel is 1/12. */
-    out[0] = u;
-    out[1] = v;
-    out[2] = (double)at->uu * per_area - u * u + 1.0 / 12.0;
-    out[3] = (double)at->uv * per_area - u * v;
-    out[4] = (double)at->vv * per_area - v * v + 1.0 / 12.0;
-    out[5] = (double)at->area;
-    out[6] = at->sign == BRIGHTER ? 1.0 : -1.0;
+    const double uu = (double)at->uu / area - u * u + 1.0 / 12.0, vv = (double)at->vv / area - v * v + 1.0 / 12.0;
+    const double uv = (double)at->uv / area - u * v, squared = uu * vv - uv * uv;
+    const double root = sqrt(squared > 1e-12 ? squared : 1e-12), filling = area / (4.0 * PI * root);
+    /* Axes with ratio r have half the trace over the root of the determinant = (r + 1 / r) / 2. */
+    if (!(filling > rules->min_filling && filling < rules->max_filling
+          && (uu + vv) / root < rules->max_aspect + 1.0 / rules->max_aspect))
+        return 0;
+    const double blob[BLOB_COLUMNS] = {u, v, uu, uv, vv, at->sign == BRIGHTER ? 1.0 : -1.0};
+    memcpy(out, blob, sizeof blob);
     return 1;
 }
 

@@ -249,11 +249,8 @@ static circle_t guessed(const double *pixel, const double *map, const double *be
     return at;
 }
 
-/* Write the results of a fitted circle; `N` is the factor of the normal equations. The harmonics of the edge are deviations of its
- * radius, in radii: 0 for a disc, while a square has the fourth. */
-static void write_circle(
-    const circle_t *at, const double *N, double sums[ROWS][ROWS], const double harmonics[8], int64_t seen, int settled,
-    double *result)
+/* Write the results of a fitted circle; `N` is the factor of the normal equations. */
+static void write_circle(const circle_t *at, const double *N, double sums[ROWS][ROWS], int64_t seen, int settled, double *result)
 {
     double cov[2][PARAMETERS] = {{0.0}}, growth[PARAMETERS];
     cov[0][X] = cov[1][Y] = 1.0;
@@ -276,10 +273,33 @@ static void write_circle(
         cholesky_solve(N, PARAMETERS, growth);
         result[15 + i - E1] = growth[i];
     }
+}
+
+/* Write the further results. The harmonics of the edge are deviations of its radius, in radii: 0 for a disc, while a square has the
+ * fourth. */
+static void write_shape(const double *N, double sums[ROWS][ROWS], const double harmonics[8], double *result)
+{
     for (int n = 0; n < 8; n++)
         result[18 + n] = 2.0 * harmonics[n] / (sums[OWN][OWN] > 1e-12 ? sums[OWN][OWN] : 1e-12);
     unevenness(sums, N, result + 26);
     added_light(sums, N, result + 31);
+}
+
+/* Write the results of a fit whose last step had the normal equations of `sums` and their factor `N`: of a brief one those, else what
+ * follows from the circle as it is now. */
+INLINE void finish(
+    const group_t *group, const spots_t *spots, int brief, int settled, double sums[ROWS][ROWS], double N[PARAMETERS * PARAMETERS],
+    double *result)
+{
+    double harmonics[8] = {0.0}, right[PARAMETERS];
+    if (!brief) {
+        sum_products(group, spots, 1, sums, harmonics);
+        equations(sums, N, right);
+        if (!cholesky(N, PARAMETERS))
+            return;
+        write_shape(N, sums, harmonics, result);
+    }
+    write_circle(&group->own, N, sums, spots->count, settled, result);
 }
 
 /* Return circle `n` with initial values, and those of its neighbours (`beside`) whose light reaches its pixels. */
@@ -356,11 +376,7 @@ void fit_circles(
             still = certain || fabs(step[X]) + fabs(step[Y]) < rules->converged_px;
             settled = certain || (still && grown * at->size < rules->converged_px);
         }
-        if (!solved)
-            continue;
-        sum_products(&group, &spots, 1, sums, harmonics);
-        equations(sums, N, right);
-        if (cholesky(N, PARAMETERS))
-            write_circle(at, N, sums, harmonics, spots.count, still, result);
+        if (solved)
+            finish(&group, &spots, (int)rules->brief, still, sums, N, result);
     }
 }

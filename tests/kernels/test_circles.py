@@ -37,6 +37,21 @@ def test_a_picture_of_the_model_gives_its_numbers_back(name: str) -> None:
     assert fit.sigma_px[0] < 0.01
 
 
+def test_a_brief_fit_is_the_same_without_the_shape_of_the_edge(rng: np.random.Generator) -> None:
+    matrix, bend = (np.array(part) for part in CIRCLES["slanted"])
+    image = picture((64, 60), np.array([31.3, 29.8]), matrix, bend, 0.8, 200.0, -170.0, np.zeros(2))
+    noisy = (image + rng.normal(0.0, 2.0, image.shape)).astype(np.float32)
+    args = (np.array([[31.0, 30.0]]), matrix[None], bend[None], np.array([1.0]), np.array([1.6]))
+    whole, brief = fit_circles(noisy, *args), fit_circles(noisy, *args, brief=True)
+    assert whole.valid.all() and brief.valid.all()
+    assert (brief.pixels == whole.pixels).all() and (brief.maps == whole.maps).all()
+    # Those at the last step, which was shorter than a twentieth of a sigma.
+    assert brief.residual == pytest.approx(whole.residual, rel=1e-3)
+    assert brief.covariance == pytest.approx(whole.covariance, rel=0.02, abs=1e-7)
+    assert not brief.harmonics.any() and whole.harmonics.any()
+    assert not brief.uneven.any() and not brief.added_light.any() and whole.added_light.any()
+
+
 @pytest.mark.parametrize("name", CIRCLES)
 def test_a_blur_that_differs_with_the_direction_comes_from_what_fits_leave(name: str) -> None:
     matrix, bend = (np.array(part) for part in CIRCLES[name])

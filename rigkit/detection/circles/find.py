@@ -11,7 +11,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs, reduced
 from rigkit.detection.circles.certainty import centre_sigmas
 from rigkit.detection.circles.evidence import GridEvidence
-from rigkit.detection.circles.fit import PLAIN_RULES, RULES, CircleFit, edge_reach, fit_circles
+from rigkit.detection.circles.fit import ITERATIONS, PLAIN_ITERATIONS, CircleFit, edge_reach, fit_circles
 from rigkit.detection.circles.grid import CircleGrid
 from rigkit.detection.circles.local_map import (
     CORNER,
@@ -25,7 +25,6 @@ from rigkit.detection.circles.local_map import (
 from rigkit.detection.circles.rows import joined, rows_of, with_rows
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS
-from rigkit.kernels.circles import CircleRules
 
 if TYPE_CHECKING:
     from rigkit.detection.circles.lattices import LabelledBlobs
@@ -97,18 +96,20 @@ class _Draft:
 
     def enlarged(self, scale: int) -> _Draft:
         """Return the draft in an image that is `scale` times as large."""
-        larger = {"fit": self.fit.enlarged(scale), "around": self.around.enlarged(scale)}
-        return replace(self, **larger, uneven_px2=scale**2 * self.uneven_px2)
+        fit, around = self.fit.enlarged(scale), self.around.enlarged(scale)
+        return replace(self, fit=fit, around=around, uneven_px2=scale**2 * self.uneven_px2)
 
 
 def grid_of(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool = False) -> CircleGrid | None:
     """Return the grid of the `blobs` of a lattice, or None. Large circles are found in a smaller image."""
     scale = blobs.reduction()
-    draft = _first(reduced(grey, scale), blobs.reduced(scale), found)
+    small, own = reduced(grey, scale), blobs.reduced(scale)
+    draft = _first(small, own, found, brief=not quick)
     if not quick:
         draft, scale = _in_finer_images(grey, draft, scale)
         if not _enough(draft):
-            draft, scale = _mixed(grey, _first(grey, blobs, found, beside=True)), 1
+            draft = _first(small, own, found, beside=True).enlarged(blobs.reduction())
+            draft, scale = _mixed(grey, draft), 1
     if not _enough(draft):
         return None
     evidence = _evidence(draft)
@@ -130,24 +131,26 @@ def _in_finer_images(grey: GreyImage, draft: _Draft, scale: int) -> tuple[_Draft
     """
     for step in (_again, _with_all):
         if _enough(draft):
-            draft = step(reduced(grey, scale), draft)
+            draft = step(reduced(grey, scale), draft, brief=True)
     while _enough(draft):
         last = scale == 1 or bool(np.median(draft.fit.blur_px) > FINE_BLUR_PX)
         finer = scale if last else scale // 2
-        draft, scale = _again(reduced(grey, finer), draft.enlarged(scale // finer)), finer
-        if last or scale == 1:
+        last = last or finer == 1
+        draft = _again(reduced(grey, finer), draft.enlarged(scale // finer), brief=not last)
+        scale = finer
+        if last:
             break
     return draft, scale
 
 
-def _first(grey: GreyImage, own: Blobs, found: LabelledBlobs, *, beside: bool = False) -> _Draft:
-    """Return the circles of blobs; `beside`: fitted with the light of neighbours."""
+def _first(grey: GreyImage, own: Blobs, found: LabelledBlobs, *, beside: bool = False, brief: bool = False) -> _Draft:
+    """Return the circles of blobs; `beside`: fitted with the light of neighbours; `brief`: for a further fit."""
     label, hexagonal = found.label, found.hexagonal
     around = local_maps(label, own.pixels, label, hexagonal=hexagonal, sigma_px=FIRST_SIGMA_PX)
     radius = Radii.of(own.shape, around)
     others, corner = (beside_each(label, hexagonal), CORNER[hexagonal]) if beside else (None, 1.0)
     blur = np.full(len(own), FIRST_EDGE_BLUR)
-    fit = _fitted(grey, own.pixels, around, radius, corner, blur, np.zeros(2), others)
+    fit = _fitted(grey, own.pixels, around, radius, corner, blur, np.zeros(2), others, brief=brief)
     bright = bool(own.sign[0] > 0)
     draft = _Draft(label=label, fit=fit, around=around, radius=radius, hexagonal=hexagonal, bright=bright, mixed=beside)
     return _tested(draft, FIRST_TOLERANCE)
@@ -161,10 +164,10 @@ def _mixed(grey: GreyImage, draft: _Draft) -> _Draft:
     return draft
 
 
-def _with_all(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
-    """Return the draft extended by rings of circles without blobs; `beside`: with the light of neighbours."""
+def _with_all(grey: GreyImage, draft: _Draft, *, beside: bool = False, brief: bool = False) -> _Draft:
+    """Return the draft extended by rings of circles without blobs; `beside`, `brief`: as in `_first`."""
     for _ in range(MAX_NEW_RINGS):
-        grown = _larger(grey, draft, beside=beside) if _enough(draft) else None
+        grown = _larger(grey, draft, beside=beside, brief=brief) if _enough(draft) else None
         if grown is None:
             break
         draft = grown
@@ -190,13 +193,16 @@ def _fitted(
     uneven_px2: FloatArray,
     beside: IntArray | None = None,
     only: BoolArray | None = None,
-    rules: CircleRules = RULES,
+    *,
+    iterations: int = ITERATIONS,
+    brief: bool = False,
 ) -> CircleFit:
     """Return the fitted circles; those that are not among `only` are only used as neighbours of the others."""
     maps = radius.seen * around.first
     reach = edge_reach(maps, 0.5 / radius.seen, blur_px, around.surrounded, corner)
     reach = reach if only is None else np.where(only, reach, 0.0)
-    return fit_circles(grey, pixels, maps, radius.printed**2 * around.second, blur_px, reach, beside, uneven_px2, rules)
+    at = (pixels, maps, radius.printed**2 * around.second, blur_px, reach, beside, uneven_px2)
+    return fit_circles(grey, *at, iterations=iterations, brief=brief)
 
 
 def like_contrast(fit: CircleFit, contrast: float, share: float) -> BoolArray:
@@ -248,15 +254,16 @@ def _spacing(around: PlaneMap) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(np.abs(np.linalg.det(around.first)), 1e-9)))
 
 
-def _again(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
-    """Return the draft fitted with maps through its current circles; `beside`: with the light of neighbours."""
+def _again(grey: GreyImage, draft: _Draft, *, beside: bool = False, brief: bool = False) -> _Draft:
+    """Return the draft fitted with maps through its current circles; `beside`, `brief`: as in `_first`."""
     fit = draft.fit
     around = local_maps(draft.label, fit.pixels, draft.label, hexagonal=draft.hexagonal, sigma_px=_sigma(fit))
     size_px = (grey.shape[1], grey.shape[0])
     around = with_smooth_curvatures(around, draft.label, fit.pixels, size_px, hexagonal=draft.hexagonal)
     radius = Radii.of(fit.maps, around, moved=bool(draft.uneven_px2.any()))
     others = beside_each(draft.label, draft.hexagonal) if beside else None
-    fresh = _fitted(grey, fit.pixels, around, radius, draft.corner, fit.blur_px, draft.uneven_px2, others)
+    at = (grey, fit.pixels, around, radius, draft.corner, fit.blur_px, draft.uneven_px2, others)
+    fresh = _fitted(*at, brief=brief)
     return _tested(replace(draft, fit=fresh, around=around, radius=radius))
 
 
@@ -297,13 +304,13 @@ def _through_its_blur(grey: GreyImage, draft: _Draft) -> _Draft:
     return draft
 
 
-def _larger(grey: GreyImage, draft: _Draft, *, beside: bool) -> _Draft | None:
+def _larger(grey: GreyImage, draft: _Draft, *, beside: bool, brief: bool) -> _Draft | None:
     """Return the draft with circles found beside its own, or None if there are none."""
     fit = draft.fit
     places, around = _beside(draft, (grey.shape[1], grey.shape[0]))
     if not len(places):
         return None
-    tried = _tried(grey, draft, places, around, beside=beside)
+    tried = _tried(grey, draft, places, around, beside=beside, brief=brief)
     near = np.linalg.norm(tried.pixels - around.pixels, axis=1) < OFF_PLACE * _spacing(around)
     if not near.any():
         return None
@@ -317,7 +324,9 @@ def _larger(grey: GreyImage, draft: _Draft, *, beside: bool) -> _Draft | None:
     return judged if len(judged.label) > len(draft.label) else None
 
 
-def _tried(grey: GreyImage, draft: _Draft, places: IntArray, around: PlaneMap, *, beside: bool) -> CircleFit:
+def _tried(
+    grey: GreyImage, draft: _Draft, places: IntArray, around: PlaneMap, *, beside: bool, brief: bool
+) -> CircleFit:
     """Return the circles fitted at places beside those of the draft."""
     typical, known = draft.fit, len(draft.label) if beside else 0
     pixels, blur, every, others = around.pixels, np.full(len(places), float(np.median(typical.blur_px))), around, None
@@ -327,13 +336,13 @@ def _tried(grey: GreyImage, draft: _Draft, places: IntArray, around: PlaneMap, *
         every = joined(draft.around, around)
     at = (grey, pixels, every, draft.radius, draft.corner, blur, draft.uneven_px2, others)
     only = np.arange(len(pixels)) >= known
-    fit = _fitted(*at, only, PLAIN_RULES)
+    fit = _fitted(*at, only, iterations=PLAIN_ITERATIONS, brief=brief)
     # Where there is no circle, a fit would use all its steps.
     near = np.linalg.norm(fit.pixels - pixels, axis=1) < UNSETTLED * OFF_PLACE * _spacing(every)
     parts = [np.abs(fit.contrast) / np.median(np.abs(typical.contrast)), fit.share / np.median(typical.share)]
     unsettled = only & ~fit.valid & near & (np.maximum(*parts) > MIN_CIRCLE_CONTRAST / UNSETTLED)
     if unsettled.any():
-        fit = with_rows(fit, unsettled, _fitted(*at, unsettled))
+        fit = with_rows(fit, unsettled, _fitted(*at, unsettled, brief=brief))
     return rows_of(fit, only)
 
 

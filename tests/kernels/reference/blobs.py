@@ -6,18 +6,24 @@ import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.detection.circles.blobs import BLOB_AREAS, DEVIATIONS, MAX_ASPECT
+from rigkit.detection.circles.blobs import BLOB_AREAS, DEVIATIONS, FILLING, MAX_ASPECT
 from rigkit.detection.saddles.response import FloatImage
 
 
 def find_blobs(off: FloatImage, variance: FloatImage) -> FloatArray:
-    """Return the blobs (N, 7) of an image minus its local mean: centroid, covariance (uu, uv, vv), area and sign."""
+    """Return the blobs (N, 6) of an image minus its local mean: centroid, covariance (uu, uv, vv) and sign."""
     limit = np.float32(DEVIATIONS) * np.sqrt(np.maximum(variance, np.float32(0.0)))
     parts = []
     for sign, mask in ((1.0, off > limit), (-1.0, off < -limit)):
         pixels, covariance, area = moments(mask)
-        flat = covariance.reshape(-1, 4)[:, [0, 1, 3]]
-        parts.append(np.column_stack([pixels, flat, area, np.full(len(area), sign)]))
+        root = np.sqrt(np.maximum(np.linalg.det(covariance), 1e-12))
+        filling = area / (4.0 * np.pi * root)
+        half_trace = 0.5 * np.trace(covariance, axis1=1, axis2=2)
+        # Axes with ratio r have half_trace / root = (r + 1 / r) / 2.
+        round_enough = half_trace / root < 0.5 * (MAX_ASPECT + 1.0 / MAX_ASPECT)
+        good = (filling > FILLING[0]) & (filling < FILLING[1]) & round_enough
+        flat = covariance[good].reshape(-1, 4)[:, [0, 1, 3]]
+        parts.append(np.column_stack([pixels[good], flat, np.full(int(good.sum()), sign)]))
     return np.concatenate(parts)
 
 
@@ -29,8 +35,6 @@ def moments(mask: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     height, width = mask.shape
     inside = (left > 0) & (top > 0) & (left + wide < width) & (top + high < height)
     inside &= (area >= BLOB_AREAS[0]) & (area <= BLOB_AREAS[1])
-    # Bounding boxes of thin, long or ragged regions are far larger than these.
-    inside &= area > wide * high * (0.25 * np.pi / MAX_ASPECT)
     inside[0] = False
     wanted = np.flatnonzero(inside)
     number = np.full(count, -1)
