@@ -193,8 +193,8 @@ def _less_noise(calibration: Calibration, root: FloatArray, variance: float, sha
     Other causes' part of the covariance (rival models) stays as it is; no variance becomes less than its `share`.
     """
     whole, p = calibration.near_covariance, len(root)
-    if calibration.pupil is None:
-        # That of the parameters may have been replaced alone.
+    if calibration.pupil is None and not np.array_equal(whole[:p, :p], calibration.covariance):
+        # That of the parameters was replaced alone.
         whole = with_block(whole, calibration.covariance, 1.0)
     if share == 1.0 or not root.size:
         return whole
