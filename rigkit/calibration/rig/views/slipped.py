@@ -22,7 +22,7 @@ MIN_FRAMES_OF_PART = 4
 MAX_LEFT_OF_SQUARES = 0.2
 """Sum of squared distances between views with two mounts, over that with one, up to which a camera slipped. The best of
 all splits of 8 to 20 frames whose boards moved between the exposures leaves 0.73 and more (60 SIMULATED rigs), a camera
-that is turned by half a degree half way 0.05 (REAL, bumblebee2)."""
+that is turned by half a degree half way 0.05 and 0.10 (REAL, bumblebee2 and bouguet)."""
 MAX_SPLITS = 40
 """Number of splits tried, spread over the frames."""
 
