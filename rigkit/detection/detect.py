@@ -39,7 +39,8 @@ def detect_boards(
         its borders determine it, else it remains a grid of its own. A board is identified by its markers, or if it is
         the only listed board of its size and only one detection fits it, of several the only whole one. A grid of
         circles is identified unless it may be the visible part of a larger board that the image border cuts off.
-    min_corners : smallest number of corners of a reported board, except whole ones of `boards`.
+    min_corners : smallest number of corners of a reported board, except whole ones of `boards`, and halves of ChArUco
+        boards.
     camera : the calibrated camera, if known. It joins the parts of a partly covered board (`guided.rejoin`), predicts
         missed corners of known boards, and determines windows and line curvatures for their fit (`guided.guided`).
     quick : an accuracy of about a tenth of a pixel is enough: circles take half the time.
@@ -65,7 +66,7 @@ def detect_boards(
             found += finder.find(search, own)
     sizes = [board.size for board in search.boards]
     if search.min_corners_seen < min_corners:
-        found = [item for item in found if len(item.grid) >= min_corners or _whole(item, sizes)]
+        found = [item for item in found if item.board_id or len(item.grid) >= min_corners or _whole(item, sizes)]
     ordered = sorted(found, key=_rank) if len(found) > 1 else found
     # The finder of circles has identified its grids already.
     plain = [board for board in search.boards if board.pattern.type == Chessboard.type]

@@ -119,7 +119,7 @@ def find_lattices(
         if coarser is None:
             break
         found = max(found, search(coarser, corner_count(found)), key=corner_count)
-    if min_corners < MIN_BOARD_CORNERS:
+    if min_corners < MIN_BOARD_CORNERS and has_markers is None:
         return found
     return [
         item

@@ -141,11 +141,9 @@ def each_level(grey: GreyImage) -> Iterator[Level]:
 
 def enlarged_level(grey: GreyImage) -> Level:
     """Return a level of twice the resolution of an image."""
-    smooth, _, thresholds = front.level(
-        cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC),
-        _level_rules(),
-        max(1, int(np.sqrt(4 * grey.size / TYPICAL))),
-    )
+    twice = np.zeros((2 * grey.shape[0], 2 * grey.shape[1]), grey.dtype)
+    cv2.resize(grey, twice.shape[::-1], dst=twice, interpolation=cv2.INTER_CUBIC)
+    smooth, _, thresholds = front.level(twice, _level_rules(), max(1, int(np.sqrt(twice.size / TYPICAL))))
     return Level(smooth, thresholds, 0.5, -0.25)
 
 

@@ -25,6 +25,9 @@ from rigkit.detection.tags.in_squares import has_markers_of
 SMALL_SQUARE_PX = 24.0
 """Largest squares, px, whose markers leave white lines narrower than the ring of the finest level (radius 2.6 px)."""
 
+MIN_MARKED = 4
+"""Smallest number of corners of a ChArUco board, which determine its pose."""
+
 
 class Search:
     """An image with the results that several finders use.
@@ -80,8 +83,12 @@ class Search:
         self._lattices = list(lattices)
 
     def min_corners_of(self, board: Board) -> int:
-        """Return the smallest number of points of a reported detection of `board`, which may be small."""
-        return min(self.min_corners, board.corner_count)
+        """Return the smallest number of points of a reported detection of `board`, which may be small.
+
+        Half of a ChArUco board is enough, as markers name its corners.
+        """
+        least = max(board.corner_count // 2, MIN_MARKED) if board.pattern.type == Charuco.type else board.corner_count
+        return min(self.min_corners, least)
 
     @property
     def min_corners_seen(self) -> int:
@@ -90,7 +97,7 @@ class Search:
         whole = (max(columns * rows, MIN_BOARD_CORNERS) for columns, rows in self.chessboard_sizes)
         marked = [board for board in self.boards if board.pattern.type == Charuco.type]
         strips = (min(board.corner_count, MIN_BOARD_CORNERS - 1) for board in marked if min(board.size) < MIN_ROWS)
-        return min([self.min_corners, *whole, *(board.corner_count for board in marked), *strips])
+        return min([self.min_corners, *whole, *map(self.min_corners_of, marked), *strips])
 
     def _found_lattices(self) -> list[RefinedLattice]:
         plain = all(board.pattern.type == Chessboard.type for board in self.boards)

@@ -366,3 +366,21 @@ def test_small_squares_and_few_rows_are_enough(size: tuple[int, int], square_px:
         (found,) = detect_boards(image, [board])
         assert (found.board_id, found.complete) == ("c", True)
         assert np.abs(errors_by_place(found, scene.truth()[0])).max() < 0.25
+
+
+def test_half_of_a_small_board_is_enough() -> None:
+    """Its markers name the corners: twelve of them are not needed."""
+    board = Board("c", 3, 4, 30.0, 30.0, pattern=Charuco("DICT_4X4_50", 22.5))
+    scene = one_board(np.random.default_rng(1), board=board, max_tilt_deg=20.0, square_px=40.0)
+    image = scene.render(optics=Optics(0.7), noise_levels=2.0, rng=np.random.default_rng(1))
+    truth = scene.truth()[0]
+    # A hand over the last row of corners and half of the squares before it.
+    last, before = truth.lattice()[-1], truth.lattice()[-2]
+    edge = 0.5 * (last + before)
+    beyond = edge + 3.0 * (last - before)
+    outline = np.concatenate([edge[:1] * 2.0 - edge[1:2], edge, edge[-1:] * 2.0 - edge[-2:-1], beyond[::-1]])
+    (found,) = detect_boards(
+        cv2.fillPoly(np.ascontiguousarray(image), [np.rint(outline).astype(np.int32)], 130.0), [board]
+    )
+    assert found.board_id == "c" and 6 <= len(found.grid) <= 9
+    assert np.abs(errors_by_place(found, truth)).max() < 0.25
