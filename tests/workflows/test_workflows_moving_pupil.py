@@ -157,12 +157,13 @@ def test_fresh_boards_are_checked_with_the_pupil(saved: Path) -> None:
     assert check_views(monitored, seen).rms_px < 0.06
     near = monitored.cameras[0]
     assert isinstance(near, NearCamera)
-    # As a central camera; and the lens and the pupil as sure together as they were solved for.
+    # As a central camera; and the lens and the pupil as sure together as they were solved for, but for the noise that
+    # departures of the lens explain.
     central = replace(monitored, cameras=(near.with_parameters([*near.lens.parameters, 0.0, 0.0]),))
     assert check_views(central, seen).rms_px > 0.2
     own, known = slice(near.lens.parameters.size, None), load_calibration(saved)
     assert known.pupil is not None
-    assert (np.diag(monitored.covariance[own, own]) >= 0.999 * np.diag(known.pupil.covariance)).all()
+    assert (np.diag(monitored.covariance[own, own]) >= 0.98 * np.diag(known.pupil.covariance)).all()
     # What the lens may do beyond its model adds to both.
     np.testing.assert_allclose(monitored.covariance[:2, own], known.pupil.with_frame[:2], rtol=0.1)
 
