@@ -12,7 +12,7 @@ from helpers.calibration_scenes import BOARD
 from helpers.rig_scenes import MODELS, NOISE_PX, SIGMAS, mounts, rig_views, sizes
 
 from rigkit.calibration.certainty.covariance import GlobalCovariance
-from rigkit.calibration.rig.calibrate import _mispaired, calibrate_rig
+from rigkit.calibration.rig.calibrate import _mistakes, calibrate_rig
 from rigkit.calibration.rig.certainty.uncertainty import transfer_covariance, transfer_uncertainty
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.exposure_times import ExposureTimes
@@ -363,8 +363,8 @@ def test_a_mixup_of_all_frames_is_looked_for_where_most_of_them_disagree(monkeyp
     cause = Finding.bad("the images of 'right' are mirrored", "use the image files as the camera wrote them")
     monkeypatch.setattr("rigkit.calibration.rig.calibrate.mixup_of_all_frames", lambda views: cause)
     rig, views = cast(RigCalibration, SimpleNamespace(cameras=(), left_out=())), RigViews([], [], (), {})
-    assert _mispaired(rig, views, 1e3) == [cause]
-    assert _mispaired(rig, views, 1.0) == []
+    assert _mistakes(rig, views, 1e3) == [cause]
+    assert _mistakes(rig, views, 1.0) == []
 
 
 @pytest.mark.parametrize("converged", [False, True])
