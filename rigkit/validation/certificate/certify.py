@@ -15,11 +15,11 @@ It is 1.96 s without a mean error, and |b| + 1.64 s where that is large (GUM, F.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import stdtr, stdtrit
+from scipy.special import ndtr, ndtri, stdtr, stdtrit
 
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
@@ -78,8 +78,11 @@ def certify(instrument: Monitored, task: Task, *, cells: tuple[int, int] = MAP_C
             f"{' and '.join(instrument.names)}; give a shorter length or another distance"
         )
     variance = variances(instrument, task, points, by_corner, by_calibration, by_pixel)
-    # Of several orientations the worst counts.
-    worst = np.argmax(sum(variance.values()), axis=1)
+    square = systematic(instrument, by_calibration)
+    # Of several orientations the worst counts: an error of known size needs less than its share of the variance.
+    whole = np.sqrt(np.maximum(sum(variance.values()) - square, TINY))
+    upper = float(ndtri(0.5 + 0.5 * task.confidence))
+    worst = np.argmax(whole * _reached(np.sqrt(square) / whole, upper, task.confidence, ndtr), axis=1)
     chosen = np.arange(len(worst))
     # Radians become degrees only here.
     factor = np.rad2deg(1.0) if task.quantity is Quantity.ANGLE else 1.0
@@ -87,9 +90,9 @@ def certify(instrument: Monitored, task: Task, *, cells: tuple[int, int] = MAP_C
         cause: np.where(seen, factor * np.sqrt(value[chosen, worst]), np.nan).reshape(shape)
         for cause, value in variance.items()
     }
-    expected = systematic(instrument, by_calibration)[chosen, worst].reshape(shape)
-    bound, quantile = _bound(sigma, factor * np.sqrt(expected), instrument.freedom, task.confidence)
-    whole = factor * (1.0 if task.quantity is Quantity.ANGLE else task.size_mm)
+    expected = factor * np.sqrt(square[chosen, worst]).reshape(shape)
+    bound, quantile = _bound(sigma, expected, instrument.freedom, task.confidence)
+    full_size = factor * (1.0 if task.quantity is Quantity.ANGLE else task.size_mm)
     # Largest displacement of any of the points by an error of one pixel, mm.
     farthest = np.linalg.norm(by_pixel, ord=2, axis=(-2, -1)).max(axis=1)
     uncertain = quantile * instrument.sigma_px * farthest.reshape(shape) > MAX_SHARE * task.size_mm
@@ -101,7 +104,7 @@ def certify(instrument: Monitored, task: Task, *, cells: tuple[int, int] = MAP_C
         in_view=in_view,
         bound=bound,
         sigma=sigma,
-        coarse=in_view & (uncertain | (bound > MAX_SHARE * whole)),
+        coarse=in_view & (uncertain | (bound > MAX_SHARE * full_size)),
     )
     return replace(certificate, findings=tuple(_findings(certificate)))
 
@@ -119,13 +122,22 @@ def _bound(
     if np.isfinite(freedom):
         known = np.minimum(freedom * (whole / calibration) ** 2, AS_NORMAL)
     quantile = stdtrit(known, 0.5 + 0.5 * confidence)
-    shift, spread = expected / np.sqrt(whole), np.sqrt(whole)
+    spread = np.sqrt(whole)
+    reached = _reached(expected / spread, quantile, confidence, lambda x: np.asarray(stdtr(known, x)))
+    return spread * reached, quantile
+
+
+def _reached(
+    shift: FloatArray, quantile: FloatArray | float, confidence: float, below: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """Return U with P(|shift + t| <= U) = confidence, for t with the distribution function `below`, whose `quantile` is
+    U without a shift."""
     low, high = np.zeros_like(shift), shift + quantile
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        enough = stdtr(known, middle - shift) - stdtr(known, -middle - shift) >= confidence
+        enough = below(middle - shift) - below(-middle - shift) >= confidence
         low, high = np.where(enough, low, middle), np.where(enough, middle, high)
-    return spread * high, quantile
+    return high
 
 
 def _findings(certificate: Certificate) -> list[Finding]:

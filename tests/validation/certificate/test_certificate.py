@@ -253,6 +253,23 @@ def test_an_error_that_is_expected_does_not_vary(times: float, rng: np.random.Ge
     assert wider > (0.985 if times > 1.0 else 0.95)
 
 
+def test_the_worst_orientation_is_that_of_the_largest_bound() -> None:
+    """Upright lengths vary by one unit, level ones are off by a known 1.1: twice the first is the larger bound."""
+    camera = camera_model("pinhole")(SIZE_PX, np.array([800.0, 800.0, *(0.5 * (np.array(SIZE_PX) - 1.0))]))
+    known, varies = np.diag([1.1, 0.0, 0.0, 0.0]) ** 2, np.diag([0.0, 1.0, 0.0, 0.0])
+    one = Monitored(
+        names=("one",),
+        cameras=(camera,),
+        cam_from_rig=(Rigid3.identity(),),
+        covariance=known + varies,
+        expected=known,
+        sigma_px=1e-6,
+    )
+    task = Task(quantity=Quantity.LENGTH, size_mm=50.0, distance_mm=1500.0)
+    upright, both = (certify(own, task, cells=(3, 3)) for own in (replace(one, covariance=varies, expected=None), one))
+    assert both.bound[1, 1] == pytest.approx(upright.bound[1, 1], rel=1e-6)
+
+
 def test_what_is_not_counted_in_is_said(rng: np.random.Generator) -> None:
     rig = rig_of("brown", rig_covariance(lens("brown"), rng), scale_sigma=0.0)
     certificate = certify(rig, Task(quantity=Quantity.DEPTH, size_mm=100.0, distance_mm=900.0), cells=(5, 4))
