@@ -178,7 +178,8 @@ def crosscheck(
         skipped.append(f"{TWO_VIEW}: its own bundle adjustment changes it by more than its uncertainty")
     if other_chain is not None:
         methods.append(compare_chains(reconstruction, other_chain, OTHER_CHAIN))
-    measured, pnp_sigmas = measure(reconstruction), dict[str, float]()
+    measured = measure(reconstruction)
+    pnp_sigmas: dict[str, float] = {}
     if shifts is not None and any(method.name == PNP for method in methods):
         pnp_sigmas = _difference_sigmas(measured, shifts, shapes)
     checks = [check for method in methods for check in _checks(reconstruction, measured, method, coverage, pnp_sigmas)]

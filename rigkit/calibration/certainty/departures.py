@@ -100,11 +100,11 @@ class Departures:
         p = len(sigmas)
         root = root_of_inverse(images[:, :p, :p].sum(axis=0))
         scores = images[:, :p, p:] - images[:, :p, :p] @ changes
-        varies = _Varies(left / max(freedom - p, 1), products_between(root, images[:, :p, :p], scores) / p)
-        before, share = varies.without(np.zeros((DISPLACEMENTS,) * 2), np.zeros(DISPLACEMENTS)), np.ones(2)
+        mean_products = _MeanProducts(left / max(freedom - p, 1), products_between(root, images[:, :p, :p], scores) / p)
+        before, share = mean_products.without(np.zeros((DISPLACEMENTS,) * 2), np.zeros(DISPLACEMENTS)), np.ones(2)
         second, mean = _averaged(left / before[1])
         for _ in range(NOISE_ROUNDS):
-            last, share = share, np.minimum(varies.without(second, mean) / before, 1.0)
+            last, share = share, np.minimum(mean_products.without(second, mean) / before, 1.0)
             second, mean = _averaged(left / (share[1] * before[1]))
             if abs(share[1] - last[1]) <= SETTLED * last[1]:
                 break
@@ -158,7 +158,7 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Varies:
+class _MeanProducts:
     """Mean products (J + 1, J + 1) of displacements and residuals, without what the parameters absorb: of corners, and
     of the images' scores with unit information."""
 

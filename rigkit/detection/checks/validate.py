@@ -158,7 +158,7 @@ def has_edge_offset(lattice: Lattice, level: Level) -> bool:
     start, middle, end = _edge_offsets(lattice, level, WIDE_STRIPE, OFFSET_PARTS)
     if -MAX_DARK < shift < MAX_BRIGHT:
         # Edges of discs that touch are hardly off in the narrow stripe. Markers are on the bright side of edges.
-        return -WIDE_STRIPE < middle < 0.0 and middle - 0.5 * (start + end) < -MAX_BOW
+        return bool(-WIDE_STRIPE < middle < 0.0 and middle - 0.5 * (start + end) < -MAX_BOW)
     return not abs(middle) < MAX_SHIFT or _bowed(start, middle, end)
 
 

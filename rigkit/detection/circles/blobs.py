@@ -119,8 +119,8 @@ def _of_level(level: FloatImage, scale: float) -> Blobs:
         min_filling=FILLING[0],
         max_filling=FILLING[1],
         max_aspect=MAX_ASPECT,
-        min_area=int(BLOB_AREAS[0]),
-        max_area=int(BLOB_AREAS[1]),
+        min_area=BLOB_AREAS[0],
+        max_area=BLOB_AREAS[1],
     )
     rows = kernel.find_blobs(off, np.asarray(cv2.blur(off * off, window), np.float32), rules)
     shape = _root(4.0 * rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2))

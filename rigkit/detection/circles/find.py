@@ -174,13 +174,13 @@ def _with_all(grey: GreyImage, draft: _Draft, *, beside: bool = False, brief: bo
     return draft
 
 
-def enough(label: IntArray) -> bool:
+def is_large_enough(label: IntArray) -> bool:
     """Return whether there are MIN_CIRCLES, in at least MIN_SIDE rows and columns."""
     return len(label) >= MIN_CIRCLES and bool((np.ptp(label, axis=0) >= MIN_SIDE - 1).all())
 
 
 def _enough(draft: _Draft) -> bool:
-    return enough(draft.label)
+    return is_large_enough(draft.label)
 
 
 def _fitted(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rigkit.detection.circles.blobs import DUPLICATE, Blobs, find_blobs
-from rigkit.detection.circles.find import MIN_CIRCLES, enough, grid_of
+from rigkit.detection.circles.find import MIN_CIRCLES, grid_of, is_large_enough
 from rigkit.detection.circles.grid import CircleGrid
 from rigkit.detection.saddles.response import GreyImage
 
@@ -56,7 +56,7 @@ class CircleSearch:
         if coarse not in self._lattices:
             blobs = find_blobs(self.grey, coarse=coarse, known=None if coarse else self._blobs.get(True))
             self._blobs[coarse] = blobs
-            self._lattices[coarse] = [found for found in blob_lattices(blobs) if enough(found.label)]
+            self._lattices[coarse] = [found for found in blob_lattices(blobs) if is_large_enough(found.label)]
         return self._lattices[coarse]
 
 

@@ -141,7 +141,7 @@ def each_level(grey: GreyImage) -> Iterator[Level]:
 
 def enlarged_level(grey: GreyImage) -> Level:
     """Return a level of twice the resolution of an image."""
-    twice = np.zeros((2 * grey.shape[0], 2 * grey.shape[1]), grey.dtype)
+    twice: GreyImage = np.zeros((2 * grey.shape[0], 2 * grey.shape[1]), grey.dtype)
     cv2.resize(grey, twice.shape[::-1], dst=twice, interpolation=cv2.INTER_CUBIC)
     smooth, _, thresholds = front.level(twice, _level_rules(), max(1, int(np.sqrt(twice.size / TYPICAL))))
     return Level(smooth, thresholds, 0.5, -0.25)

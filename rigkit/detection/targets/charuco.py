@@ -27,7 +27,7 @@ from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.lattices import MIN_BOARD_CORNERS
-from rigkit.detection.saddles.response import GreyImage, Level, pyramid
+from rigkit.detection.saddles.response import GreyImage, Level, each_level
 from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_model import NEAR_PX, TAIL_SIGMAS
@@ -44,7 +44,6 @@ from rigkit.kernels.surface import maps_of_quads
 
 SAME_CELLS = 0.2
 """Largest distance of a marker's corner from the same corner of a lattice, in sides of a cell."""
-
 MASKING_ROUNDS, MAX_MASKING_ROUNDS, SETTLED, MAX_FURTHER = 2, 8, 0.15, 1.5
 """Rounds of removing markers and fitting corners: the second starts from corners that their ink does not affect; more
 follow until corners would move by less than this part of their sigmas. Out of focus each leaves 0.7 of the errors
@@ -67,7 +66,8 @@ class CharucoFinder(Finder):
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
         lattices = search.lattices
         found, rest = _charuco_boards(search, lattices, boards)
-        search.leave([item for item in rest if _may_be_chessboard(item.lattice, pyramid(search.grey)[0])])
+        finest = next(each_level(search.grey)) if rest else None
+        search.leave([item for item in rest if finest and _may_be_chessboard(item.lattice, finest)])
         every = [completed(item.picture, _detection(item), [item.shown], search.camera) for item in found]
         if search.quick:
             return every

@@ -29,7 +29,7 @@ def instrument_of(known: Monitored, pair: tuple[str, str] | None = None) -> Moni
         )
     chosen = [known.names.index(name) for name in names]
     cameras = tuple(known.cameras[k] for k in chosen)
-    both = (known.covariance, known.means)
+    both = (known.covariance, known.mean_products)
     if len(chosen) == 1:
         own, poses = known.layout.cameras[0], (Rigid3.identity(),)
         covariance, expected = (part[own, own] for part in both)

@@ -75,7 +75,7 @@ class Monitored:
     warped: tuple[str, ...] = ()
 
     @property
-    def means(self) -> FloatArray:
+    def mean_products(self) -> FloatArray:
         """`expected`, zeros for None."""
         return np.zeros_like(self.covariance) if self.expected is None else self.expected
 

@@ -59,7 +59,7 @@ def _with_warps(camera: Monitored, known: Knowledge) -> Monitored:
     follows = np.zeros((len(rest), len(camera.covariance)))
     follows[:, :p] = -rest @ known.information[p:, :p]
     through = np.concatenate([np.eye(len(camera.covariance)), follows])
-    covariance, expected = (through @ part @ through.T for part in (camera.covariance, camera.means))
+    covariance, expected = (through @ part @ through.T for part in (camera.covariance, camera.mean_products))
     covariance[-len(rest) :, -len(rest) :] += rest
     return replace(camera, covariance=covariance, expected=expected, warped=known.warped)
 
@@ -106,7 +106,7 @@ def _with_moving_pupils(central: Monitored, pupils: Mapping[str, SolvedPupil]) -
             cameras[k] = NearCamera.of(cameras[k], pupils[name].terms)
     order.append(np.arange(layout.cameras[-1].stop, layout.count))
     through, at = np.concatenate(follows), np.concatenate(order)
-    covariance, expected = (through @ part @ through.T for part in (central.covariance, central.means))
+    covariance, expected = (through @ part @ through.T for part in (central.covariance, central.mean_products))
     covariance += _blocks(rest)
     return replace(
         central,

@@ -41,7 +41,7 @@ from rigkit.workflows.outputs.calibration_paths import boards_path, calibration_
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_rig_files
 from rigkit.workflows.outputs.provenance import provenance_of
 
-MOST_CORNERS = 0.8
+MIN_SHARE_SHOWN = 0.8
 """Share of a board's corners that some image of a session nearly always shows. With the first mark numbered wrongly,
 each image lacks those whose marks are not on the declared board; then the board is identified once more. Not measured:
 a smaller share only identifies less often."""
@@ -172,7 +172,7 @@ def _mostly_hidden(boards: Iterable[Board], views: Sequence[BoardView]) -> bool:
         name = view.board.board_id
         most[name] = max(most.get(name, 0), len(view.grid))
     marked = [board for board in boards if board.identified and board.board_id in most]
-    return any(most[board.board_id] < MOST_CORNERS * board.corner_count for board in marked)
+    return any(most[board.board_id] < MIN_SHARE_SHOWN * board.corner_count for board in marked)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -40,6 +40,6 @@ def test_departures_of_two_lenses_are_no_noise_of_frames(tmp_path: Path) -> None
     for name in ("covariance", "expected"):
         assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-9, abs=1e-30)
     # What is expected is a part of the covariance.
-    assert 0.0 < np.trace(one.means) < np.trace(one.covariance)
+    assert 0.0 < np.trace(one.mean_products) < np.trace(one.covariance)
     scale = 1.0 / np.sqrt(np.diag(one.covariance))
-    assert np.linalg.eigvalsh((one.covariance - one.means) * scale[:, None] * scale)[0] > -1e-9
+    assert np.linalg.eigvalsh((one.covariance - one.mean_products) * scale[:, None] * scale)[0] > -1e-9
