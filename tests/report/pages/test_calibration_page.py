@@ -12,6 +12,7 @@ from helpers.browser import MIN_FONT_PX, probed, probed_at_widths
 from helpers.calibration_scenes import BOARD, lens, random_views, with_outliers
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.certainty.departures import Departures
 from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration, Candidate
@@ -257,7 +258,7 @@ def test_uncertainties_near_and_far_are_widened_where_few_images_tell_them(
     pixels = np.array([[100.0, 80.0], [300.0, 200.0]])
     known = [replace(calibration, freedom=freedom) for freedom in (2.0, 5.0, 500.0)]
     a, b, many = (projection_uncertainty(c, pixels, range_mm=range_mm).covariance for c in known)
-    of_a, of_b, of_many = (c.widening**2 for c in known)
+    of_a, of_b, of_many = (Departures.of(c).noise.widening ** 2 for c in known)
     assert of_a > of_b > of_many
     by_a, by_b = (a - many) / (of_a - of_many), (b - many) / (of_b - of_many)
     np.testing.assert_allclose(by_a, by_b, rtol=1e-6)
