@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import add_options, options_of, print_json
+from rigkit.cli.console import add_options, note_written, options_of, print_json
 from rigkit.core.errors import ExitCode
 from rigkit.workflows.options.cameras import DiffOptions
 
@@ -35,4 +35,5 @@ def run(args: argparse.Namespace) -> int:
         print_json(figures_of(done) | {"page": facts_of(done).to_dict()})
     else:
         print("\n".join(words_of(done)))
+    note_written(path for path in (args.output, args.report) if path is not None)
     return ExitCode.CHECK_FAILED if done.same is False else ExitCode.WELL

@@ -106,7 +106,8 @@ def test_diff_has_a_verdict_on_rigs_and_their_cameras(
     (folder / "again.json").write_text(json.dumps(saved))
     page = folder / "diff.html"
     assert main(["diff", str(folder / "rig.json"), str(folder / "again.json"), "-r", str(page)]) == 1
-    printed = capsys.readouterr().out
+    printed, noted = capsys.readouterr()
+    assert f"{page} written" in noted
     text = page.read_text()
     # Of each camera a drawing for light pages and one for dark ones.
     assert "NOT the same rig" in text and text.count("data:image/png") == 2 * len(NAMES)

@@ -204,8 +204,9 @@ def pair_pictures(
     return files
 
 
-def difference_png(difference: CameraDifference) -> bytes:
-    """Draw the difference of two cameras over the image, with length as colour and arrows."""
+def difference_png(difference: CameraDifference, name: str = "") -> bytes:
+    """Draw the difference of two cameras over the image, with length as colour and arrows, titled by the `name` of the
+    camera in its rig."""
     u, v = difference.pixels[..., 0], difference.pixels[..., 1]
     figure = new_figure(8, float(np.clip(8 * MAP_PROPORTION * np.ptp(v) / np.ptp(u), 2.5, 12.0)), dpi=DPI)
     axis: Any = figure.subplots()
@@ -223,7 +224,8 @@ def difference_png(difference: CameraDifference) -> bytes:
     axis.set_aspect("equal")
     axis.invert_yaxis()
     figure.colorbar(mesh, ax=axis, label="px")
-    axis.set_title(f"difference {difference.rms_px:.4f} px rms, {difference.max_px:.4f} px at most{words}", fontsize=9)
+    words = f"difference {difference.rms_px:.4f} px rms, {difference.max_px:.4f} px at most{words}"
+    axis.set_title(f"{name}: {words}" if name else words, fontsize=9)
     return as_png(figure)
 
 

@@ -63,7 +63,7 @@ def facts_of(pair: Pair) -> PageFacts:
 def write_diff_page(path: Path, pair: Pair, files: tuple[Path, Path], *, force: bool) -> None:
     """Write the difference of two `files` as a page; its path was checked by `diff`."""
     pictures = [
-        (f"{name} difference over the image".strip(), partial(difference_png, own.difference))
+        (f"{name} difference over the image".strip(), partial(difference_png, own.difference, name))
         for name, own in _cameras_of(pair).items()
     ]
     alike = files[0].name == files[1].name

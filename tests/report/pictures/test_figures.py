@@ -66,6 +66,17 @@ def test_the_map_of_a_difference_fills_its_picture(size_px: tuple[int, int]) -> 
         assert inked[0] < 0.15 * length and inked[-1] > 0.85 * length
 
 
+@pytest.mark.parametrize(("name", "title"), [("left", "left: difference "), ("", "difference ")])
+def test_the_map_of_a_difference_names_the_camera_of_a_rig(
+    name: str, title: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    titles: list[str] = []
+    monkeypatch.setattr("rigkit.report.pictures.figures.as_png", lambda own: titles.append(own.axes[0].get_title()))
+    camera = Pinhole((640, 480), np.array([500.0, 500.0, 300.0, 200.0]))
+    difference_png(compare_cameras(camera, camera), name)
+    assert titles[0].startswith(title)
+
+
 @pytest.mark.parametrize("baseline_mm", [(300.0, 0.0, 0.0), (0.0, 0.0, 900.0), (0.0, 1500.0, 0.0)])
 def test_the_cloud_s_axes_and_their_numbers_are_all_in_the_picture(baseline_mm: tuple[float, float, float]) -> None:
     figure = cloud_figure(make_reconstruction(cam2_from_cam1=Rigid3(np.eye(3), np.array(baseline_mm))))
