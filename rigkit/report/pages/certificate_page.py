@@ -50,7 +50,7 @@ def certificate_facts(certificate: Certificate, limit: float | None = None) -> P
     sentences = [
         f"The bound is within {certificate.median:.3g} {unit} in half of {view}, and largest at pixel ({place}).",
         f"{100.0 * float(certificate.in_view.mean()):.0f} % of the image of camera '{certificate.instrument.names[0]}' "
-        "have the whole object in view" + (" of both cameras." if certificate.instrument.is_rig else "."),
+        "has the whole object in view" + (" of both cameras." if certificate.instrument.is_rig else "."),
     ]
     if certificate.coarse_share == 1.0:
         del sentences[0]

@@ -222,8 +222,8 @@ def change_svg(check: CalibrationCheck, c: int) -> str:
     start, by = pixels[valid][seen], (moved - pixels[valid])[seen]
     longest = float(np.linalg.norm(by, axis=1).max(initial=0.0))
     zoom = DRAWN_WIDTH / before.size_px[0]
-    times = ARROW_LENGTH * before.size_px[0] / longest if longest > 1e-6 else 0.0
-    words = f"{longest:.3g} px at most, drawn {times:.2g} times as long" if times else "nothing moves"
+    times = svg.round_down(ARROW_LENGTH * before.size_px[0] / longest) if longest > 1e-6 else 0.0
+    words = f"{longest:.3g} px at most, drawn {times:g} times as long" if times else "nothing moves"
     return (
         svg.image_ground(words, DRAWN_WIDTH, zoom * before.size_px[1])
         + f'<path d="{svg.strokes(zoom * start, zoom * times * by)}" stroke="{INK}" stroke-width="1.3" fill="none"/>'

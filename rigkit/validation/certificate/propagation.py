@@ -189,7 +189,8 @@ def variances(
 
 def systematic(instrument: Monitored, by_calibration: FloatArray) -> FloatArray:
     """Return the square (N, M) of the error that is expected, from `gradients`: a part of the lenses' variance."""
-    return np.maximum(np.einsum("nmi,ij,nmj->nm", by_calibration, instrument.mean_products, by_calibration), 0.0)
+    square = np.einsum("nmi,ij,nmj->nm", by_calibration, instrument.mean_products, by_calibration)
+    return np.asarray(np.maximum(square, 0.0))
 
 
 def _second_order(bent: FloatArray, by_pixel: FloatArray, sigma_px: float) -> FloatArray:

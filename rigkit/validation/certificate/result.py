@@ -30,15 +30,16 @@ def instrument_of(known: Monitored, pair: tuple[str, str] | None = None) -> Moni
     chosen = [known.names.index(name) for name in names]
     cameras = tuple(known.cameras[k] for k in chosen)
     both = (known.covariance, known.mean_products)
+    poses: tuple[Rigid3, ...] = (Rigid3.identity(),)
     if len(chosen) == 1:
-        own, poses = known.layout.cameras[0], (Rigid3.identity(),)
+        own = known.layout.cameras[0]
         covariance, expected = (part[own, own] for part in both)
     else:
         rigs = [
             UncertainRig(cameras=known.cameras, cam_from_rig=known.cam_from_rig, covariance=part).pair(*chosen)
             for part in both
         ]
-        poses = (Rigid3.identity(), rigs[0].posed.cam2_from_cam1)
+        poses = (*poses, rigs[0].posed.cam2_from_cam1)
         covariance, expected = (pair.covariance for pair in rigs)
     return replace(
         known,

@@ -57,8 +57,8 @@ def _refuse_colmap_rig(text: str, name: str) -> None:
     """Raise InputError for a rig_config.json of COLMAP."""
     if COLMAP_RIG.search(text):
         raise InputError(
-            f"'{name}': a rig_config.json of COLMAP does not say how large images are, so it is written only; give the "
-            "rig that it was made of, or cameras.txt of the model"
+            f"'{name}': a rig_config.json of COLMAP does not say how large images are, so rigkit cannot read it; give "
+            "the rig that it was made of, or cameras.txt of the model"
         )
 
 

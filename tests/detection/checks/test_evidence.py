@@ -84,7 +84,8 @@ def test_what_only_coarser_levels_show_is_no_board(name: str, seed: int) -> None
 )
 def test_what_passes_with_few_corners_is_judged_again(name: str, seed: int, board: Board | None) -> None:
     """Of discs the first corners seem to be those of squares, of stripes the scatter is known after the last fit."""
-    assert not detect_boards(grey_image(blank(name, np.random.default_rng(seed))), board and [board])
+    boards = None if board is None else [board]
+    assert not detect_boards(grey_image(blank(name, np.random.default_rng(seed))), boards)
 
 
 def fitted(contrast: np.ndarray) -> RefinedLattice:

@@ -24,7 +24,7 @@ from rigkit.io.calibrations.calibration_file import calibration_text, load_calib
 from rigkit.io.calibrations.history_file import load_history
 from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.planning.goal import projection_goal
-from rigkit.report.pages.check_page import check_facts, check_page
+from rigkit.report.pages.check_page import change_svg, check_facts, check_page
 from rigkit.validation.monitoring.evidence import FreshView, evidence_of
 from rigkit.validation.monitoring.judge import ALARM_CHANCE, check_views
 from rigkit.validation.monitoring.power import FOUND
@@ -48,6 +48,7 @@ def test_unchanged_cameras_hold(calibration: Calibration) -> None:
     assert check_facts(checks[0]).headline.startswith("Still holds (")
     blind = replace(checks[0], powers=tuple(replace(power, chance=0.1) for power in checks[0].powers))
     assert check_facts(blind).headline.startswith("Still holds, as far as these images show (")
+    assert re.search(r"drawn [125]0* times as long", change_svg(checks[0], 0))
 
 
 @pytest.mark.parametrize(
