@@ -21,6 +21,7 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.core.identifiers import natural_key
+from rigkit.io.corners.corner_cache import source_hash
 from rigkit.io.manifests.rig_session import RigSession, frames_of_images
 from rigkit.io.manifests.session import Session
 from rigkit.workflows.inputs.corners import session_corners, session_views
@@ -41,7 +42,7 @@ RIGS: Mapping[str, tuple[str, Mapping[str, str]]] = {
 
 def load_rig(name: str, data: Path, cache: Path) -> tuple[RigViews, dict[str, tuple[int, int]]]:
     """Return what the cameras of a rig show in each frame, and the sizes of their images."""
-    kept = cache / f"{name}.pickle"
+    kept = cache / f"{name}-{source_hash()[:20]}.pickle"
     if not kept.is_file():
         described, path = public_sets()[RIGS[name][0]], cache / f"{name}.toml"
         cameras = {
