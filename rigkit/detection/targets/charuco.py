@@ -27,7 +27,7 @@ from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.lattices import MIN_BOARD_CORNERS
-from rigkit.detection.saddles.response import GreyImage, Level, each_level
+from rigkit.detection.saddles.response import GreyImage, each_level
 from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_model import NEAR_PX, TAIL_SIGMAS
@@ -66,8 +66,7 @@ class CharucoFinder(Finder):
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
         lattices = search.lattices
         found, rest = _charuco_boards(search, lattices, boards)
-        finest = next(each_level(search.grey)) if rest else None
-        search.leave([item for item in rest if finest and _may_be_chessboard(item.lattice, finest)])
+        search.leave(_may_be_chessboards(search.grey, rest))
         every = [completed(item.picture, _detection(item), [item.shown], search.camera) for item in found]
         if search.quick:
             return every
@@ -75,9 +74,11 @@ class CharucoFinder(Finder):
         return [_less_sure(relit(search.grey, seen, item.refined, item.board), item) for seen, item in pairs]
 
 
-def _may_be_chessboard(lattice: Lattice, finest: Level) -> bool:
-    """Return whether a lattice that belongs to no ChArUco board may be a chessboard."""
-    return is_large_enough(lattice, MIN_BOARD_CORNERS) and not has_edge_offset(lattice, finest)
+def _may_be_chessboards(image: GreyImage, lattices: Sequence[RefinedLattice]) -> list[RefinedLattice]:
+    """Return those of the `lattices` that belong to no ChArUco board which may be chessboards."""
+    large = [item for item in lattices if is_large_enough(item.lattice, MIN_BOARD_CORNERS)]
+    finest = next(each_level(image)) if large else None
+    return [item for item in large if finest and not has_edge_offset(item.lattice, finest)]
 
 
 def _too_unlike(fitted: RefinedLattice, sure: BoolArray) -> BoolArray:
