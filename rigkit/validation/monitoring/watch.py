@@ -43,11 +43,12 @@ def monitored_camera(
         freedom=calibration.freedom,
         boards_mm={shape.board_id: shape.points_mm for shape in calibration.boards},
     )
-    return _with_warps(camera, Knowledge.of(own)) if beyond_model else camera
+    return _with_warps(camera, Knowledge.of(own), own.widening if quoted else 1.0) if beyond_model else camera
 
 
-def _with_warps(camera: Monitored, known: Knowledge) -> Monitored:
-    """Return a camera with the warps of its boards, as `known` with the model's P parameters from the same views.
+def _with_warps(camera: Monitored, known: Knowledge, widening: float) -> Monitored:
+    """Return a camera with the warps of its boards, as `known` with the model's P parameters from the same views; their
+    standard deviations are multiplied by `widening`.
 
     The covariance of the warps w given the parameters x is I_ww^-1, and w follows x by -I_ww^-1 I_wx: where a board's
     aspect ratio and that of the pixels were not told apart, they are wrong together.
@@ -60,7 +61,7 @@ def _with_warps(camera: Monitored, known: Knowledge) -> Monitored:
     follows[:, :p] = -rest @ known.information[p:, :p]
     through = np.concatenate([np.eye(len(camera.covariance)), follows])
     covariance, expected = (through @ part @ through.T for part in (camera.covariance, camera.mean_products))
-    covariance[-len(rest) :, -len(rest) :] += rest
+    covariance[-len(rest) :, -len(rest) :] += widening**2 * rest
     return replace(camera, covariance=covariance, expected=expected, warped=known.warped)
 
 

@@ -12,9 +12,11 @@ from helpers.calibration_scenes import BOARD, REACH_DEG, lens, noisy_view, rando
 from helpers.monitoring_scenes import NOISE_PX, best_held, changed_lens, checked, poses_held
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.certainty.departures import with_own_noise
 from rigkit.calibration.certainty.displaced import DisplacedCamera, lens_of
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
+from rigkit.core.arrays import scaled_pinv
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
@@ -264,3 +266,16 @@ def test_a_board_that_passed_for_another_lens_is_no_change(rng: np.random.Genera
     assert 1.0 < seen.score @ np.linalg.solve(seen.covariance, seen.score) < 3.0**2 * 1.05
     # The correction for it leaves nothing.
     assert evidence_of(true, fresh).rms_px < 1e-3 < evidence_of(monitored, fresh).rms_px
+
+
+def test_quoted_sigmas_of_a_measured_board_are_widened_as_those_of_the_lens(rng: np.random.Generator) -> None:
+    views = [noisy_view(lens("reg"), pose, f"{k}", rng, NOISE_PX) for k, pose in enumerate(poses_held("reg", 4))]
+    known = calibrate(views, lens("reg").size_px, model="pinhole", board="warp", folds=0)
+    given_lens = []
+    for quoted in (False, True):
+        monitored = monitored_camera(known, "cam", quoted=quoted)
+        whole, n = monitored.covariance, monitored.layout.shape.start
+        given_lens.append(whole[n:, n:] - whole[n:, :n] @ scaled_pinv(whole[:n, :n]) @ whole[:n, n:])
+    widening = with_own_noise(known).widening
+    assert widening > 1.05
+    assert np.diag(given_lens[1]) == pytest.approx(widening**2 * np.diag(given_lens[0]), rel=1e-6)
