@@ -237,13 +237,15 @@ def with_modes(
     return tuple(out), whole, np.outer(expected, expected)
 
 
-def variance_of_modes(rows: FloatArray, modes: Sequence[LensModes]) -> FloatArray:
-    """Return what the modes of lenses add to the variance (K,) about zero of combinations `rows` (K, G) of the
-    unknowns."""
-    each = [rows @ own.moves for own in modes]
-    means = np.array([moved @ own.means for moved, own in zip(each, modes, strict=True)]).reshape(-1, len(rows))
-    square = np.sum([(moved**2).sum(axis=1) for moved in each], axis=0) - (means**2).sum(axis=0)
-    return np.asarray(square + means.sum(axis=0) ** 2)
+def covariance_of_modes(modes: Sequence[LensModes], count: int) -> FloatArray:
+    """Return what the modes of lenses add to the covariance (count, count) about zero of the unknowns."""
+    out, expected = np.zeros((count, count)), np.zeros(count)
+    for own in modes:
+        mean = own.moves @ own.means
+        # Modes of two lenses are independent about their means.
+        out += own.moves @ own.moves.T + np.outer(expected, mean) + np.outer(mean, expected)
+        expected += mean
+    return out
 
 
 def with_amounts(camera: Camera, modes: FloatArray, turns: FloatArray | None = None) -> Camera:

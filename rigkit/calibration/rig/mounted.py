@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self
 
-from rigkit.calibration.certainty.displaced import LensModes, with_modes
+from rigkit.calibration.certainty.displaced import LensModes, covariance_of_modes, with_modes
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.calibration.solving.clustered import effective_freedom, widening
@@ -68,6 +68,13 @@ class MountedCameras:
     def layout(self) -> Layout:
         """Slices of lenses and mounts in the covariance."""
         return Layout.of_cameras(self.lenses)
+
+    @property
+    def covariance_with_departures(self) -> FloatArray | None:
+        """The covariance of the same unknowns with what the departures of the lenses add to it."""
+        if self.covariance is None:
+            return None
+        return self.covariance + covariance_of_modes(self.departures, len(self.covariance))
 
     @property
     def with_departures(self) -> Self:

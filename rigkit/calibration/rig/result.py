@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.certainty.displaced import LensModes, variance_of_modes
+from rigkit.calibration.certainty.displaced import LensModes, covariance_of_modes
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_rig import BoardRig
@@ -146,7 +146,7 @@ class RigCalibration:
             if k > 0:
                 row[self.mount(k)] += sign * (difference / length @ self._centre_jacobian(k))
         variance = self.widening**2 * float(row @ self.covariance @ row)
-        variance += float(variance_of_modes(row[None], self.departures)[0])
+        variance += float(row @ covariance_of_modes(self.departures, len(row)) @ row)
         return length, float(np.sqrt(max(variance, 0.0) + (length * self.scale_sigma) ** 2))
 
     @cached_property
@@ -158,8 +158,8 @@ class RigCalibration:
     def sigmas(self) -> FloatArray:
         """Standard deviations of the rows of `covariance`, model inadequacy included, widened so that two of them
         contain 95 % of the errors."""
-        count = len(self.covariance)
-        return np.sqrt(self.widening**2 * np.diag(self.covariance) + variance_of_modes(np.eye(count), self.departures))
+        departures = covariance_of_modes(self.departures, len(self.covariance))
+        return np.sqrt(np.diag(self.widening**2 * self.covariance + departures))
 
     @cached_property
     def mounted(self) -> MountedCameras:

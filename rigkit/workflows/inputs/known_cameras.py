@@ -111,9 +111,9 @@ def _covariance(
     lenses = dict(zip(cameras, layout.cameras, strict=True))
     total = layout.cameras[-1].stop + 6 * max(len(mounted) - 1, 0)
     out = np.zeros((total, total))
-    if rig.covariance is not None:
+    if (known := rig.covariance_with_departures) is not None:
         here, there = _covariance_indices(cameras, mounted), _covariance_indices(rig.cameras, mounted)
-        out[np.ix_(here, here)] = rig.covariance[np.ix_(there, there)]
+        out[np.ix_(here, here)] = known[np.ix_(there, there)]
     for name, covariance in alone.items():
         if covariance is not None:
             out[lenses[name], lenses[name]] = covariance
@@ -144,8 +144,8 @@ def _camera_and_covariance(path: Path, name: str, names: Sequence[str]) -> tuple
         if name not in rig.cameras:
             raise InputError(f"'{path}' has no camera '{name}'; there are {', '.join(rig.cameras)}")
         warn_if_bad(path, rig.verdicts)
-        own = _covariance_indices(rig.cameras, [name])
-        return rig.cameras[name][0], None if rig.covariance is None else rig.covariance[np.ix_(own, own)]
+        own, known = _covariance_indices(rig.cameras, [name]), rig.covariance_with_departures
+        return rig.cameras[name][0], None if known is None else known[np.ix_(own, own)]
     if (calibration := calibration_of_file(path)) is not None:
         warn_if_bad(path, calibration.verdicts)
         warn_of_pupil(path, calibration)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,8 +12,11 @@ from helpers.rig_scenes import MODELS, NOISE_PX, SIGMAS, mounts, rig_views, size
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.io.calibrations.rig_file import load_saved_rig, rig_text
+from rigkit.io.manifests.rig_session import RigSession
+from rigkit.io.manifests.session import Session
 from rigkit.kernels.departures import DISPLACEMENTS, displacements
 from rigkit.validation.monitoring.watch import monitored_rig
+from rigkit.workflows.inputs.known_cameras import known_cameras
 
 DECENTRED_PX = 2.0
 
@@ -43,3 +47,16 @@ def test_departures_of_two_lenses_are_no_noise_of_frames(tmp_path: Path) -> None
     assert 0.0 < np.trace(one.mean_products) < np.trace(one.covariance)
     scale = 1.0 / np.sqrt(np.diag(one.covariance))
     assert np.linalg.eigvalsh((one.covariance - one.mean_products) * scale[:, None] * scale)[0] > -1e-9
+    # A camera that is added to this rig takes lenses and mounts to be as uncertain as the rig says.
+    session = RigSession(
+        path=tmp_path / "more.toml",
+        cameras=dict.fromkeys([*sizes(), "more"], cast(Session, None)),
+        frames="number",
+        baselines=(),
+        known_rig=tmp_path / "rig.json",
+    )
+    known = known_cameras(session)
+    assert known is not None and known.covariance is not None
+    beyond = rig.sigmas**2 - rig.widening**2 * np.diag(rig.covariance)
+    assert np.diag(known.covariance) == pytest.approx(np.diag(rig.covariance) + beyond, rel=1e-9)
+    assert (beyond > 0.5 * np.diag(rig.covariance)).any()
