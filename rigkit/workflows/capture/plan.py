@@ -31,13 +31,7 @@ from rigkit.validation.monitoring.watch import monitored_camera
 from rigkit.workflows.calibration.calibrate import calibrate_session, session_inputs
 from rigkit.workflows.calibration.next_pictures import NEXT_VIEWS, goal_of, next_frames, next_views
 from rigkit.workflows.checks.check import load_monitored
-from rigkit.workflows.inputs.camera_files import (
-    bad_verdict,
-    bad_verdict_in_file,
-    require_covariance,
-    warn_if_bad,
-    warn_of_pupil,
-)
+from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad, warn_of_pupil
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions
 from rigkit.workflows.options.plan import LensOptions, PlanOptions
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
@@ -78,8 +72,7 @@ def plan_session(
     bad = None
     if source.suffix != ".toml":
         require_covariance(source)
-        bad = bad_verdict_in_file(source)
-        warn_if_bad(source)
+        bad = warn_if_bad(source)
     if rig:
         monitored, boards = load_monitored(source)
         if not boards:
@@ -94,8 +87,7 @@ def plan_session(
         calibrating = CalibrateOptions(cache=Cache.UPDATE)
         ensure_writable(options.report, force=options.force, inputs=[source, *session_inputs(session, calibrating)])
         calibration = calibrate_session(session, calibrating, progress=progress).calibration
-        warn_if_bad(source, calibration.verdicts)
-        bad = bad_verdict(calibration.verdicts)
+        bad = warn_if_bad(source, calibration.verdicts)
         boards = session.boards
     else:
         calibration = load_calibration(source)

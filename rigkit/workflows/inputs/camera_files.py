@@ -130,11 +130,13 @@ def bad_verdict(verdicts: Iterable[Finding]) -> Finding | None:
     return None if bad is None else replace(bad, message=f"the calibration's verdict is bad: {bad.message}")
 
 
-def warn_if_bad(path: str | Path, verdicts: Iterable[Finding] | None = None) -> None:
-    """Warn if the file has a verdict BAD; `verdicts` are its own, or None to read them."""
+def warn_if_bad(path: str | Path, verdicts: Iterable[Finding] | None = None) -> Finding | None:
+    """Warn of a file's verdict BAD, and return it, None if it has none; `verdicts` are its own, or None to read
+    them."""
     bad = bad_verdict_in_file(path) if verdicts is None else bad_verdict(verdicts)
     if bad is not None:
         _log.warning("'%s': %s", path, bad.message)
+    return bad
 
 
 def _neglected_pupil(which: str, camera: Camera, pupil: FloatArray, pixels: Pixels) -> str:
