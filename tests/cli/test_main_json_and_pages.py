@@ -63,9 +63,11 @@ def test_diff_certify_check_and_plan(calibrated: Path, tmp_path: Path, capsys: p
         (tmp_path / path.name).write_bytes(path.read_bytes() + b"again")
     assert main(["check", known, *map(str, own)]) == 2
     assert "was made from these very images" in capsys.readouterr().err
-    assert main(["check", known, *images, str(own[2])]) == 0
+    page = tmp_path / "left-out.html"
+    assert main(["check", known, *images, str(own[2]), "-r", str(page)]) == 0
     left_out = capsys.readouterr().err
     assert f"{own[2]}" in left_out and "the calibration was made from it, and fits it" in left_out
+    assert f"left out: {own[2].name}" in page.read_text()
     for given in ([str(calibrated)], [str(path) for path in sorted(calibrated.glob("*.JPG"), reverse=True)]):
         assert main(["check", known, *given]) == 2
         assert "was made from these very images" in capsys.readouterr().err

@@ -118,7 +118,7 @@ def check_pictures(
             check = replace(check, flipped=flipped_pictures(check.monitored, views))
             _require_right_order(check, views)
     pictures.left_out.extend((f"{path}", OWN_IMAGE) for path in own)
-    files = _files(source, check, options)
+    files = _files(source, check, options, pictures.left_out)
     write_together(files, force=options.force)
     if options.history is not None:
         _register(options.history, source, check, before, options.temperature_c)
@@ -156,8 +156,11 @@ def _digest_alone(images: Sequence[Path]) -> str:
     return (digest_of_images(images) or "").rpartition(": ")[2]
 
 
-def _files(source: Path, check: CalibrationCheck, options: CheckOptions) -> dict[Path, str | bytes]:
-    """Return the contents of the files to write, by path: the corrected calibration, and the page."""
+def _files(
+    source: Path, check: CalibrationCheck, options: CheckOptions, left_out: Sequence[tuple[str, str]]
+) -> dict[Path, str | bytes]:
+    """Return the contents of the files to write, by path: the corrected calibration, and the page, which names the
+    images `left_out`."""
     files: dict[Path, str | bytes] = {}
     # No correction where it holds or where nothing explains the images; flipped images are themselves the error.
     right = check.holds or check.unexplained or bool(check.flipped)
@@ -165,6 +168,7 @@ def _files(source: Path, check: CalibrationCheck, options: CheckOptions) -> dict
         files[options.fix] = fixed_text(source, check)
     if options.report is not None:
         facts = {source.name: digest_line(source), **software_facts()}
+        facts |= {f"left out: {Path(name).name}": reason for name, reason in left_out}
         files[options.report] = check_page(check, f"Check of {source.name}", facts)
     return files
 
