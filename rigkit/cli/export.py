@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     if args.source.is_dir() or args.source.suffix in (".toml", ".ply"):
         return _export_cloud(args)
     if args.single_precision:
-        raise InputError("export: --float is for PLY clouds; leave it out")
+        raise InputError("export: --float is for clouds written as PLY; leave it out")
     import numpy as np
 
     from rigkit.rectification.targets import field_across
@@ -80,8 +80,9 @@ def _export_cloud(args: argparse.Namespace) -> int:
     if kind not in known:
         what = "a PLY" if is_ply else "a cloud"
         raise InputError(f"export: {what} is written as {', '.join(known)}, not as '{kind}'; use --to")
+    if args.single_precision and kind != "ply":
+        raise InputError(f"export: --float is for clouds written as PLY, not as '{kind}'; leave it out")
     unused = {"--names": args.names, "--size": args.size, "--from": args.source_format}
-    unused |= {"--float": args.single_precision and kind != "ply"}
     unused |= {"--pair": is_ply and args.pair, "--planes": is_ply and args.planes}
     if (option := next((name for name, given in unused.items() if given), None)) is not None:
         raise InputError(f"export: {option} does not apply to {'a PLY' if is_ply else 'a cloud'}; leave it out")

@@ -60,7 +60,7 @@ def test_export_of_a_ply_keeps_its_unit_and_writes_32_bit_numbers(
     assert not any("double" in line for line in header) and "property float x" in header
     np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").points_mm, cloud.points_mm.astype(np.float32))
     assert main(["export", str(tmp_path / "a.ply"), "-o", str(tmp_path / "b.las"), "--float"]) == 2
-    assert "--float does not apply to a" in capsys.readouterr().err
+    assert "--float is for clouds written as PLY, not as 'las'" in capsys.readouterr().err
 
 
 def test_header_says_units_frame_boards_and_comments(cloud_file: Path) -> None:
