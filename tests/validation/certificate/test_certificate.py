@@ -243,7 +243,7 @@ def test_an_error_that_is_expected_does_not_vary(times: float, rng: np.random.Ge
     points, weights = measured_points(rig.cameras[0].unproject(certificate.pixels[certificate.in_view])[0], task, True)
     by_corner, by_calibration, by_pixel, _ = gradients(rig.cameras, rig.cam_from_rig, points, weights)
     about = variances(replace(rig, covariance=joint), task, points, by_corner, by_calibration, by_pixel)
-    drawn = np.sqrt(sum(about.values())[:, 0, None]) * rng.normal(size=(len(points), 4000))
+    drawn = np.sqrt(np.sum(list(about.values()), axis=0)[:, 0, None]) * rng.normal(size=(len(points), 4000))
     drawn += (by_calibration @ error)[:, :1]
     inside = (np.abs(drawn) <= certificate.bound[certificate.in_view][:, None]).mean()
     assert inside == pytest.approx(0.95, abs=0.005)
