@@ -196,17 +196,22 @@ def place_together(excess: FloatArray, cells: IntArray, size: tuple[int, int], c
     for turn in range(4):
         turned = grid_turned(cells, (columns - 1, rows - 1), turn)
         low, high = turned.min(axis=0), turned.max(axis=0)
-        shifts = [np.arange(-b, n - a) for a, b, n in zip(low, high, (wide, tall), strict=True)]
-        shift = np.stack(np.meshgrid(*shifts), axis=-1).reshape(-1, 1, 2)
-        column, row = np.moveaxis(turned + shift, 2, 0)
-        inside = (column >= 0) & (column < wide) & (row >= 0) & (row < tall)
-        codes = np.where(inside, codes_at[np.where(inside, row, 0), np.where(inside, column, 0)], -1)
-        own = codes >= 0
-        # Rotated back by `turn`, the tag is upright.
-        total = np.where(own, excess[np.arange(len(cells)), codes + (-turn) % 4], 0.0).sum(axis=1)
-        count = own.sum(axis=1)
+        own_wide, own_tall = high - low + 1
+        # Reversed, so that each square of the board adds to all shifts at once.
+        column, row = (high - turned).T
+        grid, there = np.zeros((excess.shape[1], own_tall, own_wide)), np.zeros((own_tall, own_wide), dtype=np.int64)
+        grid[:, row, column], there[row, column] = excess.T, 1
+        total = np.zeros((tall + own_tall - 1, wide + own_wide - 1))
+        count = np.zeros(total.shape, dtype=np.int64)
+        for r, c in np.argwhere(codes_at >= 0):
+            part = slice(r, r + own_tall), slice(c, c + own_wide)
+            # Rotated back by `turn`, the tag is upright.
+            total[part] += grid[codes_at[r, c] + (-turn) % 4]
+            count[part] += there
         score = np.where(count < MIN_TAGS_OF_PLACE, 0.0, total / np.sqrt(np.maximum(count, 1)))
-        found.append((score, count, np.insert(shift[:, 0], 0, turn, axis=1)))
+        y, x = np.indices(total.shape)
+        move = np.stack([np.full(total.size, turn), x.ravel() - high[0], y.ravel() - high[1]], axis=1)
+        found.append((score.ravel(), count.ravel(), move))
     score, count, move = (np.concatenate(part) for part in zip(*found, strict=True))
     best = int(score.argmax())
     if score[best] < max(SURE_EXCESS, AHEAD + float(np.delete(score, best).max(initial=0.0))):
