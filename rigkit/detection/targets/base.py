@@ -14,11 +14,12 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.detection.checks.validate import has_edge_offset, is_large_enough
 from rigkit.detection.lattice.lattice import MIN_ROWS
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.lattices import MIN_BOARD_CORNERS, BoardCriteria, corner_count, find_lattices, fit_and_confirm
 from rigkit.detection.saddles.local_contrast import equalised, stretched
-from rigkit.detection.saddles.response import BASE_PIXELS, GreyImage
+from rigkit.detection.saddles.response import BASE_PIXELS, GreyImage, each_level
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.tags.in_squares import has_markers_of
 
@@ -79,8 +80,10 @@ class Search:
         return self._lattices
 
     def leave(self, lattices: Sequence[RefinedLattice]) -> None:
-        """Keep only these lattices for other finders."""
-        self._lattices = list(lattices)
+        """Keep for other finders only those of these lattices that may be chessboards."""
+        large = [item for item in lattices if is_large_enough(item.lattice, MIN_BOARD_CORNERS)]
+        finest = next(each_level(self.grey)) if large else None
+        self._lattices = [item for item in large if finest and not has_edge_offset(item.lattice, finest)]
 
     def min_corners_of(self, board: Board) -> int:
         """Return the smallest number of points of a reported detection of `board`, which may be small.

@@ -19,15 +19,13 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
-from rigkit.detection.checks.validate import has_edge_offset, is_large_enough
 from rigkit.detection.guided.corner_fit import MARKER_BLURS, RADIUS_PX, fit_corners, gap_to_markers
 from rigkit.detection.guided.guided import MAX_ADDED_RESIDUAL_MARKED, completed
 from rigkit.detection.guided.lopsided_blur import blur_shift_px
 from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.lattices import MIN_BOARD_CORNERS
-from rigkit.detection.saddles.response import GreyImage, each_level
+from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_model import NEAR_PX, TAIL_SIGMAS
@@ -64,21 +62,13 @@ class CharucoFinder(Finder):
     """Returns lattices placed by their markers; chessboards then do not use them."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
-        lattices = search.lattices
-        found, rest = _charuco_boards(search, lattices, boards)
-        search.leave(_may_be_chessboards(search.grey, rest))
+        found, rest = _charuco_boards(search, search.lattices, boards)
+        search.leave(rest)
         every = [completed(item.picture, _detection(item), [item.shown], search.camera) for item in found]
         if search.quick:
             return every
         pairs = zip(every, found, strict=True)
         return [_less_sure(relit(search.grey, seen, item.refined, item.board), item) for seen, item in pairs]
-
-
-def _may_be_chessboards(image: GreyImage, lattices: Sequence[RefinedLattice]) -> list[RefinedLattice]:
-    """Return those of the `lattices` that belong to no ChArUco board which may be chessboards."""
-    large = [item for item in lattices if is_large_enough(item.lattice, MIN_BOARD_CORNERS)]
-    finest = next(each_level(image)) if large else None
-    return [item for item in large if finest and not has_edge_offset(item.lattice, finest)]
 
 
 def _too_unlike(fitted: RefinedLattice, sure: BoolArray) -> BoolArray:
