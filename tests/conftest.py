@@ -52,7 +52,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         there |= names
         if not LEFT_OUT.isdisjoint(names):
             item.add_marker("thorough")
-    if config.args_source is config.ArgsSource.TESTPATHS and (gone := LEFT_OUT - there):
+    whole = config.args_source is config.ArgsSource.TESTPATHS and not config.getoption("lf", False)
+    if whole and (gone := LEFT_OUT - there):
         words = f"{THOROUGH.name} names tests that are not there: {', '.join(sorted(gone))}"
         config.issue_config_time_warning(pytest.PytestWarning(words), stacklevel=2)
 
