@@ -142,9 +142,14 @@ RIG_FILE = file(
                 "rms_px": described(NUMBER, "training error in the rig"),
                 "outline_px?": described(matrix(columns=2), "convex, around all corners that it saw"),
                 "departures?": described(
-                    obj({"modes": matrix(), "moves": matrix(), "means?": array(NUMBER)}),
-                    "lens errors beyond the model: independent displacements of the image of one sigma each, the "
-                    "changes that each makes to the quantities of `covariance`, and the amount expected of each",
+                    obj(
+                        {
+                            "modes": described(matrix(), "independent displacements of the image, of one sigma each"),
+                            "moves": described(matrix(), "change of the quantities of `covariance` with each"),
+                            "means?": described(array(NUMBER), "expected amount of each, in sigmas"),
+                        }
+                    ),
+                    "lens errors beyond the model",
                 ),
                 "pupil?": _PUPIL,
                 "lag?": described(

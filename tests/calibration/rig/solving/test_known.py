@@ -15,8 +15,9 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import log_so3
 
-LINEAR = 0.002
-"""Terms of the second order, of the errors of a mount: 4e-4 was seen."""
+NOISE_OF_EACH = 0.01
+"""Each solution states the noise that its lenses' departures leave of its own residuals (4e-3 of the errors of a mount was
+seen), and terms of the second order (4e-4)."""
 BOW_ERROR_MM = 0.05
 """Of a bow of 1 mm in 14 views with corners of 0.2 px: 0.01 was seen."""
 
@@ -68,7 +69,7 @@ def test_mounts_of_lenses_not_known_exactly_are_as_unsure(rng: np.random.Generat
         moved.append(
             np.concatenate([log_so3(pose.rotation @ there.rotation.T), pose.translation_mm - there.translation_mm])
         )
-    assert np.sqrt(np.sum(np.square(moved), axis=0)) == pytest.approx(np.sqrt(np.diag(added)), rel=LINEAR)
+    assert np.sqrt(np.sum(np.square(moved), axis=0)) == pytest.approx(np.sqrt(np.diag(added)), rel=NOISE_OF_EACH)
 
 
 def test_a_camera_is_added_to_a_rig_that_stays(rng: np.random.Generator) -> None:
