@@ -16,8 +16,8 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import log_so3
 
 NOISE_OF_EACH = 0.01
-"""Each solution states the noise that its lenses' departures leave of its own residuals (4e-3 of the errors of a mount was
-seen), and terms of the second order (4e-4)."""
+"""Each solution states the noise that its lenses' departures leave of its own residuals (4e-3 of the errors of a mount
+was seen), and errors have terms of the second order (4e-4)."""
 BOW_ERROR_MM = 0.05
 """Of a bow of 1 mm in 14 views with corners of 0.2 px: 0.01 was seen."""
 
