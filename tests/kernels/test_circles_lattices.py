@@ -10,18 +10,11 @@ from kernels.reference import circle_maps
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import FloatArray
-from rigkit.detection.circles.blobs import BLOB_AREAS, DEVIATIONS, FILLING, MAX_ASPECT, WINDOW_PX
+from rigkit.detection.circles.blobs import WINDOW_PX, blob_rules
 from rigkit.detection.circles.local_map import local_maps, plane_basis
-from rigkit.kernels.circles import BlobRules, find_blobs
+from rigkit.kernels.circles import find_blobs
 
-RULES = BlobRules.of(
-    deviations=DEVIATIONS,
-    min_filling=FILLING[0],
-    max_filling=FILLING[1],
-    max_aspect=MAX_ASPECT,
-    min_area=BLOB_AREAS[0],
-    max_area=BLOB_AREAS[1],
-)
+RULES = blob_rules()
 SAME = 1e-9
 """Of centroids and covariances, px: sums of whole numbers on one side, of floats on the other."""
 SAME_MAP = 1e-6

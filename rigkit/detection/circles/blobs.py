@@ -110,11 +110,9 @@ def _halved(level: FloatImage) -> FloatImage:
     return np.asarray(cv2.resize(level[:height, :width], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
 
 
-def _of_level(level: FloatImage, scale: float) -> Blobs:
-    smooth = cv2.GaussianBlur(level, (0, 0), SMOOTH_PX)
-    window = (WINDOW_PX, WINDOW_PX)
-    off = smooth - cv2.blur(smooth, window)
-    rules = kernel.BlobRules.of(
+def blob_rules() -> kernel.BlobRules:
+    """Return the constants of this module, as the kernel takes them."""
+    return kernel.BlobRules.of(
         deviations=DEVIATIONS,
         min_filling=FILLING[0],
         max_filling=FILLING[1],
@@ -122,7 +120,13 @@ def _of_level(level: FloatImage, scale: float) -> Blobs:
         min_area=BLOB_AREAS[0],
         max_area=BLOB_AREAS[1],
     )
-    rows = kernel.find_blobs(off, np.asarray(cv2.blur(off * off, window), np.float32), rules)
+
+
+def _of_level(level: FloatImage, scale: float) -> Blobs:
+    smooth = cv2.GaussianBlur(level, (0, 0), SMOOTH_PX)
+    window = (WINDOW_PX, WINDOW_PX)
+    off = smooth - cv2.blur(smooth, window)
+    rows = kernel.find_blobs(off, np.asarray(cv2.blur(off * off, window), np.float32), blob_rules())
     shape = _root(4.0 * rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2))
     return Blobs(scaled_up(rows[:, :2], scale), shape * scale, rows[:, 5])
 

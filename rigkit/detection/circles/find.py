@@ -115,9 +115,12 @@ def grid_of(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool 
     evidence = _evidence(draft)
     # Sizes of much blurred circles are not yet those of the image itself.
     for _ in range(0 if quick or draft.mixed or blobs.reduction() == 1 else 1 if scale == 1 else 2):
-        again = draft if evidence.convincing else _again(grey, draft.enlarged(scale))
-        if again is not draft and _enough(again):
-            draft, evidence, scale = again, _evidence(again), 1
+        if evidence.convincing:
+            break
+        again = _again(grey, draft.enlarged(scale))
+        if not _enough(again):
+            break
+        draft, evidence, scale = again, _evidence(again), 1
     if evidence.convincing and not quick:
         draft = _through_its_blur(reduced(grey, scale), draft)
     return _finished(draft.enlarged(scale), evidence, (grey.shape[1], grey.shape[0]))
