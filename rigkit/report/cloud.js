@@ -7,7 +7,6 @@
 const CLOUD_START = {yaw: -0.3, pitch: 0.2, zoom: 1, u: 0, v: 0};
 const CLOUD_DISTANCE = 2.6;
 const CLOUD_FILL = 1.3;
-const CLOUD_TURN = 0.008;
 const CLOUD_SHARE = 0.88;
 const CLOUD_INSIDE = 0.99;
 const NEAREST = 0.1;
@@ -20,7 +19,7 @@ function cloudView(canvas) {
   const normals = new Int8Array(packed.buffer, 12 * count, 3 * count), colours = packed.subarray(15 * count);
   const tools = canvas.parentElement, pen = canvas.getContext("2d", {willReadFrequently: true});
   const shape = tools.querySelector("[data-shape]"), turning = tools.querySelector("[data-turn]");
-  let view = null, image = null, depths = null, asked = false, last = null;
+  let view = null, image = null, depths = null, asked = false;
 
   // The first view, zoomed and moved until nearly all points fill the canvas.
   function fitted() {
@@ -96,47 +95,16 @@ function cloudView(canvas) {
   }
 
   function turn() {
-    view.yaw += CLOUD_TURN;
+    view.yaw += TURN_PER_PX;
     ask();
   }
 
-  canvas.addEventListener("pointerdown", (e) => {
-    last = [e.clientX, e.clientY];
-    canvas.setPointerCapture(e.pointerId);
-  });
-  canvas.addEventListener("pointermove", (e) => {
-    if (!last) return;
-    const by = [e.clientX - last[0], e.clientY - last[1]];
-    last = [e.clientX, e.clientY];
-    if (e.shiftKey) {
-      view.u += by[0];
-      view.v += by[1];
-    } else {
-      view.yaw -= by[0] * CLOUD_TURN;
-      view.pitch = Math.max(-1.57, Math.min(1.57, view.pitch + by[1] * CLOUD_TURN));
-    }
-    ask();
-  });
-  canvas.addEventListener("pointerup", () => (last = null));
-  canvas.addEventListener("wheel", (e) => {
-    e.preventDefault();
-    view.zoom *= Math.exp(-e.deltaY * 0.001);
-    ask();
-  }, {passive: false});
-  canvas.addEventListener("dblclick", () => {
-    view = fitted();
-    ask();
-  });
-  canvas.addEventListener("keydown", (e) => {
-    const step = {ArrowLeft: [-0.1, 0, 1], ArrowRight: [0.1, 0, 1], ArrowUp: [0, 0.1, 1], ArrowDown: [0, -0.1, 1],
-      "+": [0, 0, 1.15], "-": [0, 0, 1 / 1.15]}[e.key];
-    if (!step) return;
-    e.preventDefault();
-    view.yaw += step[0];
-    view.pitch += step[1];
-    view.zoom *= step[2];
-    ask();
-  });
+  function shifted(dx, dy) {
+    view.u += dx;
+    view.v += dy;
+  }
+
+  turnable(canvas, () => view, ask, {reset: () => (view = fitted()), shifted});
   for (const box of [shape, turning]) box.addEventListener("change", ask);
   window.addEventListener("resize", ask);
   window.addEventListener("beforeprint", draw);

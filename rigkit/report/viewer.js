@@ -10,7 +10,6 @@ const FROM = {free: START, front: {yaw: 0, pitch: 0, zoom: 1, flat: true}, top: 
   side: {yaw: Math.PI / 2, pitch: 0, zoom: 1, flat: true}};
 const NEAR_PX = 14;
 const SCALE_PX = 140;
-const TURN_PER_PX = 0.008;
 const DISTANCE = 3.2;
 // As it is first turned, the scene reaches so far from the middle of the view to its edge.
 const FILLED = 0.9;
@@ -178,51 +177,21 @@ function viewer(canvas, scene) {
     return [best[1], `${best[1].name} at (${where}) mm`];
   }
 
-  let last = null;
-  canvas.addEventListener("pointerdown", (e) => {
-    last = [e.clientX, e.clientY];
-    canvas.setPointerCapture(e.pointerId);
-  });
-  canvas.addEventListener("pointermove", (e) => {
-    if (!last) {
-      const [thing, words] = under(e);
-      if (thing !== hovered) {
-        hovered = thing;
-        const told = canvas.parentElement.querySelector(".hover");
-        if (told) told.textContent = words;
-        draw();
-      }
-      return;
-    }
-    view.yaw -= (e.clientX - last[0]) * TURN_PER_PX;
-    view.pitch = Math.max(-1.57, Math.min(1.57, view.pitch + (e.clientY - last[1]) * TURN_PER_PX));
-    last = [e.clientX, e.clientY];
+  function told(e) {
+    const [thing, words] = under(e);
+    if (thing === hovered) return;
+    hovered = thing;
+    const place = canvas.parentElement.querySelector(".hover");
+    if (place) place.textContent = words;
     draw();
-  });
-  canvas.addEventListener("pointerup", () => (last = null));
-  canvas.addEventListener("wheel", (e) => {
-    e.preventDefault();
-    view.zoom *= Math.exp(-e.deltaY * 0.001);
-    draw();
-  }, {passive: false});
-  canvas.addEventListener("dblclick", () => {
-    view = {...START};
+  }
+
+  function start(from) {
+    view = {...from};
     fitted = "";
-    draw();
-  });
-  canvas.addEventListener("keydown", (e) => {
-    if (e.key === "+" || e.key === "-") {
-      view.zoom *= e.key === "+" ? 1.15 : 1 / 1.15;
-      draw();
-      return;
-    }
-    const step = {ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1]}[e.key];
-    if (!step) return;
-    e.preventDefault();
-    view.yaw += step[0];
-    view.pitch += step[1];
-    draw();
-  });
+  }
+
+  turnable(canvas, () => view, draw, {reset: () => start(START), hover: told});
   for (const box of canvas.parentElement.querySelectorAll("input[data-show]")) {
     box.addEventListener("change", () => {
       show[box.dataset.show] = box.checked;
@@ -231,8 +200,7 @@ function viewer(canvas, scene) {
   }
   for (const press of canvas.parentElement.querySelectorAll("button[data-from]")) {
     press.addEventListener("click", () => {
-      view = {...FROM[press.dataset.from]};
-      fitted = "";
+      start(FROM[press.dataset.from]);
       draw();
     });
   }
