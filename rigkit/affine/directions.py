@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import TINY, BoolArray, FloatArray, IntArray
 from rigkit.core.choices import SUPPORTS, Support
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
@@ -304,7 +304,7 @@ def _projective_fit(tangent: _Tangent, index: IntArray, steps: FloatArray) -> tu
         target = measured - fitted + fitted / w
         q, r = np.linalg.qr((whitening @ rows).reshape(n, 2 * m, -1))
         pivots = np.abs(np.einsum("nii->ni", r)) if r.shape[1] == r.shape[2] else np.zeros((n, 1))
-        solvable = pivots.min(axis=1) > MIN_PIVOT * np.maximum(pivots.max(axis=1), 1e-300)
+        solvable = pivots.min(axis=1) > MIN_PIVOT * np.maximum(pivots.max(axis=1), TINY)
         if not solvable.any():
             break
         inverse = np.linalg.inv(np.where(solvable[:, None, None], r, np.eye(3 * d + 2)))

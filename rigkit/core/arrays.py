@@ -26,6 +26,8 @@ MAX_VARIANCE = 1e36
 MIN_EIGENVALUE = -1e-6
 """Of a correlation matrix, times the number of its rows: rounding of an inverse makes zeros slightly negative."""
 
+TINY = 1e-300
+"""Least divisor (variance, sum of squares) where a quotient must exist; below all that is not rounding."""
 SORTED_SOONER = 1000
 """Below so many numbers sorting is faster than partitioning."""
 

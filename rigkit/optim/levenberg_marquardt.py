@@ -14,7 +14,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import TINY, FloatArray
 from rigkit.optim.damping import Damping, Stop, StopReason
 
 
@@ -145,7 +145,7 @@ def damped_step(jacobian: FloatArray, residual: FloatArray, damping: float) -> D
     it (Marquardt). Unknowns with a zero column do not change. None where the system is singular.
     """
     normal = jacobian.T @ jacobian
-    size = np.maximum(np.sqrt(np.diag(normal)), 1e-300)
+    size = np.maximum(np.sqrt(np.diag(normal)), TINY)
     normal = normal / size / size[:, None]
     normal.flat[:: len(size) + 1] += damping
     gradient = (jacobian.T @ residual) / size

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Points
+from rigkit.core.arrays import TINY, BoolArray, FloatArray, Mat3, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
@@ -136,7 +136,7 @@ def variance_and_covariance(
     factor = variance_factor(float(data @ data), 2 * corners - unknowns)
     variance = np.where(np.arange(len(problem.residual)) < len(data), factor, 1.0)
     information = (problem.jacobian.T / variance) @ problem.jacobian
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scale = np.sqrt(np.maximum(np.diag(information), TINY))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     if not values[0] > 1e-14:
         raise DegenerateError(f"pair '{pair_id}': the corners leave the boards' poses open; more of them must be seen")

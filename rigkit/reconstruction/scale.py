@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, IntArray, Points
+from rigkit.core.arrays import TINY, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
@@ -49,7 +49,7 @@ def metric_scale(
     """
     scales, variance, slopes = board_scales_and_gradients(points_unit, board_index, grid, boards, covariances)
     known = np.isfinite(scales)
-    weights = np.where(known, 1.0 / np.maximum(np.where(known, variance, 1.0), 1e-300), 0.0)
+    weights = np.where(known, 1.0 / np.maximum(np.where(known, variance, 1.0), TINY), 0.0)
     total = weights.sum()
     gradient = np.einsum("b,bni->ni", weights, slopes) / total
     return float(np.sum(weights * np.where(known, scales, 0.0)) / total), float(total**-0.5), gradient
@@ -120,8 +120,8 @@ def _similarity_scale(
         residual = np.einsum("nij,nj->ni", whiten, points - k * turned - c)
         square = np.sum(residual**2, axis=1)
         if covariances is None:
-            noise = max(float(np.median(square)) / MEDIAN_OF_CHI_SQUARE_3, 1e-300)
-        w = np.minimum(1.0, noise * OUTLIER_SQUARE / np.maximum(square, 1e-300)) ** 2
+            noise = max(float(np.median(square)) / MEDIAN_OF_CHI_SQUARE_3, TINY)
+        w = np.minimum(1.0, noise * OUTLIER_SQUARE / np.maximum(square, TINY)) ** 2
         J = np.concatenate([turned[:, :, None], -k * skew(turned), np.broadcast_to(np.eye(3), whiten.shape)], axis=2)
         J = whiten @ J
         gram = np.einsum("n,nij,nik->jk", w, J, J)
@@ -149,7 +149,7 @@ def _robust_start(points: Points, centred: Points) -> tuple[float, FloatArray, F
     for _ in range(5):
         off = points - k * centred @ R.T - c
         size = np.linalg.norm(off, axis=1)
-        w = 1.0 / np.maximum(size, 0.1 * np.median(size) + 1e-300)
+        w = 1.0 / np.maximum(size, 0.1 * np.median(size) + TINY)
         mean_p, mean_m = w @ points / w.sum(), w @ centred / w.sum()
         R = nearest_rotation((points - mean_p).T * w @ (centred - mean_m))
         c = mean_p - k * R @ mean_m

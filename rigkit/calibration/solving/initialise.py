@@ -22,7 +22,7 @@ from rigkit.calibration.solving.radial_alignment import TURN_SIGMAS, Alignment, 
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera, RadialCurve, image_center
-from rigkit.core.arrays import FloatArray, Mat3, Points, median_of
+from rigkit.core.arrays import TINY, FloatArray, Mat3, Points, median_of
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
@@ -47,8 +47,6 @@ NOTHING = 1e-9
 """Smallest divisor, of lengths (px, mm)."""
 NOTHING_RAD = 1e-6
 """Smallest divisor, of angles."""
-TINY = 1e-300
-"""Smallest divisor, of sums of squares of any scale."""
 POLYNOMIAL_RIDGE = 1e-12
 """Added to the unit diagonal: keeps the normal matrix invertible where the views do not determine the polynomial."""
 FLIPS = 10

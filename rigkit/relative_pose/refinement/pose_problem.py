@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, IntArray, as_array
+from rigkit.core.arrays import TINY, FloatArray, IntArray, as_array
 from rigkit.core.errors import InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
@@ -77,7 +77,7 @@ class _WeightedRows(LinearisedProblem):
         """Return the damped step (5,), zero in fixed parameters; None if the system is singular."""
         J, w = self.jacobian[:, self.free], self.weights
         gram, gradient = (J.T * w) @ J, (J.T * w) @ self.residuals
-        scale = np.diag(gram) + 1e-12 * np.trace(gram) + 1e-300
+        scale = np.diag(gram) + 1e-12 * np.trace(gram) + TINY
         try:
             move = np.linalg.solve(gram + damping * np.diag(scale), -gradient)
         except np.linalg.LinAlgError:

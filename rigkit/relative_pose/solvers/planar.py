@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, Mat3
+from rigkit.core.arrays import TINY, FloatArray, Mat3
 from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
 from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseline, check_count, finish, reweighted
@@ -107,9 +107,9 @@ def _dual_optimum(G: FloatArray) -> FloatArray:
         high[todo[~rising]], v_high[todo[~rising]] = mu[todo[~rising]], v[~rising]
         done = np.abs(slope) < STATIONARY
         out[todo[done]] = v[done]
-        gap = np.minimum(values[:, :1] - values[:, 1:], -1e-300)
+        gap = np.minimum(values[:, :1] - values[:, 1:], -TINY)
         curvature = 2.0 * np.sum(along[:, 1:] ** 2 / gap, axis=1)
-        newton = mu[todo] - slope / np.minimum(curvature, -1e-300)
+        newton = mu[todo] - slope / np.minimum(curvature, -TINY)
         middle = 0.5 * (low[todo] + high[todo])
         inside = (newton > low[todo]) & (newton < high[todo]) & (step < NEWTON_STEPS)
         mu[todo] = np.where(inside, newton, middle)

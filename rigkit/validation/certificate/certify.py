@@ -22,7 +22,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri, stdtr, stdtrit
 
 from rigkit.cameras.compare import grid_pixels
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import TINY, FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
 from rigkit.core.measurement_task import Quantity, Task
@@ -47,8 +47,6 @@ is relied upon. SIMULATED corner noise, lengths, depths, planes and angles: up t
 within a bound of 95 %, beyond 1 97 to 100 % (2026-11-29). The calibration's errors are propagated linearly."""
 AS_NORMAL = 1e6
 """Degrees of freedom from which Student's distribution counts as normal."""
-TINY = 1e-300
-"""Least variance, so that ratios of variances exist."""
 BISECTIONS = 50
 """Of the interval of a bound: to rounding."""
 

@@ -13,6 +13,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
+from rigkit.core.reach import Reach
 from rigkit.core.tables import Table
 from rigkit.io.calibrations.calibration_file import load_calibration
 from rigkit.io.calibrations.rig_file import is_rig_file
@@ -69,7 +70,9 @@ def plan_session(
     if rig and source.suffix == ".toml":
         raise InputError(f"plan: '{source}' is a session of a rig; give the rig that it was calibrated to, rig.json")
     ensure_writable(options.report, force=options.force, inputs=[source])
-    bad = None
+    title = f"Images to check {source.name} with" if options.check else f"Next images for {source.name}"
+    bad: Finding | None = None
+    found: tuple[Table, ...] = ()
     if source.suffix != ".toml":
         require_covariance(source)
         bad = warn_if_bad(source)
@@ -77,11 +80,12 @@ def plan_session(
         monitored, boards = load_monitored(source)
         if not boards:
             raise InputError(f"plan: '{source}' does not say what boards there are; calibrate it with rigkit")
-        if options.check:
-            return _checked(monitored, boards, count, options, source, bad)
         with about(source):
-            plan = next_frames(monitored, boards, count, length=options.length, reach=options.reach)
-        return _shown(plan, options, f"Next images for {source.name}", source, bad)
+            if options.check:
+                plan, found = _to_check(monitored, boards, count, options.reach)
+            else:
+                plan = next_frames(monitored, boards, count, length=options.length, reach=options.reach)
+        return _shown(plan, options, title, source=source, bad=bad, found=found)
     if source.suffix == ".toml":
         session = load_session(source)
         calibrating = CalibrateOptions(cache=Cache.UPDATE)
@@ -95,29 +99,23 @@ def plan_session(
             boards = without_parts(shape.board for shape in calibration.boards)
         if not boards:
             raise InputError(f"plan: no whole board was seen for '{source}'; give the session that it was made from")
+    if not options.check:
+        warn_of_pupil(source, calibration)
+    with about(source):
+        if options.check:
+            plan, found = _to_check(monitored_camera(calibration, source.stem), boards, count, options.reach)
+        else:
+            plan = next_views(calibration, boards, count, length=options.length, reach=options.reach)
     taken = calibration.corners.used[0]
-    if options.check:
-        return _checked(monitored_camera(calibration, source.stem), boards, count, options, source, bad, taken)
-    warn_of_pupil(source, calibration)
-    with about(source):
-        plan = next_views(calibration, boards, count, length=options.length, reach=options.reach)
-    return _shown(plan, options, f"Next images for {source.name}", source, bad, taken)
+    return _shown(plan, options, title, source=source, bad=bad, taken=taken, found=found)
 
 
-def _checked(
-    monitored: Monitored,
-    boards: Sequence[Board],
-    count: int,
-    options: PlanOptions,
-    source: Path,
-    bad: Finding | None,
-    taken: Pixels | None = None,
-) -> PlannedSession:
-    """Return the pictures to check a camera or a rig with."""
-    with about(source):
-        plan, powers = informative_views(monitored, boards, count, options.reach)
-    found = (power_table(powers, "Changes that these images would reveal"),)
-    return _shown(plan, options, f"Images to check {source.name} with", source, bad, taken, found)
+def _to_check(
+    monitored: Monitored, boards: Sequence[Board], count: int, reach: Reach
+) -> tuple[Plan, tuple[Table, ...]]:
+    """Return the pictures to check a camera or a rig with, and the table of the changes that they would reveal."""
+    plan, powers = informative_views(monitored, boards, count, reach)
+    return plan, (power_table(powers, "Changes that these images would reveal"),)
 
 
 def plan_lens(lens: LensOptions, options: PlanOptions) -> PlannedSession:
@@ -139,6 +137,7 @@ def _shown(
     plan: Plan,
     options: PlanOptions,
     title: str,
+    *,
     source: Path | None = None,
     bad: Finding | None = None,
     taken: Pixels | None = None,

@@ -21,10 +21,7 @@ from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.calibration.solving.clustered import products_between, reduced_by_cluster, root_of_inverse, square_of_rest
 from rigkit.calibration.solving.solver import Solution
 from rigkit.cameras.moving_pupil import far_camera, with_pupil_of
-from rigkit.core.arrays import FloatArray, IntArray
-
-TINY = 1e-300
-"""Least variance, so that ratios of variances exist."""
+from rigkit.core.arrays import TINY, FloatArray, IntArray
 
 
 def lens_modes(
