@@ -68,9 +68,9 @@ def test_corners_on_one_line_of_the_image(where: str, rng: np.random.Generator) 
 
 @pytest.mark.parametrize("noise_px", [0.0, 0.2])
 def test_the_same_image_many_times(noise_px: float, rng: np.random.Generator) -> None:
-    """Nothing tells a bent board from another lens."""
+    """Nothing tells a bent board from another lens; which of the refusals comes first is a matter of rounding."""
     view = random_views(lens("reg"), 1, rng, reach_deg=33.0, noise_px=noise_px)[0][0]
-    with pytest.raises(DegenerateError, match="about different axes"):
+    with pytest.raises(DegenerateError, match="all 8 images show the board at the same pose and count as one"):
         calibrate([replace(view, image=f"{k}.png") for k in range(8)], SIZE, model="brown")
 
 

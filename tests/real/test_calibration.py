@@ -92,7 +92,10 @@ def plane_views(part: str) -> list[BoardView]:
 
 # Whether the pupil moves is decided in nearly half of the time.
 @pytest.mark.parametrize("pupil", ["central", pytest.param("auto", marks=pytest.mark.thorough)])
-@pytest.mark.parametrize(("shape", "limit"), [("warp", PLANE_WARP_PX), ("released", PLANE_RELEASED_PX)])
+@pytest.mark.parametrize(
+    ("shape", "limit"),
+    [("warp", PLANE_WARP_PX), pytest.param("released", PLANE_RELEASED_PX, marks=pytest.mark.thorough)],
+)
 def test_plane_with_published_corners(shape: str, limit: float, pupil: str) -> None:
     result = calibrate(plane_views("train"), (1280, 800), model="kannala_brandt", board=shape, pupil=pupil)
     assert len(result.views) == 18 and result.dropped == ()
@@ -158,6 +161,7 @@ def _centre(camera: Camera) -> FloatArray:
     return camera.project(np.array([0.0, 0.0, 1.0]))[0]
 
 
+@pytest.mark.thorough
 def test_pixels_twice_as_wide_as_high() -> None:
     """As single fields of interlaced images have them. The other models, fitted to boards as one found them, strayed to
     other lenses there, and the right one was refused as open."""

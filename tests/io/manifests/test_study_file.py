@@ -95,7 +95,7 @@ def test_shipped_studies_are_read() -> None:
     assert names == [path.stem for path in paths]
 
 
-def test_processes_and_interruptions_do_not_change_the_numbers(tmp_path: Path) -> None:
+def test_interruptions_do_not_change_the_numbers(tmp_path: Path) -> None:
     study = load_study(write(tmp_path, MINIMAL))
     alone = run_study(study)
     assert [chunk.shape[3] for chunk in alone] == [50, 50, 20]
@@ -117,11 +117,18 @@ def test_processes_and_interruptions_do_not_change_the_numbers(tmp_path: Path) -
     # A damaged part is computed again, not trusted.
     left[0].write_bytes(left[0].read_bytes()[:100])
     reported.clear()
-    resumed = run_study(study, jobs=2, parts=parts, progress=lambda what, done, total: reported.append(done))
+    resumed = run_study(study, parts=parts, progress=lambda what, done, total: reported.append(done))
     assert reported == [1, 2, 3]
     for first, second in zip(alone, resumed, strict=True):
         np.testing.assert_array_equal(first, second)
     assert not parts.exists()
+
+
+@pytest.mark.thorough
+def test_processes_do_not_change_the_numbers(tmp_path: Path) -> None:
+    study = load_study(write(tmp_path, MINIMAL))
+    for one, two in zip(run_study(study), run_study(study, jobs=2), strict=True):
+        np.testing.assert_array_equal(one, two)
 
 
 def test_the_key_depends_on_everything_that_matters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -121,7 +121,7 @@ def test_a_changed_mount_is_found_from_a_scene_without_boards() -> None:
 def _aligned(rng: np.random.Generator) -> tuple[PairMatches, PairMatches]:
     """Patches of planes, aligned by affine warps without noise: as they are found, and as the rig straightens them."""
     camera, offset = DISTORTED.cameras[0], np.arange(-HALF_WIDTH_OF_FEATURE, HALF_WIDTH_OF_FEATURE + 1.0)
-    pixels1 = rng.uniform([20.0, 20.0], [1260.0, 940.0], (1200, 2))
+    pixels1 = rng.uniform([20.0, 20.0], [1260.0, 940.0], (400, 2))
     u = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
     weight = np.exp(-0.25 * (u**2).sum(axis=1) / (WINDOW_OF_PATCH * HALF_WIDTH_OF_FEATURE) ** 2)
     rays, seen1 = camera.unproject(pixels1[:, None] + u)
@@ -143,7 +143,7 @@ def test_what_an_affine_warp_leaves_of_the_map_between_lenses_is_taken_back(rng:
     before, after = check_matches(DISTORTED, [found]), check_matches(DISTORTED, [straight])
     # Half of what a match is taken to err by, but alike wherever it is.
     assert before.rms_px > 0.008
-    assert after.holds and after.rms_px < 0.2 * before.rms_px
+    assert after.holds and after.rms_px < 0.3 * before.rms_px
 
 
 def test_matches_without_information_are_refused() -> None:
