@@ -184,25 +184,26 @@ class CaptureGuide:
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
         frame_gain, min_gain = self._frame_gain(observation.view, plan, photo=photo), min_gain_of(photo=photo)
         remaining = () if self.calibration is None else self._remaining
-        would_do = bool(remaining) and self.has_many
-        would_do = would_do and (all(own.reached for own in remaining) or plan.gain < MIN_GAIN_TO_CONTINUE)
+        reached = all(own.reached for own in remaining) or plan.gain < MIN_GAIN_TO_CONTINUE
+        would_do = bool(remaining) and self.has_many and reached
         steady = self._full.is_steady(len(self.views)) if would_do else False
-        words = f"Hold the board: {where}"
-        if steady is None:
+        enough, waits = steady is True, steady is None
+        is_worth_taking = frame_gain >= min_gain
+        if waits:
             words = CHECKING
-        elif steady:
+        elif enough:
             words = enough_words(remaining, plan.gain, plan.knowledge.camera)
-        elif observation.view is not None and frame_gain >= min_gain and observation.complaint:
+        elif observation.view is not None and is_worth_taking and observation.complaint:
             words = observation.complaint.capitalize()
-        elif would_do:
-            words = f"One more as confirmation: {where}"
+        else:
+            words = f"{'One more as confirmation' if would_do else 'Hold the board'}: {where}"
         return Advice(
             words=words,
             target_px=where.outline_px,
             frame_gain=frame_gain,
-            take=not observation.complaint and frame_gain >= min_gain and steady is False,
-            enough=steady is True,
-            waits=steady is None,
+            take=is_worth_taking and not (observation.complaint or enough or waits),
+            enough=enough,
+            waits=waits,
             remaining=remaining,
             more_percent=100.0 * plan.gain if remaining else None,
         )

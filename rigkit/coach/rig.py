@@ -36,7 +36,7 @@ from rigkit.planning.candidates import board_poses_in_view, outline_mm
 from rigkit.planning.goal import RemainingError
 from rigkit.planning.information import BoardPoses
 from rigkit.planning.instructions import placement
-from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
+from rigkit.planning.mounts import SharedViews, median_motion, mount_error_px, mount_information
 
 SHARED_FRAMES = 5
 """With fewer boards seen by two cameras at once, their disagreement cannot be estimated."""
@@ -274,7 +274,7 @@ class RigGuide:
         motions = [shared.in_b.pose(k) @ shared.in_a.pose(k).inverse() for k in range(len(shared.in_a))]
         board = self.options.boards[0]
         in_a = board_poses_in_view(shared.a, board, self.options.reach)
-        in_b = in_a.transformed(mean_motion(motions))
+        in_b = in_a.transformed(median_motion(motions))
         pixels, valid = shared.b.project(in_b.in_cam(outline_mm(board)))
         both = np.all(valid & shared.b.on_image(pixels), axis=1)
         if not both.any():

@@ -32,6 +32,7 @@ HEADERS = {
     "Cache-Control": "no-store",
 }
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
+NO_SERVER = 'coach: needs a web server; install it with `pip install "rigkit[coach]"`'
 
 
 def new_token() -> str:
@@ -51,7 +52,7 @@ def coach_app(coach: Coach, token: str, hosts: tuple[str, ...] = LOCAL, *, camer
         from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse
         from starlette.routing import Route
     except ImportError as error:
-        raise InstallationError('coach: needs a web server; install it with `pip install "rigkit[coach]"`') from error
+        raise InstallationError(NO_SERVER) from error
 
     async def page(request: Request) -> Response:
         refusal = _refused(request, token, hosts)
@@ -69,7 +70,7 @@ def coach_app(coach: Coach, token: str, hosts: tuple[str, ...] = LOCAL, *, camer
         what = request.path_params["what"]
         try:
             parts = _parts(data, request.query_params.get("sizes"))
-            state = await run_in_threadpool(_done, coach, what, parts)
+            state = await run_in_threadpool(_answer, coach, what, parts)
         except RigkitError as error:
             return JSONResponse({"error": str(error)}, 400, HEADERS)
         if state is None:
@@ -146,7 +147,8 @@ def _parts(data: bytes, sizes: str | None) -> list[bytes]:
     return [data[end - count : end] for end, count in zip(ends, counts, strict=True)]
 
 
-def _done(coach: Coach, what: str, parts: list[bytes]) -> dict[str, Any] | None:
+def _answer(coach: Coach, what: str, parts: list[bytes]) -> dict[str, Any] | None:
+    """Return what the coach answers to the request `what` with its images, None to one that it does not know."""
     if what == "take" and not parts:
         return coach.take_shown()
     if what in ("look", "offer", "take", "photo"):
@@ -178,7 +180,7 @@ def serve(app: Starlette, host: str, port: int, ready: Callable[[int], None]) ->
     try:
         import uvicorn
     except ImportError as error:
-        raise InstallationError('coach: needs a web server; install it with `pip install "rigkit[coach]"`') from error
+        raise InstallationError(NO_SERVER) from error
     with socket.socket() as listening:
         try:
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

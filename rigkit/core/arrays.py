@@ -191,6 +191,11 @@ def known_median(values: FloatArray) -> float:
     return median_of(known) if known.size else math.nan
 
 
+def sampling_step(count: int, max_samples: int) -> int:
+    """Return the step of a slice that takes at most `max_samples` of `count` items, evenly spread."""
+    return max(1, math.ceil(count / max_samples))
+
+
 def rows_where(values: FloatArray, which: BoolArray) -> FloatArray:
     """Return the rows (M, K) of `values` (..., K) where `which` (...) is true. values[which] takes five times as
     long."""

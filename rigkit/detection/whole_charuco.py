@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, sampling_step
 from rigkit.core.boards import Board
 from rigkit.core.patterns.aruco import largest_dictionary, marker_count
 from rigkit.core.patterns.charuco import Charuco
@@ -55,7 +55,7 @@ def choose_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> tupl
     # With an even number of rows of corners both patterns are the same board.
     if len({_squares_of(board).tobytes() for board in boards}) == 1:
         return boards[0], True
-    some = images[:: -(-len(images) // IMAGES_OF_PATTERN)]
+    some = images[:: sampling_step(len(images), IMAGES_OF_PATTERN)]
     excess, places = np.sum(list(in_threads(lambda image: _evidence_for_second(boards, image), some)), axis=0)
     return boards[int(excess > 0.0)], bool(abs(excess) >= SURE_OF_PATTERN * np.sqrt(max(places, 1.0)))
 
@@ -86,7 +86,7 @@ def has_next_row(board: Board, images: Sequence[GreyImage]) -> bool | None:
         likeness[likeness == 0.0] = np.nan
         return likeness, _ends(image, pixels, squares[last & _visible(likeness, last)], taller)
 
-    likeness, ends = zip(*in_threads(like, images[:: -(-len(images) // IMAGES_OF_ROWS)]), strict=True)
+    likeness, ends = zip(*in_threads(like, images[:: sampling_step(len(images), IMAGES_OF_ROWS)]), strict=True)
     of_last, beyond = (np.concatenate([one[row] for one in likeness]) for row in (last, ~last))
     return _resembles_last_row(beyond[np.isfinite(beyond)], of_last[np.isfinite(of_last)], sum(ends))
 
@@ -109,7 +109,7 @@ def has_first_row(board: Board, images: Sequence[GreyImage]) -> bool:
         visible = _visible(likeness, np.ones(len(likeness), np.bool_))
         return _ends(image, found.lattice(), squares[first][visible], board, first=True)
 
-    return sum(in_threads(count, images[:: -(-len(images) // IMAGES_OF_ROWS)])) >= MIN_ENDS
+    return sum(in_threads(count, images[:: sampling_step(len(images), IMAGES_OF_ROWS)])) >= MIN_ENDS
 
 
 def _visible(likeness: FloatArray, row: BoolArray) -> BoolArray:

@@ -36,12 +36,12 @@ from rigkit.interop.exchange import (
 from rigkit.interop.opencv_storage import parse_storage
 
 OPENCV_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"), Accepted("ucm"))
-FAMILIES = (PERSPECTIVE, (Accepted("kannala_brandt"),))
-"""Models that OpenCV rectifies together: those of calib3d, and of fisheye."""
+FAMILIES = {False: PERSPECTIVE, True: (Accepted("kannala_brandt"),)}
+"""Models that OpenCV rectifies together, by whether they are those of cv2.fisheye."""
 MATRIX = ("camera_matrix", "cameraMatrix", "mtx")
 DISTORTION = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D", "dist")
 """Keys in OpenCV's samples, functions and tutorials. K is not among them: it is cv2.fisheye's, with other terms."""
-KEYS = ("M1", "D1", "M2", "D2", "R", "T")
+STEREO_KEYS = ("M1", "D1", "M2", "D2", "R", "T")
 
 
 def write_opencv(camera: Camera, outline: Pixels | None = None) -> Written:
@@ -189,7 +189,7 @@ def read_opencv_stereo(text: str, name: str = "OpenCV stereo") -> tuple[tuple[Ca
     """Return both cameras and cam2_from_cam1 (mm) of a stereo file; raises InputError for missing keys."""
     data = parse_storage(text, name)
     size = written_size(data, name)
-    found = {key: read_opencv_matrix(data, key, name) for key in KEYS}
+    found = {key: read_opencv_matrix(data, key, name) for key in STEREO_KEYS}
     for key, count in (("R", 9), ("T", 3)):
         if found[key].size != count:
             raise InputError(f"'{name}': '{key}' has {found[key].size} numbers instead of {count}; is the file whole?")
@@ -205,7 +205,7 @@ def _family(
 ) -> tuple[tuple[Written, Written], bool]:
     """Return both cameras in the family of models that covers more of the images, then has the smaller error."""
     found = []
-    for fisheye, accepted in enumerate(FAMILIES):
+    for fisheye, accepted in FAMILIES.items():
         try:
             pair = (
                 best_accepted(camera1, accepted, "OpenCV", outlines[0]),
@@ -218,7 +218,7 @@ def _family(
     if not found:
         raise InputError("OpenCV stereo: no family of OpenCV's models follows both lenses; take another format")
     _, _, fisheye, pair = min(found, key=lambda f: f[:3])
-    return pair, bool(fisheye)
+    return pair, fisheye
 
 
 def _rectified(

@@ -6,6 +6,7 @@ board_from_a has the errors of both. Frames are independent, so their informatio
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,8 +63,8 @@ def mount_error_px(shared: SharedViews, information: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(np.einsum("ij,...ji->...", mean, _inverse(information)), 0.0)))
 
 
-def mean_motion(motions: list[Rigid3]) -> Rigid3:
-    """Return the middle of similar motions: medians of their rotations relative to the first, and of translations."""
+def median_motion(motions: Sequence[Rigid3]) -> Rigid3:
+    """Return the componentwise medians of similar motions: of rotations relative to the first, and of translations."""
     first = motions[0]
     turns = np.array([log_so3(m.rotation @ first.rotation.T) for m in motions])
     shifts = np.array([m.translation_mm for m in motions])

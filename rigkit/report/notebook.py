@@ -12,7 +12,7 @@ import numpy as np
 
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, sampling_step
 from rigkit.core.findings import Finding, Severity, most_severe_first, worst
 from rigkit.core.printing import counted
 from rigkit.core.progress import Progress, silent
@@ -81,7 +81,7 @@ def scene_svg(scene: Mapping[str, Any]) -> str:
         colour = SHADES[plane["board"] % len(SHADES)]
         outline = svg.line(drawn(corners))
         out.append(f'<path d="{outline}Z" fill="{colour}" fill-opacity="0.08" stroke="{colour}" stroke-opacity="0.6"/>')
-    step = -(-len(points) // MAX_DRAWN_POINTS) or 1
+    step = sampling_step(len(points), MAX_DRAWN_POINTS)
     board = np.array(scene["board"], dtype=np.int64)
     for index in np.unique(board[::step]).tolist():
         path = svg.dots(drawn(points[::step][board[::step] == index]))

@@ -41,7 +41,7 @@ def run_demo(options: DemoOptions | None = None, *, progress: Progress = silent)
     options = options or DemoOptions()
     if options.seed < 0:
         raise InputError(f"demo: --seed {options.seed}: a number from 0 upwards is needed")
-    process_count(options.jobs)  # complaints before the work
+    process_count(options.jobs)  # an impossible number of jobs is refused before the work
     manifest = build_demo(usable_path(options.output), np.random.default_rng(options.seed), progress)
     _log.info(
         f"capture written to {options.output}: images, boards, {manifest.name}; truth.json, which rigkit does not read"

@@ -86,7 +86,7 @@ def detect_in_images(
         raise InputError(
             f"--min-corners {options.min_corners}: a chessboard of less than 3x3 corners cannot be recognised"
         )
-    process_count(options.jobs)  # complaints before the work
+    process_count(options.jobs)  # an impossible number of jobs is refused before the work
     boards = tuple(board_of_words(str(board)) for board in options.boards)
     given = [one for path in paths for one in videos_inside(Path(path))]
     videos, bad = _frames_of(list(filter(is_video, given)), boards, progress)

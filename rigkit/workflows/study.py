@@ -53,7 +53,7 @@ def run_studies(
     Raises InputError, before the first study runs, if a file cannot be read or written or two studies share a name.
     """
     options = options or StudyOptions()
-    process_count(options.jobs)  # complaints before the work
+    process_count(options.jobs)  # an impossible number of jobs is refused before the work
     studies = [load_study(path) for path in paths]
     if options.trials is not None:
         studies = [replace(study, trials=options.trials) for study in studies]

@@ -42,7 +42,7 @@ from rigkit.geometry.rotation import angle_between, log_so3, unit
 from rigkit.io.manifests.rig_session import load_rig_session
 from rigkit.planning.candidates import board_poses_in_view
 from rigkit.planning.information import CornerError
-from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
+from rigkit.planning.mounts import SharedViews, median_motion, mount_error_px, mount_information
 from rigkit.workflows.capture.coach import open_coach
 from rigkit.workflows.options.coach import CoachOptions
 
@@ -69,7 +69,7 @@ def test_the_error_of_a_mount_is_what_repeated_frames_show(rng: np.random.Genera
     in_px = mount_error_px(shared, information[0])
     assert 0.3 * NOISE_PX < in_px < 3.0 * NOISE_PX
     assert mount_error_px(shared, 4.0 * information[0]) == pytest.approx(0.5 * in_px)
-    assert np.allclose(mean_motion([MOUNT] * 3).matrix(), MOUNT.matrix())
+    assert np.allclose(median_motion([MOUNT] * 3).matrix(), MOUNT.matrix())
 
 
 def test_a_rig_is_enough_when_lenses_and_mounts_are(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, sampling_step
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.codes import transferred
 from rigkit.kernels.surface import maps_of_quads
@@ -58,7 +58,7 @@ def module_size(image: GreyImage, upright: FloatArray, bits: BoolArray, step: fl
     bits : (N, B, B) which bits of their codes are black.
     step : distance from one tag to the next, in sides of these quadrilaterals.
     """
-    some = slice(None, None, -(-len(upright) // ENOUGH_TAGS))
+    some = slice(None, None, sampling_step(len(upright), ENOUGH_TAGS))
     upright, bits, count = upright[some], bits[some], bits.shape[1]
     maps = maps_of_quads(upright)
     outlines = np.arange(count + 1.0, count + 6.0, OUTLINE_STEP)

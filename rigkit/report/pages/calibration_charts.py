@@ -12,7 +12,7 @@ import numpy as np
 
 from rigkit.calibration.certainty.uncertainty import projection_uncertainty
 from rigkit.calibration.result import Calibration
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, sampling_step
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.report import svg
 from rigkit.report.svg import DRAWN_WIDTH, INK, SOFT, round_down, round_up
@@ -143,7 +143,7 @@ def radius_svg(calibration: Calibration) -> str:
     plot = _Plot(
         "error against radius", (0.0, reach), (0.0, top), ("distance from the image's centre, px", "error, px")
     )
-    step = -(-len(radius) // MAX_RESIDUAL_DOTS)
+    step = sampling_step(len(radius), MAX_RESIDUAL_DOTS)
     shown = error[::step] <= top
     places = np.stack([plot.u(radius[::step][shown]), plot.v(error[::step][shown])], axis=-1)
     plot.parts.append(

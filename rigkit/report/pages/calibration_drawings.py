@@ -13,7 +13,7 @@ from rigkit.calibration.certainty.coverage import outline_of_corners
 from rigkit.calibration.certainty.uncertainty import projection_uncertainty, uncertainty_map
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.compare import grid_pixels
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, sampling_step
 from rigkit.report import svg
 from rigkit.report.svg import DRAWN_WIDTH, INK, MARK, SOFT, WRONG, dots, round_down, strokes
 
@@ -41,7 +41,7 @@ def residuals_svg(calibration: Calibration) -> str:
     """Draw the magnified residual of each corner; outliers are crosses."""
     corners, (pixels, residuals) = calibration.corners, calibration.corners.used
     times = round_down(RMS_LENGTH * calibration.camera.size_px[0] / max(calibration.rms_px, 1e-9))
-    step = -(-len(pixels) // MAX_VECTORS)
+    step = sampling_step(len(pixels), MAX_VECTORS)
     q, d = pixels[::step], residuals[::step]
     words = f"{len(q)} residuals, measured minus projected, magnified {times:g} times"
     words += f" (every {_ordinal(step)} drawn)" if step > 1 else ""
@@ -112,7 +112,7 @@ def coverage_svg(calibration: Calibration) -> str:
             shade = 0.08 + 0.42 * min(count[i, j] / max(np.quantile(count[count > 0], 0.9), 1.0), 1.0)
             place = f'x="{i * w:.1f}" y="{j * h:.1f}" width="{w:.1f}" height="{h:.1f}"'
             out.append(f'<rect {place} fill="{INK}" fill-opacity="{shade:.2f}"/>')
-    step = -(-len(pixels) // MAX_VECTORS)
+    step = sampling_step(len(pixels), MAX_VECTORS)
     out.append(f'<path d="{dots(zoom * pixels[::step])}" stroke="{MARK}" stroke-width="2.2" stroke-linecap="round"/>')
     middles = (np.stack(np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"), axis=-1) + 0.5) * size - 0.5
     seen = calibration.camera.unproject(middles)[1] | (count > 0)

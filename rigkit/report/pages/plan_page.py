@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import Pixels, without_nan
+from rigkit.core.arrays import Pixels, sampling_step, without_nan
 from rigkit.core.boards import Board
 from rigkit.core.tables import Column, Table, cells
 from rigkit.geometry.rigid3 import Rigid3
@@ -88,7 +88,7 @@ def view_svg(plan: Plan, index: int, taken: Pixels | None = None) -> str:
     where = placement(camera, view.board, view.cam_from_board)
     out = [svg.image_ground(str(where), VIEW_WIDTH, zoom * camera.size_px[1])]
     if taken is not None and len(taken):
-        path = svg.dots(zoom * taken[:: -(-len(taken) // MAX_DOTS)])
+        path = svg.dots(zoom * taken[:: sampling_step(len(taken), MAX_DOTS)])
         out.append(f'<path d="{path}" stroke="{INK}" stroke-opacity="0.35" stroke-width="2" stroke-linecap="round"/>')
     out += [
         f'<path d="{_path(zoom * square)}Z" fill="{MARK}" fill-opacity="0.75"/>'

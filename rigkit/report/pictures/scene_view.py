@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.result import ViewResult
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, sampling_step
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.reconstruct import Reconstruction
 
@@ -29,7 +29,7 @@ def scene_of(reconstruction: Reconstruction) -> dict[str, Any]:
     cloud = reconstruction.cloud
     cameras = {"camera 1": Rigid3.identity(), "camera 2": reconstruction.cam2_from_cam1.inverse()}
     planes = [
-        {"board": index, "corners": _rounded(_box(cloud.points_mm[cloud.board_index == index]), 2)}
+        {"board": index, "corners": _rounded(_bounding_box(cloud.points_mm[cloud.board_index == index]), 2)}
         for index in range(len(cloud.board_ids))
         if (cloud.board_index == index).sum() >= 3
     ]
@@ -78,7 +78,7 @@ def _views_scene(
     names = list(dict.fromkeys(wholes.values()))
     outlines = {name: _outline(points) for name, points in shapes.items()}
     planes = []
-    for view, world_from_cam in views[:: -(-len(views) // MAX_BOARDS) or 1]:
+    for view, world_from_cam in views[:: sampling_step(len(views), MAX_BOARDS)]:
         corners = (world_from_cam @ view.cam_from_board).apply(outlines[view.board_id])
         name = f"{view.image}, {view.board_id}: {view.rms_px:.3f} px"
         planes.append({"board": names.index(wholes[view.board_id]), "corners": _rounded(corners, 2), "name": name})
@@ -115,7 +115,7 @@ def _outline(points_mm: FloatArray) -> FloatArray:
     return np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
 
 
-def _box(points: FloatArray) -> FloatArray:
+def _bounding_box(points: FloatArray) -> FloatArray:
     """Return the corners (4, 3) of the bounding box, along the principal axes, of coplanar points."""
     centre = points.mean(axis=0)
     axes = np.linalg.svd(points - centre, full_matrices=False)[2][:2]

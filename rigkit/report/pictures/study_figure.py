@@ -13,6 +13,8 @@ from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
 METHOD_COLOURS: tuple[str, ...] = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
 METHOD_COLOURS += ("#332288", "#44aa99", "#882255", "#999933", "#cc6677", "#111111")
+UNDATED: dict[str, dict[str, None]] = {"png": {"Software": None}, "pdf": {"CreationDate": None}}
+"""What is left out of a file by format, so that the same figure gives the same file."""
 SWATCH_INCHES, LETTER_INCHES = 0.6, 0.085
 """Widths in the legend: of a swatch with the gaps around it, and of a letter of a method's name."""
 
@@ -47,8 +49,7 @@ def study_figure(table: StudyTable, file_format: str = "png") -> bytes:
         fitting = min(len(study.methods), max(1, int(figure.get_figwidth() / entry)))
         figure.legend(handles, study.methods, loc="outside lower center", ncols=fitting, frameon=False)
     data = io.BytesIO()
-    metadata = {"Software": None} if file_format == "png" else {"CreationDate": None} if file_format == "pdf" else None
-    figure.savefig(data, format=file_format, dpi=150, metadata=metadata)
+    figure.savefig(data, format=file_format, dpi=150, metadata=UNDATED.get(file_format))
     return data.getvalue()
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rigkit.core.arrays import sampling_step
 from rigkit.core.boards import Board
 from rigkit.core.errors import CheckFailed, DegenerateError, InputError
 from rigkit.core.patterns.aprilgrid import AprilGrid
@@ -214,7 +215,7 @@ def _mirrored_where_doubtful(
         or (not guess.marked and len(guess.images) >= MIN_SHARE_OF_IMAGES * len(pictures))
     ):
         return None
-    some = pictures[:: max(1, -(-len(pictures) // EXPLAINING_IMAGES))]
+    some = pictures[:: sampling_step(len(pictures), EXPLAINING_IMAGES)]
     marks = guess_board([_flipped(image) for _, image in some], _named(progress, "checking for mirrored images"))
     if marks is not None and marks.board.identified and len(marks.images) >= MIN_SHARE_OF_IMAGES * len(some):
         return _mirror_message(some[marks.images[0]][0], marks.board.pattern)
@@ -223,7 +224,7 @@ def _mirrored_where_doubtful(
 
 def _doubtful(pictures: Sequence[tuple[str, GreyImage]], progress: Progress) -> str | None:
     """Return a description of the first doubtful grid in images, or None."""
-    some = pictures[:: max(1, -(-len(pictures) // EXPLAINING_IMAGES))]
+    some = pictures[:: sampling_step(len(pictures), EXPLAINING_IMAGES)]
     for k, (name, image) in enumerate(some):
         progress("searching for doubtful boards", k, len(some))
         words = doubtful_grid(image)
@@ -347,7 +348,7 @@ def _pictures(
 ) -> Iterator[tuple[str, GreyImage | InputError]]:
     """Yield (name, grey image or error) of about `max_images` images, evenly spread over `paths`; `between`: of those
     halfway between these. Videos give frames."""
-    step = max(1, -(-len(paths) // max_images))
+    step = sampling_step(len(paths), max_images)
     for path in paths[step // 2 if between else 0 :: step]:
         try:
             if is_video(path):

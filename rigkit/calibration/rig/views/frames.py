@@ -21,7 +21,7 @@ from rigkit.calibration.rig.views.observations import (
     outer_corners,
 )
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, sampling_step
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.geometry.rigid3 import Rigid3
@@ -154,7 +154,7 @@ def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | 
     x1, x2 = (np.einsum("nij,ncj->nci", r, points) + t[:, None] for r, t in ((r1, t1), (r2, t2)))
     distance = np.linalg.norm(x2, axis=-1).mean(axis=-1)
     starts = np.flatnonzero(np.diff([-1, *owner]))
-    tried = np.arange(0, len(owner), -(-len(owner) // MAX_TRIED))
+    tried = np.arange(0, len(owner), sampling_step(len(owner), MAX_TRIED))
     off_mm = np.einsum("hij,ncj->hnci", rotation[tried], x1) + shift[tried, None, None] - x2
     offs = np.sqrt(np.einsum("hnci,hnci->hnc", off_mm, off_mm)).mean(axis=-1) / distance
     typical = np.median(np.minimum.reduceat(offs, starts, axis=1), axis=1)
