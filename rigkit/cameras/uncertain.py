@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
-from rigkit.geometry.principal_axes import principal_axes
+from rigkit.core.arrays import FloatArray, principal_axes
 from rigkit.geometry.relative_pose import relative_pose, relative_pose_jacobian
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3

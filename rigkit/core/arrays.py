@@ -28,6 +28,8 @@ MIN_EIGENVALUE = -1e-6
 
 TINY = 1e-300
 """Least divisor (variance, sum of squares) where a quotient must exist; below all that is not rounding."""
+NEGLIGIBLE_AXIS = 1e-12
+"""Relative variance (of parameters scaled to one sigma) up to which a principal axis is left out."""
 SORTED_SOONER = 1000
 """Below so many numbers sorting is faster than partitioning."""
 
@@ -233,6 +235,15 @@ def scaled_pinv(matrix: FloatArray, rcond: float = 1e-15) -> FloatArray:
     diagonal = np.diag(matrix)
     scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 0.0)
     return np.asarray(symmetric_pinv(matrix * scale[:, None] * scale, rcond) * scale[:, None] * scale)
+
+
+def principal_axes(covariance: FloatArray) -> FloatArray:
+    """Return rows (K, P) whose outer products sum up to `covariance`: independent steps of one sigma each."""
+    sigma = np.sqrt(np.diag(covariance))
+    safe = np.where(sigma > 0.0, sigma, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
+    kept = values > NEGLIGIBLE_AXIS * values[-1]
+    return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T * sigma)
 
 
 def median_of(values: FloatArray) -> float:

@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, principal_axes
 from rigkit.core.truth import Feature, MeasuredDistance
-from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.triangulation import point_uncertainty
 from rigkit.reconstruction.calibration_shifts import CalibrationShifts
 from rigkit.reconstruction.reconstruct import Reconstruction

@@ -33,10 +33,10 @@ from rigkit.coach.guide import GuideOptions
 from rigkit.coach.look import FrameObservation, observe_frame
 from rigkit.coach.rig import SHARED_FRAMES, RigGuide
 from rigkit.coach.sources import frames_of_folders
+from rigkit.core.arrays import principal_axes
 from rigkit.core.errors import InputError
 from rigkit.core.measurement_task import Quantity, Task
 from rigkit.geometry.board_pose import board_pose
-from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, log_so3, unit
 from rigkit.io.manifests.rig_session import load_rig_session

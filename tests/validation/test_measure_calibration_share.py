@@ -9,8 +9,8 @@ from helpers.reconstructions import make_reconstruction
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.core.arrays import principal_axes
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
-from rigkit.geometry.principal_axes import principal_axes
 from rigkit.reconstruction.calibration_shifts import calibration_shifts
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.checks import validate

@@ -25,7 +25,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
 from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
-from rigkit.reconstruction.growing.curvature import correct_curvature
 from rigkit.reconstruction.growing.fill import at_best_depth, fill_holes
 from rigkit.reconstruction.growing.grow import (
     EpipolarConstraint,
@@ -34,7 +33,7 @@ from rigkit.reconstruction.growing.grow import (
     grow,
     grow_in_both_directions,
 )
-from rigkit.reconstruction.growing.surface import WINDOW_AREA_PX, GrownSurface, PairRays, fit_surface
+from rigkit.reconstruction.growing.surface import WINDOW_AREA_PX, GrownSurface, PairRays, correct_curvature, fit_surface
 from rigkit.reconstruction.growing.sweep import fill_by_sweep
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_lens_errors
 from rigkit.reconstruction.moved_cameras import Calibrations, moved_pairs, visible_in_all

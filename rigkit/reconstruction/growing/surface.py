@@ -15,7 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rigkit.affine.refine_patches import FLOOR_PX, WINDOW_OF_PATCH
+from rigkit.affine.curvature import curvature_shift, window_variance
+from rigkit.affine.refine_patches import FLOOR_PX, WINDOW_OF_PATCH, levels_of_larger
 from rigkit.affine.surface import linear_gauge
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Normals, Points
@@ -278,3 +279,17 @@ def _inverse(normal: FloatArray) -> FloatArray:
     scale = 1.0 / np.sqrt(np.einsum("nii->ni", normal))
     both = scale[:, :, None] * scale[:, None, :]
     return np.asarray(np.linalg.inv(normal * both) * both)
+
+
+def correct_curvature(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3) -> GrownPatches:
+    """Return the pairs, at their nodes or `centred`, with their pixels in image 2 corrected for the curvature of the
+    surface in their alignment windows (`affine.curvature`)."""
+    planes = PairRays.of(grown, camera1, camera2).planes(cam2_from_cam1)
+    at = grown.valid & np.isfinite(planes[..., 0])
+    place = grown.pixels1[at]
+    rows, columns = np.nonzero(at)
+    off = place - grown.step * np.stack([columns, rows], axis=1)
+    variance = window_variance(HALF_WIDTH) * 4.0 ** (grown.coarser[at] + levels_of_larger(grown.A21[at]))
+    pixels2 = grown.pixels2.copy()
+    pixels2[at] -= curvature_shift(place, planes[at], variance, (camera1, camera2), cam2_from_cam1, off)
+    return replace(grown, pixels2=pixels2)
