@@ -129,7 +129,8 @@ def one_off(views: Views) -> Views:
 
 
 def test_one_off_in_all_frames(rng: np.random.Generator) -> None:
-    assert ONE_OFF in cause(one_off(pair(rng)))
+    """Six frames: with so few the joint solution first believes some of them, and leaves out others."""
+    assert ONE_OFF in cause(one_off({name: own[:6] for name, own in pair(rng).items()}))
 
 
 @pytest.mark.parametrize("board", [BOARD, Board("even", 8, 6, 30.0, 30.0)])
