@@ -8,12 +8,14 @@ from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens
 
+from rigkit.calibration.rig import calibrate
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.certainty.readouts import readout_error
 from rigkit.calibration.rig.heldout import heldout_rms
@@ -21,11 +23,12 @@ from rigkit.calibration.rig.joint import JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving import lags
 from rigkit.calibration.rig.solving.exposure_times import POINTS
-from rigkit.calibration.rig.solving.lags import Timing, cost_of_own_times, times_of, with_trajectories
+from rigkit.calibration.rig.solving.lags import TIMINGS, Timing, cost_of_own_times, times_of, with_trajectories
 from rigkit.calibration.rig.solving.shutters import readout_errors_of_speeds, readout_steps, with_longer_readouts
 from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
+from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibrations.rig_file import load_saved_rig, rig_text
@@ -137,16 +140,19 @@ def test_images_are_read_row_by_row(tmp_path: Path) -> None:
     assert list(load_saved_rig(tmp_path / "rig.json").cameras) == ["left", "right"]
 
 
-@pytest.mark.parametrize("best", ["lags", "trigger"])
+@pytest.mark.parametrize("best", TIMINGS)
 def test_timing_that_predicts_worse_is_left_out(best: Timing, monkeypatch: pytest.MonkeyPatch) -> None:
+    def solved(views: Any, progress: Progress, known: None, timing: Timing = "readouts") -> Any:
+        return SimpleNamespace(timing=timing)
+
     def heldout(joint: JointRig, folds: int) -> tuple[float, tuple[float, ...]]:
         return (0.2 if joint.timing == best else 0.3), (0.1, 0.1)
 
-    monkeypatch.setattr("rigkit.calibration.rig.calibrate.heldout_rms", heldout)
-    rig = rig_of(0.05, 0, readout=0.05, time=lambda k: 0.5 * k)
-    assert not rig.readouts
-    assert bool(rig.lags) == (best == "lags")
-    assert rig.heldout_rms_px == 0.2
+    monkeypatch.setattr(calibrate, "solve_jointly", solved)
+    monkeypatch.setattr(calibrate, "heldout_rms", heldout)
+    every: Any = None
+    joint, (rms, _) = calibrate._best_timing(every, None, 5, silent)
+    assert joint.timing == best and rms == 0.2
 
 
 def test_without_heldout_errors_the_rig_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,6 +181,12 @@ def joint_with_readouts(seed: int) -> JointRig:
         patch.setattr("rigkit.calibration.rig.calibrate.heldout_rms", kept)
         rig_of(0.05, seed, readout=0.05, time=lambda k: 0.5 * k)
     return joints[0]
+
+
+def test_lags_are_all_that_is_solved_for_where_no_more_is_asked() -> None:
+    joint = joint_with_readouts(0)
+    again = solve_jointly(joint.views, silent, timing="lags")
+    assert joint.timing == "readouts" and again.timing == "lags"
 
 
 def test_readouts_are_solved_for_until_they_settle() -> None:
