@@ -59,13 +59,14 @@ def rig_page(
     `session_page`."""
     name = session.path.resolve().parent.name
     sections = [
-        CalibrationSection(own, c, _thumbnails(session.cameras[own], c), plans.get(own)) for own, c in shown.items()
+        CalibrationSection(camera, calibration, _thumbnails(session.cameras[camera], calibration), plans.get(camera))
+        for camera, calibration in shown.items()
     ]
     boards = _boards_in_words(next(iter(session.cameras.values())).boards)
-    then = "then every camera as calibrated alone" if len(rig.cameras) > 1 else "then the camera"
-    lead = f"{session.path.name} with {boards}: the rig first, {then}"
-    images = {f"images of {own}": s.images for own, s in session.cameras.items()}
-    sources = {f"corners of {own}": found.source for own, found in corners.items()}
+    cameras = "every camera as calibrated alone" if len(rig.cameras) > 1 else "the camera"
+    lead = f"{session.path.name} with {boards}: the rig first, then {cameras}"
+    images = {f"images of {camera}": own.images for camera, own in session.cameras.items()}
+    sources = {f"corners of {camera}": found.source for camera, found in corners.items()}
     facts = _facts(session.path, files, images, sources)
     return build_calibration_page(f"rigkit rig calibration: {name}", lead, sections, facts, rig, checks)
 
