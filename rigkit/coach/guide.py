@@ -193,7 +193,7 @@ class CaptureGuide:
             words = CHECKING
         elif enough:
             words = enough_words(remaining, plan.gain, plan.knowledge.camera)
-        elif observation.view is not None and is_worth_taking and observation.complaint:
+        elif is_worth_taking and observation.complaint:
             words = observation.complaint.capitalize()
         else:
             words = f"{'One more as confirmation' if would_do else 'Hold the board'}: {where}"

@@ -84,9 +84,7 @@ class FrameObservation:
 
     @property
     def complaint(self) -> str:
-        """What is wrong with the image, in words; "" where nothing is."""
-        if self.view is None:
-            return "show the whole board"
+        """What is wrong with the image of the board that is seen, in words; "" where nothing is."""
         if self.contrast < MIN_BOARD_CONTRAST:
             return "more light"
         if self.clipped > MAX_CLIPPED:
