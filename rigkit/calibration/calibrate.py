@@ -235,7 +235,8 @@ def _result(solution: _Solution) -> Calibration:
         other = solution.with_pupil(replace(moving, candidates=[*candidates, *moving.candidates]))
         with suppress(DegenerateError):
             result, far_of_moving = other.assembled()
-            if result.pupil is not None and (request.pupil == "moving" or (better and pupil_is_significant(result))):
+            confirmed = request.pupil == "moving" or (better and pupil_is_significant(result, central))
+            if confirmed and result.pupil is not None:
                 return other.with_verdicts(result, far_of_moving)
             if possible and solved_again(result) is not None:
                 central, far = solution.assembled(possible)

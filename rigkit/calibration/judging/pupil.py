@@ -83,12 +83,14 @@ class MovingPupil:
         between images.
     freedom : degrees of freedom of the latter.
     parameter_changes : (P,) change of the camera's parameters if the movement were modelled.
+    left_px : residuals that remain, rms per degree of freedom.
     """
 
     mm_per_rad2: float
     sigma_mm_per_rad2: float
     freedom: float
     parameter_changes: FloatArray
+    left_px: float
 
     @classmethod
     def of(cls, calibration: Calibration) -> MovingPupil | None:
@@ -97,7 +99,7 @@ class MovingPupil:
         if found is None:
             return None
         # Rows common to all images, then the pupil and the residual.
-        products, image, p = found
+        products, image, p, residuals = found
         whole = products.sum(axis=0)
         scale = np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
         gram = whole / np.outer(scale, scale)
@@ -112,7 +114,8 @@ class MovingPupil:
         information = left * scale[pupil] ** 2
         own, pull = products[:, :-1, :-1], products[:, :-1, -1]
         amount = float((pull @ direction).sum()) / information
-        step = _regression(gram, np.arange(pupil + 1), -1) * scale[-1] / scale[:-1]
+        fitted = _regression(gram, np.arange(pupil + 1), -1)
+        step = fitted * scale[-1] / scale[:-1]
         after = np.bincount(image, (pull - own @ step) @ direction)
         share = np.bincount(image, own @ direction @ direction) / information
         variance = float((after**2 / np.maximum(1.0 - share, MIN_LEFT)).sum()) / information**2
@@ -120,7 +123,9 @@ class MovingPupil:
         freedom = max(1.0 / float((share**2).sum()) - 1.0, 1.0)
         # The calibration itself could adapt its parameters and board shapes, but no displacements.
         alone = _regression(gram, np.append(common[:p], common[-BOWS:]), pupil)[:p] * scale[pupil] / scale[:p]
-        return cls(amount, float(np.sqrt(variance)), freedom, -amount * alone)
+        square = max(float(gram[-1, -1] - fitted @ gram[:-1, -1]), 0.0) * scale[-1] ** 2
+        left_px = float(np.sqrt(square / max(residuals - len(fitted), 1)))
+        return cls(amount, float(np.sqrt(variance)), freedom, -amount * alone, left_px)
 
     @property
     def chance(self) -> float:
@@ -164,14 +169,19 @@ def solved_again(calibration: Calibration) -> MovingPupil | None:
     return None if taken_back else replace(rest, mm_per_rad2=solved + rest.mm_per_rad2)
 
 
-def pupil_is_significant(calibration: Calibration) -> bool:
-    """Return whether the pupil of a calibration moves significantly."""
-    again = solved_again(calibration)
-    return again is not None and again.chance <= BY_CHANCE
+def pupil_is_significant(calibration: Calibration, central: Calibration) -> bool:
+    """Return whether the pupil of a calibration moves significantly, by the residuals of the same lens with or without
+    it. Both are linearised with any displacement of a central lens free, and the one that is nearer to the joint
+    minimum leaves less: a pupil solved for instead of a displacement has moved lens and boards far away from it."""
+    again, before = solved_again(calibration), MovingPupil.of(central)
+    if again is None or (before is not None and before.left_px < again.left_px and before.chance > BY_CHANCE):
+        return False
+    return again.chance <= BY_CHANCE
 
 
-def _products(calibration: Calibration) -> tuple[FloatArray, IntArray, int] | None:
-    """Return J^T J (V, K, K) of V views with poses eliminated, the image (V,) of each, and P; None with too few views.
+def _products(calibration: Calibration) -> tuple[FloatArray, IntArray, int, int] | None:
+    """Return J^T J (V, K, K) of V views with poses eliminated, the image (V,) of each, P, and the number of residuals
+    less that of the poses' parameters; None with too few views.
     The columns of J are derivatives by what is common to all images (the camera's P parameters, displacements of the
     image and bows of the boards) and by the pupil, and the residual."""
     views = [view for view in calibration.views if np.count_nonzero(view.kept) >= MIN_INFORMATIVE_CORNERS]
@@ -182,7 +192,8 @@ def _products(calibration: Calibration) -> tuple[FloatArray, IntArray, int] | No
         return None
     length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
     image = np.unique([view.image for view in views], return_inverse=True)[1]
-    return without_pose(products, length)[:, 6:, 6:], image, calibration.camera.parameters.size
+    residuals = sum(2 * int(np.count_nonzero(view.kept)) - 6 for view in views)
+    return without_pose(products, length)[:, 6:, 6:], image, calibration.camera.parameters.size, residuals
 
 
 def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatArray, IntArray]:

@@ -231,21 +231,24 @@ def _each_alone(
     names = [name for name, _, _ in asked]
     found |= dict(zip(names, calibrate_together(asked, known=candidate_fits, progress=progress), strict=True))
     if any(found[name].pupil is not None for name in names):
-        found |= _with_pupils_too([one for one in asked if one[2].pupil == "auto" and found[one[0]].pupil is None])
+        central = {name: one for name, one in found.items() if one.pupil is None}
+        found |= _with_pupils_too([one for one in asked if one[2].pupil == "auto" and one[0] in central], central)
     seen = [frame_observations(own, found[name]) for name, own in views.items()]
     return RigViews(list(views), seen, tuple(found[name] for name in views), {})
 
 
-def _with_pupils_too(cameras: Sequence[tuple[str, Sequence[BoardView], Request]]) -> dict[str, Calibration]:
-    """Return the calibrations with a moving pupil of those cameras for which it is significant. If other cameras of the
-    rig have a moving pupil, no improvement of the held-out error is required."""
+def _with_pupils_too(
+    cameras: Sequence[tuple[str, Sequence[BoardView], Request]], central: Mapping[str, Calibration]
+) -> dict[str, Calibration]:
+    """Return the calibrations with a moving pupil of those cameras for which it is significant, against their `central`
+    ones. If other cameras of the rig have a moving pupil, no improvement of the held-out error is required."""
     out = {}
     for name, views, request in cameras:
         try:
             (moving,) = calibrate_together([(name, views, replace(request, pupil="moving"))])
         except DegenerateError:
             continue
-        if pupil_is_significant(moving):
+        if pupil_is_significant(moving, central[name]):
             out[name] = moving
     return out
 

@@ -26,6 +26,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Severity
+from rigkit.kernels.departures import DISPLACEMENTS, displacements
 
 NEAR, FAR = Board("near", 9, 6, 12.0, 12.0), Board("far", 9, 6, 120.0, 120.0)
 """They fill the image at 90 to 210 mm, and at ten times that."""
@@ -167,13 +168,13 @@ def test_residuals_are_those_of_points_in_mm() -> None:
 def test_the_option_pupil_decides_whether_one_is_solved_for() -> None:
     assert session(NEAR, MM_PER_RAD2, 0).pupil is None
     forced = session(NEAR, 0.0, 1, pupil="moving")
-    assert forced.pupil is not None and not pupil_is_significant(forced)
+    assert forced.pupil is not None and not pupil_is_significant(forced, session(NEAR, 0.0, 1))
     with pytest.raises(InputError, match="auto, central, moving"):
         session(NEAR, 0.0, 1, pupil="perhaps")
 
 
 def test_an_insignificant_pupil_is_dropped_with_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rigkit.calibration.calibrate.pupil_is_significant", lambda _: False)
+    monkeypatch.setattr("rigkit.calibration.calibrate.pupil_is_significant", lambda *_: False)
     found = session(NEAR, MM_PER_RAD2, 0, pupil="auto")
     assert found.pupil is None
     printed = {c.name: c for c in found.candidates}
@@ -194,10 +195,28 @@ def test_a_few_images_have_a_pupil_or_sigmas_that_include_it() -> None:
 def test_residuals_take_back_a_pupil_that_only_a_wrong_model_asks_for() -> None:
     rng = np.random.default_rng(0)
     views = random_views(lens("reg"), 12, rng, reach_deg=REACH_DEG["reg"], noise_px=0.05)[0]
-    wrong = calibrate(views, SIZE, model="pinhole", board="flat", folds=0, pupil="moving")
-    assert wrong.pupil is not None and solved_again(wrong) is None and not pupil_is_significant(wrong)
+    wrong, central = (
+        calibrate(views, SIZE, model="pinhole", board="flat", folds=0, pupil=pupil) for pupil in ("moving", "central")
+    )
+    assert wrong.pupil is not None and solved_again(wrong) is None and not pupil_is_significant(wrong, central)
     again = solved_again(session(NEAR, MM_PER_RAD2, 0, pupil="moving"))
     assert again is not None and 0.9 * MM_PER_RAD2 < again.mm_per_rad2 < 1.1 * MM_PER_RAD2
+
+
+def test_a_lens_that_departs_from_its_model_is_central() -> None:
+    """Solved for with a pupil, lens and boards are so far from the truth that its residuals do not take it back."""
+    rng = np.random.default_rng(38)
+    amounts, views = rng.normal(size=DISPLACEMENTS), []
+    for view in random_views(lens("wide"), 12, rng, reach_deg=REACH_DEG["wide"], noise_px=0.05)[0]:
+        pixels = view.pixels + np.einsum("ijn,j->ni", displacements(view.pixels, SIZE), amounts)
+        views.append(replace(view, pixels=np.clip(pixels, 0.0, np.array(SIZE) - 1.0)))
+    moving, found = (
+        calibrate(views, SIZE, model="kannala_brandt", board="flat", folds=0, pupil=pupil)
+        for pupil in ("moving", "auto")
+    )
+    again = solved_again(moving)
+    assert again is not None and again.chance < BY_CHANCE
+    assert found.pupil is None and pupil_of(found).left_px < again.left_px
 
 
 def test_a_requested_pupil_that_images_do_not_determine_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
