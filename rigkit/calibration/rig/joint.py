@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.solving.departing import cost_with_departures
 from rigkit.calibration.rig.solving.known import KnownCameras
 from rigkit.calibration.rig.solving.lags import Timing, times_of, with_lags
 from rigkit.calibration.rig.solving.shape import common_shape
@@ -172,6 +173,8 @@ def solve_jointly(
     typical_sigmas = float(np.sqrt(typical) / max(sigma, MIN_PX))
     typical_px, size_px = typical_distance_px(observations, cost), _boards_px(seen)
     _require_common_moments(typical_px, size_px, seen)
+    if typical_sigmas > DISAGREES and known is None:
+        typical_sigmas = min(typical_sigmas, _sigmas_with_departures(observations, solution, sigma))
     if typical_sigmas > DISAGREES:
         observations = replace(observations, held=_lens_priors(single, sigma, typical_sigmas**2 - 1.0))
         if known is not None:
@@ -191,6 +194,12 @@ def solve_jointly(
         notes=(*(sizes or also), *notes),
         known=known,
     )
+
+
+def _sigmas_with_departures(observations: RigObservations, solution: Solution[RigState], sigma: float) -> float:
+    """Return the typical cost of sharing poses, in standard deviations, if lenses depart from their models."""
+    cost = cost_with_departures(observations, solution, sigma)
+    return float("inf") if cost is None else float(np.sqrt(typical_cost(cost, sigma)) / max(sigma, MIN_PX))
 
 
 def _solved(

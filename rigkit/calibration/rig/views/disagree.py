@@ -18,6 +18,7 @@ import numpy as np
 from rigkit.calibration.rig.solving.state import Key, RigObservations, RigState
 from rigkit.calibration.rig.views.observations import FrameObservations
 from rigkit.calibration.solving.solver import Solution
+from rigkit.core.arrays import FloatArray
 from rigkit.core.printing import digits
 
 MAX_DISTANCE_RATIO = 12.0
@@ -44,16 +45,20 @@ def cost_of_sharing(
 ) -> dict[Key, float]:
     """Return for every shared target the increase of the cost by sharing one pose, px^2 for each of the six parameters
     that every view but one gives up. Residuals of a view that is bad by itself do not count."""
-    poses = len(observations.keys)
-    alone, views = np.zeros(poses), np.zeros(poses)
+    alone = np.zeros(len(observations.keys))
     for c, own in enumerate(seen):
         weight, frame, camera = observations.weights[c], observations.frame[c], observations.cameras[c]
         squared = np.zeros(weight.shape)
         squared[camera.present] = np.concatenate([e.squared_px for e in own.values()])
         np.add.at(alone, frame, (weight**2 * squared).sum(axis=1))
-        np.add.at(views, frame, 1.0)
-    excess = np.maximum(solution.normal.costs - alone, 0.0) / np.maximum(6.0 * (views - 1.0), 1.0)
-    return {key: float(e) for key, e, n in zip(observations.keys, excess, views, strict=True) if n > 1.0}
+    return excess_cost(observations, solution.normal.costs, alone)
+
+
+def excess_cost(observations: RigObservations, shared: FloatArray, alone: FloatArray) -> dict[Key, float]:
+    """Return `cost_of_sharing` from the costs (F,) of all poses, `shared` and for each view `alone`."""
+    views = np.bincount(np.concatenate(observations.frame), minlength=len(shared))
+    excess = np.maximum(shared - alone, 0.0) / np.maximum(6.0 * (views - 1.0), 1.0)
+    return {key: float(e) for key, e, n in zip(observations.keys, excess, views, strict=True) if n > 1}
 
 
 def typical_distance_px(observations: RigObservations, cost: Mapping[Key, float]) -> float:
