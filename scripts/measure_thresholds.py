@@ -51,6 +51,7 @@ from rigkit.detection.checks.border import squares_end
 from rigkit.detection.checks.evidence import (
     MIN_EXPECTED_CORNERS,
     OF_EXPECTED_SIZE,
+    OF_WHOLE,
     OFFSET,
     SCORE,
     Evidence,
@@ -318,6 +319,8 @@ def print_sizes(found: list[Candidate]) -> None:
         short, long = min(size), max(size)
         print(f"  {long} x {short}: {count}, {np.log(len(large) / count):.1f}")
     print(f"  none of another size: {np.log(max(len(large), 1)):.1f} and more; in use: {OF_EXPECTED_SIZE}")
+    whole = sum(c.evidence.raggedness == 1.0 for c in found if not c.board and c.corners >= MIN_EXPECTED_CORNERS)
+    print(f"  {whole} lack no corner: {np.log(len(large) / max(whole, 1)):.1f} or more; in use: {OF_WHOLE}")
     near = [c for c in found if c.corners >= MIN_EXPECTED_CORNERS and -OF_EXPECTED_SIZE < c.evidence.score <= 0.0]
     for board, what in ((True, "boards"), (False, "other patterns")):
         ends = [c.ends for c in near if c.board is board]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rigkit.core.arrays import known_median
 from rigkit.detection.checks.border import squares_end
 from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at_discontinuities, without_outliers
-from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS, OF_EXPECTED_SIZE, Evidence
+from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS, OF_EXPECTED_SIZE, OF_WHOLE, Evidence
 from rigkit.detection.checks.validate import (
     exceeds_known_sizes,
     has_bowed_edges,
@@ -283,7 +283,7 @@ def _confirmed_parts(
 
 def _remains_board(grey: GreyImage, item: RefinedLattice, criteria: BoardCriteria) -> bool:
     """Return whether a lattice is still a board after its sigmas were raised for the scatter of its corners."""
-    prior = OF_EXPECTED_SIZE if _of_size(item.lattice, criteria.sizes) else 0.0
+    prior = _prior(item.lattice, criteria.sizes)
     return Evidence.of(item).score + prior > 0.0 or _is_marked_board(grey, item.lattice, item, criteria)
 
 
@@ -319,7 +319,7 @@ def _accepted(
         after
         for before, after in rest
         if _of_size(after.lattice, sizes)
-        if is_board(after, min(before, after.lattice.known.size), min_corners, OF_EXPECTED_SIZE)
+        if is_board(after, min(before, after.lattice.known.size), min_corners, _prior(after.lattice, sizes))
         if squares_end(grey, after.lattice)
     ]
     return sure + sorted(likely, key=lambda item: -Evidence.of(item).score)[:room]
@@ -335,6 +335,11 @@ def _is_marked_board(grey: GreyImage, before: Lattice, after: RefinedLattice, cr
 def _of_size(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
     """Return whether `lattice` has one of `sizes`, and enough corners for that to be evidence."""
     return lattice.count >= MIN_EXPECTED_CORNERS and frozenset(lattice.size) in {frozenset(size) for size in sizes}
+
+
+def _prior(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> float:
+    """Return what the size of `lattice` adds to its evidence score."""
+    return _of_size(lattice, sizes) * (OF_EXPECTED_SIZE + OF_WHOLE * bool(lattice.known.all()))
 
 
 def _is_plausible(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:

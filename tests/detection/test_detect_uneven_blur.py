@@ -78,6 +78,21 @@ def test_boards_smeared_by_motion_are_found_whole_and_in_place(
     assert RATIO[0] < np.sqrt((off**2 / found.sigma_px[:, None] ** 2).mean()) < RATIO[1]
 
 
+@pytest.mark.parametrize("turned", [0.05, 0.3])
+def test_a_small_board_of_interlaced_lines_is_found_whole_and_in_place(turned: float) -> None:
+    image, truth = moved_board(2.0, 0.5, turned)
+    smaller, shift = 0.6, 3
+    small = cv2.resize(image, None, fx=smaller, fy=smaller, interpolation=cv2.INTER_AREA)
+    small[1::2] = np.roll(small[1::2], shift, axis=1)
+    truth = smaller * (truth + 0.5) - 0.5 + np.array([0.5 * shift, 0.0])
+    (found,) = detect_boards(small, [BOARD])
+    assert len(found.grid) == COLUMNS * ROWS
+    off = np.linalg.norm(found.pixels[:, None] - truth, axis=2).min(axis=1)
+    assert (off < 3.0 * found.sigma_px).all()
+    # Of an unknown size it is not certain enough.
+    assert detect_boards(small) == ()
+
+
 def lattice_of(corners: FloatArray) -> Lattice:
     pixels = corners.reshape(ROWS, COLUMNS, 2)
     return Lattice(pixels, np.full((ROWS, COLUMNS), 170.0), True)

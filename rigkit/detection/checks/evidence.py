@@ -55,6 +55,11 @@ OF_EXPECTED_SIZE, MIN_EXPECTED_CORNERS = 4.0, 20
 ratio of the frequencies of that size among boards and other patterns. Of 75 lattices of other patterns at most 1 has
 the size of a common board (9 x 6, 7 x 10), and 3 have 6 x 4 corners; smaller ones have any size."""
 
+OF_WHOLE = 3.0
+"""Further increase if such a lattice lacks no corner, of which raggedness counts a part. Of 935 lattices of other
+patterns with 20 corners or more (RENDERED, and REAL photographs, sharp, blurred and moved) 5 are whole, of 612 with 30
+or more none. Small boards in motion or of interlaced lines, which need it, mostly are."""
+
 
 class Evidence(NamedTuple):
     """The measures of a lattice; (upper) medians over its corners.
