@@ -75,6 +75,7 @@ WORSE = (
     ("aprilgrid", "one", "regular", "blur", 1.5),
     ("circles", "one", "fisheye", "covered", 0.15),
     ("circles", "partial", "regular", "noise", 5.0),
+    ("circles", "one", "regular", "faint", 0.035),
 )
 """Rendered boards that take special parts of the search: target, scene, lens, degradation and how much."""
 SEVERAL = (("three", "regular", 2.0), ("three", "fisheye", 2.0), ("room", "regular", 2.0), ("room", "fisheye", 10.0))

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from rigkit.detection.circles.fit import CircleFit
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
+
 UNEXPLAINED, MISSHAPEN, DISPLACED, CORNERED, MAX_IMPLAUSIBILITY = 0.17, 0.08, 0.04, 0.03, 1.4
 """Scales of `GridEvidence`, and the largest sum of squares in these of a grid. Those of two REAL boards reach 0.150
 (sharpened), 0.055, 0.029 (motion of 6 px), 0.023 (ink that spreads by 2 px) and a sum of 1.2, in eleven kinds of worse
@@ -12,6 +18,13 @@ nearest, solar panels, cloth and a trellis under motion, have 2.0, 2.4 and 3.1; 
 blurred by 2 px has 1.62, in 14 blobs, all others more than 3. The limit is in the middle.
 `scripts/measure_thresholds.py --circles` measures both."""
 
+CORE, CORE_BLURS, LAPLACIAN_PX = 0.5, 2.0, 1.5
+"""Part of a circle's radius within which noise is measured, if the edge is further away than so many s of its blur and
+the reach of the filter, px."""
+
+LAPLACIANS = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
+"""The difference of two Laplacians, which is 0 in even light and 6 times the noise (Immerkaer 1996)."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridEvidence:
@@ -19,7 +32,7 @@ class GridEvidence:
 
     Attributes
     ----------
-    unexplained : RMS residual over contrast.
+    unexplained : RMS residual in excess of the noise (`noise_levels`), over contrast.
     misshapen : differences of size and slant from the predictions by neighbours, in radii.
     displaced : distance from the place predicted by neighbours, in distances of neighbours.
     corners : amplitude in radii of the edge's harmonics 3 to 6, the mean over all circles: squares have 0.15.
@@ -39,3 +52,20 @@ class GridEvidence:
     @property
     def convincing(self) -> bool:
         return self.implausibility < MAX_IMPLAUSIBILITY
+
+
+def noise_levels(grey: GreyImage, fit: CircleFit) -> float:
+    """Return the standard deviation of the noise of pixels inside circles, 0 if these are too small to tell."""
+    narrow = np.linalg.svd(fit.maps, compute_uv=False)[:, 1]
+    large = (1.0 - CORE) * narrow > CORE_BLURS * fit.blur_px + LAPLACIAN_PX
+    if not large.any():
+        return 0.0
+    inside = CORE * np.stack(np.meshgrid(*2 * [np.linspace(-0.7, 0.7, 5)]), axis=-1).reshape(-1, 2)
+    places = fit.pixels[large, None] + inside @ np.swapaxes(fit.maps[large], 1, 2)
+    column, row = np.rint(places).astype(np.int64).reshape(-1, 2).T
+    height, width = grey.shape
+    column, row = column.clip(1, width - 2), row.clip(1, height - 2)
+    total = np.zeros(len(row))
+    for (down, along), weight in np.ndenumerate(LAPLACIANS):
+        total += weight * grey[row + down - 1, column + along - 1]
+    return float(np.median(np.abs(total))) / (6.0 * MEDIAN_OF_NORMAL)

@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs, reduced
 from rigkit.detection.circles.certainty import centre_sigmas
-from rigkit.detection.circles.evidence import GridEvidence
+from rigkit.detection.circles.evidence import GridEvidence, noise_levels
 from rigkit.detection.circles.fit import ITERATIONS, PLAIN_ITERATIONS, CircleFit, edge_reach, fit_circles
 from rigkit.detection.circles.grid import CircleGrid
 from rigkit.detection.circles.local_map import (
@@ -49,8 +49,6 @@ MAX_CIRCLE_RESIDUAL = 3.0
 """Largest ratio of residual to contrast relative to the typical one: a circle above it is partly covered."""
 MIN_TYPICAL_CIRCLE = 0.03
 """Lower limit of the typical ratio of residual to contrast."""
-UNSETTLED = 2.0
-"""Factor of the limits of place and contrast for fits that have not converged."""
 SUPPORT = 5
 """Smallest number of neighbours that predict a circle without a blob."""
 MAX_GAIN = 10.0
@@ -112,7 +110,7 @@ def grid_of(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool 
             draft, scale = _mixed(grey, draft), 1
     if not _enough(draft):
         return None
-    evidence = _evidence(draft)
+    evidence = _evidence(reduced(grey, scale), draft)
     # Sizes of much blurred circles are not yet those of the image itself.
     for _ in range(0 if quick or draft.mixed or blobs.reduction() == 1 else 1 if scale == 1 else 2):
         if evidence.convincing:
@@ -120,7 +118,7 @@ def grid_of(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool 
         again = _again(grey, draft.enlarged(scale))
         if not _enough(again):
             break
-        draft, evidence, scale = again, _evidence(again), 1
+        draft, evidence, scale = again, _evidence(grey, again), 1
     if evidence.convincing and not quick:
         draft = _through_its_blur(reduced(grey, scale), draft)
     return _finished(draft.enlarged(scale), evidence, (grey.shape[1], grey.shape[0]))
@@ -341,9 +339,9 @@ def _tried(
     only = np.arange(len(pixels)) >= known
     fit = _fitted(*at, only, iterations=PLAIN_ITERATIONS, brief=brief)
     # Where there is no circle, a fit would use all its steps.
-    near = np.linalg.norm(fit.pixels - pixels, axis=1) < UNSETTLED * OFF_PLACE * _spacing(every)
+    near = np.linalg.norm(fit.pixels - pixels, axis=1) < OFF_PLACE * _spacing(every)
     parts = [np.abs(fit.contrast) / np.median(np.abs(typical.contrast)), fit.share / np.median(typical.share)]
-    unsettled = only & ~fit.valid & near & (np.maximum(*parts) > MIN_CIRCLE_CONTRAST / UNSETTLED)
+    unsettled = only & ~fit.valid & near & (np.maximum(*parts) > MIN_CIRCLE_CONTRAST)
     if unsettled.any():
         fit = with_rows(fit, unsettled, _fitted(*at, unsettled, brief=brief))
     return rows_of(fit, only)
@@ -362,13 +360,14 @@ def _beside(draft: _Draft, size_px: tuple[int, int]) -> tuple[IntArray, PlaneMap
     return places[fine], rows_of(around, fine)
 
 
-def _evidence(draft: _Draft) -> GridEvidence:
+def _evidence(grey: GreyImage, draft: _Draft) -> GridEvidence:
     fit, label = draft.fit, draft.label
     expected = local_maps(label, fit.pixels, label, hexagonal=draft.hexagonal, sigma_px=_sigma(fit), leave_out=True)
     off = np.linalg.norm(fit.pixels - expected.pixels, axis=1) / _spacing(expected)
     sure = expected.gain < SURE_GAIN
+    beyond_noise = np.maximum(fit.residual**2 - noise_levels(grey, fit) ** 2, 0.0) / fit.contrast**2
     return GridEvidence(
-        unexplained=float(np.median(fit.residual / np.abs(fit.contrast))),
+        unexplained=float(np.sqrt(np.median(beyond_noise))),
         misshapen=float(np.median(np.sqrt((fit.growth**2).sum(axis=1)))),
         displaced=float(np.median(off[sure])) if sure.any() else np.inf,
         corners=float(np.hypot(*fit.harmonics.mean(axis=0).T).max()),

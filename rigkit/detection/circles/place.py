@@ -24,13 +24,24 @@ MAX_EMPTY = 0.2
 """Largest share of a board's circles that may be covered if the others determine their place."""
 EMPTY_LINE = 0.5
 """Share of a line of the board beside the circles that is visible and empty, above which it is another board."""
+STRAY_CIRCLES = 2
+"""Largest number of circles in a line beyond the board, mostly visible and empty, that do not belong to it: something
+round beside the board."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Place:
-    """A place of a lattice on a board: cells (N, 2) of the index grid, and the number of other visible, empty cells."""
+    """A place of a lattice on a board.
+
+    Attributes
+    ----------
+    grid : (M, 2) cells of the index grid.
+    kept : (N,) which circles of the lattice these are, all but stray ones.
+    empty : number of other visible, empty cells.
+    """
 
     grid: IntArray
+    kept: BoolArray
     empty: int
 
 
@@ -50,7 +61,7 @@ def boards_meant(found: CircleGrid, boards: Sequence[Board]) -> list[tuple[Board
             (board, _open_place(found, board, 0)) for board in boards if all(board is not own for own, _ in whole)
         ]
         likely = whole + [(board, place) for board, place in others if place is not None]
-    return [(board, _detection(found, place.grid, board.size)) for board, place in likely]
+    return [(board, _detection(found, place, board.size)) for board, place in likely]
 
 
 def may_be_part(found: CircleGrid, board: Board) -> bool:
@@ -67,7 +78,7 @@ def _open_place(found: CircleGrid, board: Board, max_empty: int) -> _Place | Non
 def placed_on(found: CircleGrid, board: Board) -> BoardDetection | None:
     """Return the circles on the board's grid, unnamed, or None if their place is ambiguous."""
     place = _place_on(found, board)
-    return None if place is None else _detection(found, place.grid, board.size)
+    return None if place is None else _detection(found, place, board.size)
 
 
 def _place_on(found: CircleGrid, board: Board) -> _Place | None:
@@ -80,7 +91,7 @@ def _place_on(found: CircleGrid, board: Board) -> _Place | None:
     good = [place for place in places if place.empty <= least + MAX_EMPTY_DIFFERENCE]
     if len({_key(place.grid, board) for place in good}) > 1:
         return None
-    return max(good, key=lambda place: _upright(place.grid, found.pixels))
+    return max(good, key=lambda place: _upright(place.grid, found.pixels[place.kept]))
 
 
 def _places_on(found: CircleGrid, board: Board) -> list[_Place]:
@@ -104,7 +115,7 @@ def lone_part(found: CircleGrid, board: Board) -> BoardDetection | None:
     if best is None:
         return None
     columns, rows = (best[1].max(axis=0) + 1).tolist()
-    return _detection(found, best[1], (columns, rows))
+    return _detection(found, _Place(best[1], np.ones(len(found), np.bool_), 0), (columns, rows))
 
 
 def _counted(found: CircleGrid, layout: str) -> Iterator[tuple[IntArray, IntArray]]:
@@ -148,6 +159,10 @@ def _places(circles: IntArray, empty: IntArray, board: Board) -> Iterator[_Place
     if staggered:
         row, half = np.indices(there.shape)
         there = (row + half) % 2 == int(isinstance(pattern, Circles) and pattern.stagger == "left")
+    kept = _on_board(circles, empty, there)
+    if kept is None:
+        return
+    circles = circles[kept]
     low, extent = circles.min(axis=0), np.ptp(circles, axis=0) + 1
     for across in range(wide - extent[0] + 1):
         for down in range(rows - extent[1] + 1):
@@ -162,7 +177,22 @@ def _places(circles: IntArray, empty: IntArray, board: Board) -> Iterator[_Place
             if _empty_line(at, beside, there):
                 continue
             left = len(beside)
-            yield _Place(np.stack([at[:, 0] // 2 if staggered else at[:, 0], at[:, 1]], axis=-1), left)
+            yield _Place(np.stack([at[:, 0] // 2 if staggered else at[:, 0], at[:, 1]], axis=-1), kept, left)
+
+
+def _on_board(circles: IntArray, empty: IntArray, there: BoolArray) -> BoolArray | None:
+    """Return which circles (N,) may be on a board with circles `there`: all but stray ones in lines that are too many,
+    and None if more are too many."""
+    kept = np.ones(len(circles), np.bool_)
+    for axis, points in enumerate((there.sum(axis=0), there.sum(axis=1))):
+        while kept.any() and np.ptp(places := circles[kept, axis]) >= len(points):
+            ends = [int(places.min()), int(places.max())]
+            counts = [int(np.count_nonzero(places == end)) for end in ends]
+            line = ends[int(np.argmin(counts))]
+            if min(counts) > STRAY_CIRCLES or (empty[:, axis] == line).sum() <= EMPTY_LINE * points.max():
+                return None
+            kept &= circles[:, axis] != line
+    return kept if kept.any() else None
 
 
 def _empty_line(at: IntArray, empty: IntArray, there: BoolArray) -> bool:
@@ -188,6 +218,7 @@ def _upright(grid: IntArray, pixels: FloatArray) -> float:
     return float(slope[0, 0] + slope[1, 1])
 
 
-def _detection(found: CircleGrid, grid: IntArray, size: tuple[int, int]) -> BoardDetection:
-    order = np.lexsort(grid.T)
-    return BoardDetection(None, *size, grid[order], found.pixels[order], found.sigma_px[order])
+def _detection(found: CircleGrid, place: _Place, size: tuple[int, int]) -> BoardDetection:
+    order = np.lexsort(place.grid.T)
+    pixels, sigma_px = found.pixels[place.kept], found.sigma_px[place.kept]
+    return BoardDetection(None, *size, place.grid[order], pixels[order], sigma_px[order])

@@ -247,6 +247,34 @@ def test_circles_that_something_covers_are_left_out() -> None:
     assert np.abs(errors_by_place(found, truth)).max() < SINGLE_PX
 
 
+def test_a_faint_grid_in_noise_is_found() -> None:
+    """A quarter of its contrast is noise, which does not count as a residual of the circles."""
+    rng = np.random.default_rng(2)
+    scene = one_board(rng, lens="regular", board=REGULAR)
+    image = scene.render(rng=rng).astype(np.float64)
+    faint = 120.0 + 0.045 * (image - 128.0) + 2.0 * rng.standard_normal(image.shape)
+    (found,) = detect_boards(np.rint(faint).astype(np.uint8), [REGULAR])
+    assert found.complete and found.board_id == "r"
+    turns = [found, *(found.turned(k) for k in REGULAR.turns)]
+    assert min(np.abs(errors_by_place(turn, scene.truth()[0])).max() for turn in turns) < 0.5
+
+
+def test_something_round_beside_a_grid_is_not_of_the_board() -> None:
+    scene = slanted(HEXAGONAL, "regular", 0.0, 20.0, 450.0)
+    points, pose = HEXAGONAL.points(), scene.boards[0].world_from_board
+    angles = np.arange(40) * np.pi / 20.0
+    ring = 7.5 * np.stack([np.cos(angles), np.sin(angles), np.zeros(40)], axis=-1)
+    # Before the fourth row, in its step.
+    ring += points[3 * HEXAGONAL.columns] - (points[1] - points[0])
+    seen = scene.camera.project(pose.apply(ring))[0]
+    image = scene.render(noise_levels=2.0, rng=np.random.default_rng(0)).astype(np.uint8)
+    cv2.fillPoly(image, [np.rint(16.0 * seen).astype(np.int32)], 40, cv2.LINE_AA, 4)
+    assert [len(grid) for grid in find_grids(image)] == [HEXAGONAL.corner_count + 1]
+    (found,) = detect_boards(image, [HEXAGONAL])
+    assert found.board_id == "h" and found.complete
+    assert np.abs(errors_by_place(found, scene.truth()[0])).max() < SINGLE_PX
+
+
 @pytest.mark.parametrize("motion_px", [(2.6, 1.5), (5.2, 3.0)])
 def test_a_motion_that_stretches_all_circles_alike_makes_none_uncertain(motion_px: tuple[float, float]) -> None:
     """It is the same on both sides of a circle: taken for noise, sigmas are 2.4 and 5 times the errors, and for errors
