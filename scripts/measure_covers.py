@@ -8,7 +8,8 @@ covered in a random direction: by a straight cover of one grey level or random t
 truth is the corners found without the cover. A corner is in view if the cover is more than half a square away; it is
 false if it is more than a tenth of a square, or a pixel, from every true corner. Prints for each set and kind: boards
 found (half of 12 corners or more in view), corners found of those in view, false ones and the worst of them, corners
-whose sigma is a twentieth of the square or more, and RMS error over sigma of all others.
+whose sigma is a twentieth of the square or more, and of all others RMS error over sigma and how many are further off
+than FAR_SIGMAS.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from rigkit.io.media.images import read_image
 KINDS = ("flat", "texture", "hand")
 IN_VIEW, FALSE_CELLS, FALSE_PX, UNSURE_CELLS = 0.5, 0.1, 1.0, 0.05
 """As the head of this file says, in squares and px."""
+FAR_SIGMAS = 5.0
 NEARLY_ALL, FEWEST = 0.9, 12
 """Part of the corners by which a board is whole, and corners in view by which it is to be found."""
 BEYOND_CELLS = 1.6
@@ -58,6 +60,7 @@ class Score:
     worst_px: float = 0.0
     squared: float = 0.0
     counted: int = 0
+    far: int = 0
 
     def add(self, other: Score) -> None:
         for name in vars(other):
@@ -68,7 +71,8 @@ class Score:
         rms = f"{(self.squared / self.counted) ** 0.5:.2f}" if self.counted else ""
         worst = f" ({self.worst_px:.1f} px)" if self.false else ""
         seen = f"{self.found} of {self.in_view}"
-        return f"{self.boards} of {self.images} | {seen} | {self.false}{worst} | {self.unsure} | {rms}"
+        far = f"{self.far} of {self.counted}"
+        return f"{self.boards} of {self.images} | {seen} | {self.false}{worst} | {self.unsure} | {rms} | {far}"
 
 
 def cover(
@@ -148,6 +152,7 @@ def scored(found: list[BoardDetection], truth: FloatArray, sides: FloatArray, ma
                 worst_px=float(off[false].max(initial=0.0)),
                 squared=float((0.5 * (off / item.sigma_px)[typical] ** 2).sum()),
                 counted=int(typical.sum()),
+                far=int((off / item.sigma_px > FAR_SIGMAS)[typical].sum()),
             )
         )
     score.found = int((seen & in_view).sum()) if least else 0
@@ -182,7 +187,8 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="a line for each image that is not all right")
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    print("| set | cover | boards | in view | false (worst) | unsure | error / sigma |\n|:--|:--|--:|--:|--:|--:|--:|")
+    print("| set | cover | boards | in view | false (worst) | unsure | error / sigma | far |")
+    print("|:--|:--|--:|--:|--:|--:|--:|--:|")
     total = {kind: Score() for kind in args.kinds}
     for words in args.sets:
         determined, _, place = words.rpartition("=")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, known_median
+from rigkit.detection.subpixel.refined import RefinedLattice
 
 UNCERTAIN_FACTOR, NEARBY_CELLS = 6.0, 2
 """A corner is uncertain if its sigma exceeds this times the median of the board, and of its neighbours up to so many
@@ -13,6 +14,12 @@ cells away (in oblique or dark parts many are less certain): usually its window 
 IN_PLACE_CELLS, IN_PLACE_TIMES = 0.05, 2.0
 """Largest distance of a corner that agrees with its prediction, in cells, or (the larger) relative to the expected
 error of the prediction, which is larger at the end of a row."""
+
+UNLIKE, OF_ONE_EDGE = 3.0, 4.0
+"""Ratio of a corner's residual over contrast to the typical one, above which it is due to an edge in the window (a
+finger, a sheet), and how much more such residuals move the corner than noise does. On 10 REAL boards with markers,
+under 60 covers, errors of the 60 corners with three times the typical sigma are 3.3 sigmas (rms) without this, and 1.5
+with it; 16 and 2 exceed 5 sigmas."""
 
 
 def uncertain_outliers(sigma_px: FloatArray, off_cells: FloatArray, gain: FloatArray) -> BoolArray:
@@ -44,3 +51,13 @@ def uncertain(sigma_px: FloatArray) -> BoolArray:
         around = np.lib.stride_tricks.sliding_window_view(padded, (reach, reach))[out]
         out[out] = sigma_px[out] > UNCERTAIN_FACTOR * np.nanmedian(around, axis=(1, 2))
     return out
+
+
+def sigmas_beside_edges(item: RefinedLattice) -> FloatArray:
+    """Return the sigmas (R, C) of the corners of a board, px, that include the shift by edges in their windows that are
+    not the board's."""
+    relative = item.relative_residual
+    unlike = relative / (UNLIKE * max(known_median(relative), 1e-9))
+    with np.errstate(invalid="ignore"):
+        of_edges = np.sqrt(1.0 - np.maximum(unlike, 1.0) ** -2)
+    return np.asarray(np.hypot(item.sigma_px, OF_ONE_EDGE * of_edges * item.worst_sigma_px))

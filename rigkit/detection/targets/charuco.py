@@ -32,6 +32,7 @@ from rigkit.detection.subpixel.edge_model import NEAR_PX, TAIL_SIGMAS
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import scatter_factors
 from rigkit.detection.subpixel.subpixel import refine
+from rigkit.detection.subpixel.uncertain_corners import sigmas_beside_edges
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.detection.tags.codes import transferred
 from rigkit.detection.tags.in_squares import AGREEING_MARKERS, MIN_MARKERS, between_markers, place_by_markers
@@ -387,5 +388,5 @@ def _detection(found: _MarkedBoard) -> BoardDetection:
     refined, board = found.refined, found.board
     row, column = np.nonzero(refined.lattice.known)
     grid = np.stack([column, row], axis=-1)
-    pixels, sigma = refined.lattice.pixels[row, column], refined.sigma_px[row, column]
+    pixels, sigma = refined.lattice.pixels[row, column], sigmas_beside_edges(refined)[row, column]
     return BoardDetection(board.board_id, board.columns, board.rows, grid, pixels, sigma)
