@@ -292,9 +292,9 @@ EXPORT void block_products(
 
 /* The results of a circle: u, v, the map (4), covariance of (u, v) at noise of variance 1 (uu, uv, vv), blur, brightness outside,
  * brightness inside less outside, RMS residual, number of pixels, whether the fit converged, variances of e1 to e3 at noise of
- * variance 1 (3), harmonics 3 to 6 of the edge (8), the gradient (2) and normal equations (uu, uv, vv) of an anisotropic blur, and the
+ * variance 1 (3), harmonics 3 to 8 of the edge (12), the gradient (2) and normal equations (uu, uv, vv) of an anisotropic blur, and the
  * move (2) of the centre by a gradient of added light, with its covariance (uu, uv, vv) at noise of variance 1. */
-enum { CIRCLE_OUTCOMES = 36, SPOT = 3, BESIDE = 6 };
+enum { HARMONICS = 6, CIRCLE_OUTCOMES = 28 + 2 * HARMONICS, SPOT = 3, BESIDE = 6 };
 
 /* The constants of detection.circles.fit, under their names there. `brief`: residual and variances are those at the last step, and
  * what is not needed for a further fit stays 0: harmonics, anisotropic blur and added light. */

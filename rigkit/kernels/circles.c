@@ -60,9 +60,9 @@ INLINE int gather(
     return 1;
 }
 
-/* Add the harmonics 3 to 6 of the residuals of a block over the angle in the plane (cosine, sine), weighted with the derivative by
+/* Add the harmonics from 3 on of the residuals of a block over the angle in the plane (cosine, sine), weighted with the derivative by
  * the radius. */
-INLINE void add_harmonics(const places_t *places, const double grown[BLOCK], const double off[BLOCK], double out[8])
+INLINE void add_harmonics(const places_t *places, const double grown[BLOCK], const double off[BLOCK], double out[2 * HARMONICS])
 {
     double c[BLOCK], s[BLOCK], cn[BLOCK], sn[BLOCK];
 #pragma omp simd
@@ -73,7 +73,7 @@ INLINE void add_harmonics(const places_t *places, const double grown[BLOCK], con
         cn[k] = grown[k] * off[k] * (c[k] * c[k] - s[k] * s[k]);
         sn[k] = grown[k] * off[k] * 2.0 * c[k] * s[k];
     }
-    for (int n = 0; n < 4; n++) {
+    for (int n = 0; n < HARMONICS; n++) {
         double cosines = 0.0, sines = 0.0;
 #pragma omp simd reduction(+ : cosines, sines)
         for (int k = 0; k < BLOCK; k++) {
@@ -89,7 +89,8 @@ INLINE void add_harmonics(const places_t *places, const double grown[BLOCK], con
 }
 
 /* Write the sums of the products of rows to the lower triangle of `sums`; if `all` rows are wanted, add up the harmonics, too. */
-INLINE void sum_products(const group_t *at, const spots_t *spots, const int all, double sums[ROWS][ROWS], double harmonics[8])
+INLINE void sum_products(
+    const group_t *at, const spots_t *spots, const int all, double sums[ROWS][ROWS], double harmonics[2 * HARMONICS])
 {
     const int count = all ? ROWS : COLUMNS;
     double du[BLOCK], dv[BLOCK], value[BLOCK], rows[ROWS][BLOCK];
@@ -277,12 +278,12 @@ static void write_circle(const circle_t *at, const double *N, double sums[ROWS][
 
 /* Write the further results. The harmonics of the edge are deviations of its radius, in radii: 0 for a disc, while a square has the
  * fourth. */
-static void write_shape(const double *N, double sums[ROWS][ROWS], const double harmonics[8], double *result)
+static void write_shape(const double *N, double sums[ROWS][ROWS], const double harmonics[2 * HARMONICS], double *result)
 {
-    for (int n = 0; n < 8; n++)
+    for (int n = 0; n < 2 * HARMONICS; n++)
         result[18 + n] = 2.0 * harmonics[n] / (sums[OWN][OWN] > 1e-12 ? sums[OWN][OWN] : 1e-12);
-    unevenness(sums, N, result + 26);
-    added_light(sums, N, result + 31);
+    unevenness(sums, N, result + 18 + 2 * HARMONICS);
+    added_light(sums, N, result + 23 + 2 * HARMONICS);
 }
 
 /* Write the results of a fit whose last step had the normal equations of `sums` and their factor `N`: of a brief one those, else what
@@ -291,7 +292,7 @@ INLINE void finish(
     const group_t *group, const spots_t *spots, int brief, int settled, double sums[ROWS][ROWS], double N[PARAMETERS * PARAMETERS],
     double *result)
 {
-    double harmonics[8] = {0.0}, right[PARAMETERS];
+    double harmonics[2 * HARMONICS] = {0.0}, right[PARAMETERS];
     if (!brief) {
         sum_products(group, spots, 1, sums, harmonics);
         equations(sums, N, right);
@@ -340,7 +341,7 @@ void fit_circles(
         if (!inverted(at))
             continue;
         const int both = gather(at, grey, bytes, width, height, reach[n], band, capacity, &spots);
-        double sums[ROWS][ROWS], harmonics[8] = {0.0}, N[PARAMETERS * PARAMETERS], right[PARAMETERS], step[PARAMETERS];
+        double sums[ROWS][ROWS], harmonics[2 * HARMONICS] = {0.0}, N[PARAMETERS * PARAMETERS], right[PARAMETERS], step[PARAMETERS];
         if (!both || !(spots.count >= rules->min_pixels))
             continue;
         double before[PARAMETERS] = {0.0}, times = 1.0, moved_before = 0.0;

@@ -65,7 +65,7 @@ def fit_circles(
     capacity: int,
     rules: CircleRules,
 ) -> FloatArray:
-    """Return the outcomes of N circles, (N, 36). Arguments as for `detection.circles.fit.fit_circles`; `capacity` is
+    """Return the outcomes of N circles, (N, 40). Arguments as for `detection.circles.fit.fit_circles`; `capacity` is
     the number of pixels of the largest window."""
     return np.asarray(
         kernels().fit_circles(image, pixels, maps, curvatures, blur, uneven, reach, beside, rules, capacity)

@@ -55,7 +55,7 @@ def centre_sigmas(fit: CircleFit, label: IntArray, slope_gain: FloatArray | floa
     odd = _without_smooth_part(fit.growth, label) ** 2
     more = _variance_over_white((odd / typical)[:, 1:])
     misshapen = np.maximum(odd.sum(axis=1) - ODD_BY_NOISE * more * typical.sum(axis=1), 0.0)
-    wavy = (_without_smooth_part(fit.harmonics.reshape(len(label), -1), label) ** 2).mean(axis=1)
+    wavy = (_without_smooth_part(fit.harmonics[:, :4].reshape(len(label), -1), label) ** 2).mean(axis=1)
     uneven = np.maximum(wavy - WAVY_BY_NOISE * more * relative**2, 0.0)
     moved = np.maximum((fit.added_light**2).sum(axis=1), 1e-12)
     by_noise = MOVED_BY_NOISE * more * np.trace(fit.added_light_covariance, axis1=1, axis2=2)

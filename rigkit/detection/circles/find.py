@@ -119,8 +119,10 @@ def grid_of(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool 
         if not _enough(again):
             break
         draft, evidence, scale = again, _evidence(grey, again), 1
-    if evidence.convincing and not quick:
+    if evidence.may_convince and not quick:
         draft = _through_its_blur(reduced(grey, scale), draft)
+        later = None if evidence.convincing else _evidence(reduced(grey, scale), draft)
+        evidence = later if later and later.convinces_late else evidence
     return _finished(draft.enlarged(scale), evidence, (grey.shape[1], grey.shape[0]))
 
 
@@ -286,7 +288,8 @@ def _through_its_blur(grey: GreyImage, draft: _Draft) -> _Draft:
     """Return the draft fitted with the light of neighbours and the anisotropy of the blur, if they matter; and with
     circles that are found only so.
 
-    It is used for grids only: large circles with much blur overlap to a pattern like a chessboard.
+    It is used for grids, and what may be one, only: large circles with much blur overlap to a pattern like a
+    chessboard.
     """
     grown = False
     for done in range(BLUR_ROUNDS):

@@ -43,7 +43,7 @@ class CircleFit:
     blur_px, brightness, contrast, residual : (N,) blur of the edge, level around the circle, difference of the level
         inside, RMS residual in grey levels.
     count : (N,) pixels.
-    harmonics : (N, 4, 2) cosine and sine of harmonics 3 to 6 of the edge, in radii.
+    harmonics : (N, 6, 2) cosine and sine of harmonics 3 to 8 of the edge, in radii.
     uneven : (N, 5) normal equations of a correction of `uneven_px2` from the residuals, over their variance: the
         right-hand side and the matrix (xx, xy, yy).
     added_light, added_light_covariance : (N, 2) and (N, 2, 2) move of the centre if light added to the image (glare)
@@ -175,10 +175,10 @@ def fit_circles(
         residual=rows[:, 12],
         count=rows[:, 13],
         growth_variance=rows[:, 15:18] * (rows[:, 12] ** 2)[:, None],
-        harmonics=rows[:, 18:26].reshape(-1, 4, 2),
-        uneven=rows[:, 26:31] / np.maximum(rows[:, 12:13], 1e-6) ** 2,
-        added_light=rows[:, 31:33],
-        added_light_covariance=rows[:, [33, 34, 34, 35]].reshape(-1, 2, 2) * (rows[:, 12] ** 2)[:, None, None],
+        harmonics=rows[:, 18:30].reshape(-1, 6, 2),
+        uneven=rows[:, 30:35] / np.maximum(rows[:, 12:13], 1e-6) ** 2,
+        added_light=rows[:, 35:37],
+        added_light_covariance=rows[:, [37, 38, 38, 39]].reshape(-1, 2, 2) * (rows[:, 12] ** 2)[:, None, None],
         valid=valid,
     )
 

@@ -12,16 +12,18 @@ from detection_bench.circle_bound import circle_information
 from detection_bench.corner_bound import position_bound
 from detection_bench.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, bench_field_deg, one_board
 from detectors.degradations import degraded
+from helpers.data import read_grey, shared_data
 from helpers.detection_scenes import errors_by_place
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.circles import Circles
-from rigkit.detection.circles.search import find_grids
+from rigkit.detection.circles.search import CircleSearch, find_grids
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
+from rigkit.io.boards.board_words import board_of_words
 from rigkit.synthetic.photometry import Photometry, develop
 from rigkit.synthetic.render import Optics
 from rigkit.synthetic.scene import Panel, PlacedBoard
@@ -341,6 +343,24 @@ def test_a_grid_of_another_size_is_no_board() -> None:
 def test_nothing_is_found_where_no_circles_are(name: str) -> None:
     for seed in range(3):
         assert find_grids(blank(name, np.random.default_rng(seed))) == []
+
+
+def test_octagons_are_no_circles() -> None:
+    """Without the eighth harmonic of their edges 23 of these were a grid."""
+    octagons = blank("panels", np.random.default_rng(611), (640, 480))
+    assert find_grids(octagons) == []
+    assert max(grid.evidence.corners for grid in CircleSearch(octagons).seen() if len(grid) == 23) > 0.025
+
+
+def test_real_circles_that_motion_joins_are_found() -> None:
+    """The first fits, without motion, leave 28 of 336 circles."""
+    image = read_grey(shared_data("public/circles-hexagonal") / "image01.jpg")
+    board = board_of_words("circles:14x24x12,layout=hexagonal,stagger=left,diameter_mm=10")
+    moved = cv2.filter2D(image, -1, np.array([[0.5, *[1.0] * 7, 0.5]]) / 8.0)
+    ((still,), (found,)) = (detect_boards(picture, [board]) for picture in (image, moved))
+    assert found.complete
+    in_sigmas = (found.pixels - still.pixels) / found.sigma_px[:, None]
+    assert np.sqrt((in_sigmas**2).mean()) < HONEST[1]
 
 
 def test_cloth_that_moves_is_no_grid_of_circles() -> None:
