@@ -109,6 +109,11 @@ def grey_image(image: NDArray[np.generic]) -> GreyImage:
     return grey
 
 
+def as_bytes(grey: GreyImage) -> NDArray[np.uint8]:
+    """Return grey levels rounded to 8 bits, those that are as they are."""
+    return grey if grey.dtype == np.uint8 else np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
 def _finite(image: NDArray[np.generic]) -> FloatImage:
     """Return a floating-point image as float32, with NaN and infinities replaced by the extreme finite values."""
     with np.errstate(over="ignore"):

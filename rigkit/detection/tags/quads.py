@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.saddles.response import GreyImage, as_bytes
 from rigkit.detection.tags.codes import read_tags, transferred
 from rigkit.detection.tags.placing import MIN_BITS, TagBoard
 from rigkit.kernels.surface import maps_of_quads
@@ -62,7 +62,7 @@ def quadrilaterals(image: GreyImage) -> FloatArray:
     Pattern Recognition 47 (2014), section 4.1. cv2.aruco spends four fifths of its time on reading them, too, and
     supports neither wide borders nor more than one dictionary.
     """
-    grey = image if image.dtype == np.uint8 else np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    grey = as_bytes(image)
     fewest = max(MIN_PERIMETER * max(grey.shape), MIN_OUTLINE_PX)
     found: list[NDArray[np.integer[Any] | np.floating[Any]]] = []
     lengths: list[int] = []

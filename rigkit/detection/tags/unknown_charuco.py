@@ -13,7 +13,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.patterns.aruco import marker_count, smallest_dictionary
 from rigkit.core.patterns.charuco import Charuco
-from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.saddles.response import GreyImage, as_bytes
 from rigkit.detection.tags.markers import ReadMarkers, read_markers
 from rigkit.kernels.surface import maps_of_quads
 
@@ -70,7 +70,7 @@ class MarkerObservations:
 
     def look(self, index: int, image: GreyImage) -> bool:
         """Read the markers of an image; return whether some of them are in squares."""
-        for kind, read in self._read(np.clip(np.rint(image), 0, 255).astype(np.uint8)):
+        for kind, read in self._read(as_bytes(image)):
             own = _in_squares(read.corners, read.numbers)
             if own is not None:
                 self.kinds[kind] += len(own[0])

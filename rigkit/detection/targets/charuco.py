@@ -25,7 +25,7 @@ from rigkit.detection.guided.lopsided_blur import blur_shift_px
 from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.saddles.response import GreyImage, as_bytes
 from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_model import NEAR_PX, TAIL_SIGMAS
@@ -155,8 +155,8 @@ def _by_outlines(
     """Return the corners of a board beside markers detected by their outlines, from lattices where these have them, and
     the lattices that have none."""
     whole, left = _empty(board), []
-    eight_bit = [np.clip(np.rint(picture), 0, 255).astype(np.uint8) for picture in pictures]
-    grid, pixels = max((_marked_corners(picture, board) for picture in eight_bit), key=lambda seen: len(seen[0]))
+    seen = (_marked_corners(as_bytes(picture), board) for picture in pictures)
+    grid, pixels = max(seen, key=lambda corners: len(corners[0]))
     for item in lattices:
         placed = _placed(item.lattice, grid, pixels, board) if len(grid) else None
         if placed is None:

@@ -18,15 +18,19 @@ class CirclesFinder(Finder):
     """A grid is identified if its place on one board is unique, and no other board and no other grid fits."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
-        """Return the detections. In a large image, a search for large circles that finds all boards whole is enough.
-        A quick search may miss faint circles: if it finds no board, a full one follows."""
-        look = CircleSearch(search.grey)
-        if search.grey.size > COARSE_PIXELS:
-            found = self._seen(search, look, boards, quick=search.quick, coarse=True)
-            if {item.board_id for item in found if item.complete} >= {board.board_id for board in boards}:
-                return found
-        found = self._seen(search, look, boards, quick=True) if search.quick else []
-        return found or self._seen(search, look, boards, quick=False)
+        """Return the detections. In a large image, a search for large circles that names all boards is enough: it tries
+        each place beside the circles found, whatever the size there. A quick search may miss faint circles: if it finds
+        no board, a full one follows."""
+        look, ways = CircleSearch(search.grey), (True, False) if search.quick else (False,)
+        found: list[BoardDetection] = []
+        for coarse in (True, False) if search.grey.size > COARSE_PIXELS else (False,):
+            for quick in ways:
+                found = self._seen(search, look, boards, quick=quick, coarse=coarse)
+                if found:
+                    break
+            if coarse and {item.board_id for item in found} >= {board.board_id for board in boards}:
+                break
+        return found
 
     @staticmethod
     def _seen(

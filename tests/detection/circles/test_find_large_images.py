@@ -54,15 +54,19 @@ def test_circles_of_any_size_are_found_whole_and_accurately(monkeypatch: pytest.
     assert HONEST[0] < np.sqrt(((off / found.sigma_px[:, None]) ** 2).mean()) < HONEST[1]
 
 
-def test_a_board_that_is_not_seen_whole_is_searched_for_on_all_levels(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("quick", [False, True])
+def test_a_board_that_is_named_in_a_smaller_image_is_not_searched_for_again(
+    monkeypatch: pytest.MonkeyPatch, quick: bool
+) -> None:
     board = Board("b", 10, 8, 25.0, 25.0, pattern=Circles(diameter_mm=15.0))
     scene = one_board(np.random.default_rng(3), board=board, size_px=SIZE_PX, square_px=66.0)
     image = np.asarray(scene.render(supersample=2)).copy()
     u, v = np.rint(scene.truth()[0].pixels[37]).astype(int)
-    image[v - 40 : v + 40, u - 40 : u + 40] = 128
+    image[v - 25 : v + 25, u - 25 : u + 25] = 128
     coarse = looks_coarse(monkeypatch)
-    (found,) = detect_boards(image, [board])
-    assert coarse == [True, False] and len(found.grid) >= 75
+    (found,) = detect_boards(image, [board], quick=quick)
+    # The square hides one circle whole.
+    assert coarse == [True] and found.board_id == "b" and len(found.grid) >= 78
 
 
 def test_large_circles_with_much_blur_are_found() -> None:
