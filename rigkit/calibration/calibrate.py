@@ -155,8 +155,10 @@ class _Solution:
         return result, far
 
     def with_verdicts(self, result: Calibration, far: FarProjection) -> Calibration:
-        """Return what `assembled` returned, with its verdicts."""
+        """Return what `assembled` returned, with its verdicts if the request asks for them."""
         request, outcome = self.fits.request, self.outcome
+        if not request.judged:
+            return result
         automatic = (("model", request.model), ("board_shape", request.board))
         in_force = [name for name, value in automatic if value == "auto"]
         moved = _moved(outcome.observations, outcome.chosen.fit, self.tried) if request.folds else ()

@@ -51,6 +51,8 @@ class Request:
     progress: Progress = silent
     pupil: str = "central"
     """Or "auto", "moving": see `calibrate`."""
+    judged: bool = True
+    """Whether the result has verdicts, which take a third of the time of a fit without cross-validation."""
 
 
 def wanted_models(request: Request) -> list[CandidateModel]:

@@ -6,11 +6,12 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
-from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.calibrate import calibrate_together
+from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.views.usable import OTHER_GRIDS, other_size, views_of_image, without_lookalikes
 from rigkit.cameras.base import Camera
@@ -240,15 +241,16 @@ def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera 
 
 
 def first_calibration(session: Session, found: Mapping[str, FoundCorners]) -> Calibration | None:
-    """Return a quick calibration from `found`; None if that fails."""
+    """Return a quick calibration from `found`, without verdicts; None if that fails."""
     try:
         corners = SessionCorners(found=found, unreadable={}, source="")
         views, size_px, _ = session_views(session, corners)
         # Scaramuzza's model fits any lens roughly; where it fits badly, another may fit better.
         model = "scaramuzza" if session.model == "auto" else session.model
-        first = calibrate(views, size_px, model=model, degree=session.degree, board="flat", folds=0, pupil="central")
+        request = Request(size_px=size_px, model=model, degree=session.degree, board="flat", folds=0, judged=False)
+        (first,) = calibrate_together([("", views, request)])
         if session.model == "auto" and first.sigma_px > LOOSE * median(s for v in views for s in v.sigma_px.tolist()):
-            first = calibrate(views, size_px, model="auto", board="flat", folds=0, pupil="central")
+            (first,) = calibrate_together([("", views, replace(request, model="auto", degree=None))])
         return first
     except (InputError, DegenerateError):
         return None
