@@ -99,10 +99,10 @@ def thumbnail_jpeg(image: Image, views: Sequence[ViewResult] = (), *, count: int
     wide = THUMBNAILS_PX[count > MAX_LARGE]
     zoom = wide / image.shape[1]
     size = (wide, max(round(image.shape[0] * zoom), 1))
-    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
-    if image.dtype != np.uint8:
-        small *= 255.0 / max(float(np.quantile(small, 0.999)), 1.0)
-    picture = small.clip(0.0, 255.0).astype(np.uint8)
+    picture = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    if picture.dtype != np.uint8:
+        brightest = max(float(np.quantile(picture, 0.999)), 1.0)
+        picture = (picture * (255.0 / brightest)).clip(0.0, 255.0).astype(np.uint8)
     canvas = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR if picture.ndim == 2 else cv2.COLOR_RGB2BGR)
     for view in views:
         for (u, v), kept in zip((view.pixels + 0.5) * zoom - 0.5, view.kept, strict=True):
