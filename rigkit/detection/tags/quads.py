@@ -22,6 +22,8 @@ THRESHOLD_SIDES, DARKER_THAN_MEAN = (3, 13, 23), 7.0
 """Sides of the squares, px, over whose means ink is darker by this many grey levels: the smallest one separates what
 almost touches, the largest one closes blurred borders."""
 
+AROUND_PIXEL = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
+
 OFF_OUTLINE, MIN_SIDE_OF_OUTLINE, MIN_BORDER_PX = 0.03, 0.05, 3
 """Largest deviation of an outline from the polygon of its four corners, and smallest side of that polygon, in lengths
 of the outline; and smallest distance of the corners from the border of the image."""
@@ -70,7 +72,9 @@ def quadrilaterals(image: GreyImage) -> FloatArray:
         dark = cv2.adaptiveThreshold(
             grey, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, side, DARKER_THAN_MEAN
         )
-        outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        # Lone pixels are no tags, but up to half of all outlines, which take most of the time, long or short.
+        connected = cv2.bitwise_and(dark, cv2.dilate(dark, AROUND_PIXEL))
+        outlines, _ = cv2.findContours(connected, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         for outline in outlines:
             if len(outline) < fewest:
                 continue
