@@ -49,6 +49,16 @@ def test_folder_to_corners_and_overlays_whatever_the_number_of_processes(images:
     assert all(items[0].complete and items[0].board_id for items in found.values())
 
 
+def test_few_images_are_searched_in_threads_which_need_no_imports(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rigkit.workflows.detect.over_items", None)
+    corners = tmp_path / "corners.csv"
+    assert main(["detect", str(images), "--board", "9x6x30", "-o", str(corners)]) == 0
+    found = read_corners(corners, [Board("9x6x30", 9, 6, 30.0, 30.0)])
+    assert [len(items) for items in found.values()] == [1, 1, 1]
+
+
 def camera_file(path: Path, size_px: tuple[int, int] = (640, 480)) -> Path:
     parameters = dict(zip(("fx", "fy", "cx", "cy"), (545.0, 545.0, 318.0, 242.0), strict=True))
     camera = {"model": "pinhole", "size_px": size_px, "parameters": parameters}

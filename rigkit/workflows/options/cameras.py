@@ -116,7 +116,7 @@ class DetectOptions(WrittenFiles):
     min_corners : without --board: fewest corners of a chessboard.
     output : write the corners file.
     overlay : write each image with its corners drawn in into this folder.
-    jobs : number of processes (default: one per core).
+    jobs : number of processes (default: one per core, for a hundred images or more; for fewer threads).
     """
 
     boards: tuple[Path, ...] = ()
