@@ -111,7 +111,7 @@ def grey_image(image: NDArray[np.generic]) -> GreyImage:
 
 def as_bytes(grey: GreyImage) -> NDArray[np.uint8]:
     """Return grey levels rounded to 8 bits, those that are as they are."""
-    return grey if grey.dtype == np.uint8 else np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    return np.asarray(grey if grey.dtype == np.uint8 else np.clip(np.rint(grey), 0, 255), np.uint8)
 
 
 def _finite(image: NDArray[np.generic]) -> FloatImage:
