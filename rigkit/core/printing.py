@@ -61,6 +61,15 @@ def digits(value: float) -> str:
     return f"{float(f'{value:.2g}'):.12g}"
 
 
+def probability_words(value: float) -> str:
+    """Return a probability with two decimals, but never as 0 or 1.
+
+    >>> probability_words(0.5), probability_words(0.0004), probability_words(0.9996)
+    ('0.50', '< 0.01', '> 0.99')
+    """
+    return "< 0.01" if value < 0.01 else "> 0.99" if value > 0.99 else f"{value:.2f}"
+
+
 def length_words(*mm: float, decimals: int) -> str:
     """Return lengths with so many decimals, or more (nanometres at most) if the largest length would have fewer than
     two significant digits: rigs under a microscope are small.

@@ -28,6 +28,7 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.calibrations.calibration_file import camera_to_json, load_camera, save_calibration
 from rigkit.io.calibrations.history_file import editions, load_history
+from rigkit.io.corners.corner_cache import image_hash
 from rigkit.io.media.images import read_image
 from rigkit.report.pages.check_page import _power_words
 from rigkit.synthetic.photometry import Photometry
@@ -36,8 +37,9 @@ from rigkit.synthetic.scene import PlacedBoard
 from rigkit.validation.monitoring.hypotheses import hypotheses_of
 from rigkit.validation.monitoring.judge import CalibrationCheck, Change
 from rigkit.validation.monitoring.power import Power
-from rigkit.workflows.checks.check import _replaced_by_known, _require_right_order, check_pictures
+from rigkit.workflows.checks.check import OWN_IMAGE, _replaced_by_known, _require_right_order, check_pictures
 from rigkit.workflows.options.check import CheckOptions
+from rigkit.workflows.outputs.provenance import SHORT_HASH
 
 BOARD = Board("board", 9, 6, 25.0, 25.0)
 CAMERA = Brown((640, 480), np.array([620.0, 621.0, 322.0, 236.0, -0.12, 0.05, 0.0, 0.0, 0.0]))
@@ -122,6 +124,20 @@ def test_images_of_a_rig_that_are_exchanged_are_no_change_of_it(tmp_path: Path) 
         check_pictures(rig, [pictures[k] for k in (1, 0, 3, 2)], options)
     # Of different moments: that no order puts right.
     assert check_pictures(rig, [pictures[k] for k in (0, 3)], options).check.unexplained
+
+
+def test_an_image_of_the_calibration_leaves_the_other_cameras_image_of_that_moment(tmp_path: Path) -> None:
+    rig, pictures = _rig_of_two(tmp_path, BOARD)
+    made = {"made": {"images": [image_hash(path)[:SHORT_HASH] for path in (pictures[0], pictures[3])]}}
+    rig.write_text(json.dumps(json.loads(rig.read_text()) | made))
+    done = check_pictures(rig, pictures, CheckOptions(boards=(BOARD,)))
+    assert done.check.holds and done.check.frames == 2
+    assert done.left_out == ((f"{pictures[0]}", OWN_IMAGE), (f"{pictures[3]}", OWN_IMAGE))
+    with pytest.raises(InputError, match="was made from these very images"):
+        check_pictures(rig, [pictures[0], pictures[3]], CheckOptions(boards=(BOARD,)))
+    # Matches of a scene need the images of both.
+    with pytest.raises((InputError, DegenerateError)):
+        check_pictures(rig, pictures, CheckOptions(boards=(BOARD,), scene=True))
 
 
 def test_images_are_exchanged_where_the_other_order_holds_or_explains_more(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.arrays import without_nan
-from rigkit.core.printing import counted
+from rigkit.core.printing import counted, probability_words
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.planning.goal import px_words
 from rigkit.report import svg
@@ -132,7 +132,8 @@ def _power_words(power: Power) -> str:
     whose = "" if power.camera is None else f" of camera '{power.camera}'"
     size = f"{power.size:g} {power.unit}"
     seen = f"A change of {size} rms over the image" if power.unit == "px" else f"A rotation of {size}"
-    message = f"{seen} would have been detected with probability {power.chance:.2f} (worst: {power.kind}{whose}"
+    chance = probability_words(power.chance)
+    message = f"{seen} would have been detected with probability {chance} (worst: {power.kind}{whose}"
     if np.isfinite(power.found_from):
         message += f"; {FOUND:.0%} from {power.found_from:.2g} {power.unit} on"
     if power.chance >= FOUND:
@@ -153,12 +154,12 @@ def _frames_needed(power: Power) -> str:
 
 def power_table(powers: Sequence[Power], title: str = "Detectable changes") -> Table:
     """Return the table of the chances to detect changes."""
-    heads = columns(f"change | size | probability of detection .2 | {FOUND:.0%} detected from | frames for {FOUND:.0%}")
+    heads = columns(f"change | size | probability of detection | {FOUND:.0%} detected from | frames for {FOUND:.0%}")
     rows = tuple(
         cells(
             power.kind if power.camera is None else f"{power.kind} of {power.camera}",
             f"{power.size:g} {power.unit}",
-            power.chance,
+            probability_words(power.chance),
             f"{power.found_from:.2g} {power.unit}" if np.isfinite(power.found_from) else "not detectable",
             _frames_needed(power),
         )

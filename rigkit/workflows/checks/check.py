@@ -62,6 +62,7 @@ from rigkit.workflows.outputs.provenance import (
 
 OWN_IMAGE = "the calibration was made from it, and fits it even if the camera has changed"
 NO_PARTNER = "the other cameras have no image of its name or number"
+OWN_PARTNER = "another camera's image of that moment is one of those from which the calibration was made"
 _log = logging.getLogger(__name__)
 
 
@@ -103,10 +104,10 @@ def check_pictures(
     both = {path for frame in now for path in frame} & {path for frame in before for path in frame}
     if both:
         raise InputError(f"check: '{min(both)}' is given both as a new image and with --before")
-    now, own = _without_own_images(source, now)
+    own = _own_images(source, now)
     goals = [] if options.length is None else length_goals(monitored.cameras, monitored.cam_from_rig, options.length)
     boards = _replaced_by_known(options.boards, known) or known
-    pictures = _Pictures(source=source, monitored=monitored, boards=boards, known=known, progress=progress)
+    pictures = _Pictures(source=source, monitored=monitored, boards=boards, known=known, own=own, progress=progress)
     pictures.left_out.extend((f"{path}", NO_PARTNER) for path in (*single, *alone))
     with about(source):
         look, views = pictures.seen(now, scene=options.scene)
@@ -132,23 +133,22 @@ def check_pictures(
     )
 
 
-def _without_own_images(source: Path, frames: ImagesByMoment) -> tuple[ImagesByMoment, list[Path]]:
-    """Return the frames without those that have an image from which the calibration in `source` was made, and these
-    images.
+def _own_images(source: Path, frames: ImagesByMoment) -> list[Path]:
+    """Return the images from which the calibration in `source` was made.
 
-    Raises InputError where no frame is left, or all are those of a camera of a file that does not list its images.
+    Raises InputError where these are all images, or all of a camera for a file that does not list its images.
     """
     stated = json.loads(read_text(source)).get("made")
     made = stated if isinstance(stated, dict) else {}
     known = list(made["inputs"].values()) if isinstance(made.get("inputs"), dict) else []
     own = [path for frame in frames for path in frame if is_one_of(path, made)]
-    new = [frame for frame in frames if not any(path in own for path in frame)]
-    if not new or any(_digest_alone(sorted(camera)) in known for camera in zip(*frames, strict=True)):
+    every = len(own) == sum(map(len, frames))
+    if every or any(_digest_alone(sorted(camera)) in known for camera in zip(*frames, strict=True)):
         raise InputError(
             f"check: '{source}' was made from these very images, which fit it even if the camera has changed; "
             "give new ones"
         )
-    return new, own
+    return own
 
 
 def _digest_alone(images: Sequence[Path]) -> str:
@@ -223,13 +223,14 @@ def _same_square_size(one: Board, other: Board) -> bool:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _Pictures:
-    """Images of the monitored cameras, the boards that may be in them, those `known` from the file `source`, and so far
-    the images left out and the unusable ones."""
+    """Images of the monitored cameras, the boards that may be in them, those `known` from the file `source`, its `own`
+    images, which are not used, and so far the images left out and the unusable ones."""
 
     source: Path
     monitored: Monitored
     boards: Sequence[Board]
     known: Sequence[Board]
+    own: Sequence[Path]
     progress: Progress
     left_out: list[tuple[str, str]] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
@@ -254,12 +255,18 @@ class _Pictures:
         return (lambda now: evidence_of(now, views)), views
 
     def _read(self, frame: Sequence[Path]) -> list[Any]:
-        """Return the images of a moment, [] where one is unusable: the reason goes to `unreadable`."""
+        """Return the images of a moment, [] where one is unusable: the reason goes to `unreadable` or `left_out`."""
+        if any(path in self.own for path in frame):
+            self.left_out.extend((f"{path}", OWN_PARTNER) for path in frame if path not in self.own)
+            return []
         images = [self._image(camera, path) for camera, path in zip(self.monitored.cameras, frame, strict=True)]
         return [] if any(image is None for image in images) else images
 
     def _image(self, camera: Camera, path: Path) -> Any:
-        """Return an image of the camera; None where it is unusable: the reason goes to `unreadable`."""
+        """Return an image of the camera; None where it is unusable, with the reason in `unreadable`, or the
+        calibration's own."""
+        if path in self.own:
+            return None
         try:
             return read_image_of(path, camera.size_px, self.source)
         except InputError as error:
