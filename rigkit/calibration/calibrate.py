@@ -26,7 +26,7 @@ from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut,
 from rigkit.calibration.choosing.lens_choice import ModelChoice, best_sizes, choose_lenses, like_cameras
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.choosing.one_model import ModelOutcome, on_same_images
-from rigkit.calibration.judging.moved import moved_lens
+from rigkit.calibration.judging.moved import moved_lens, two_groups
 from rigkit.calibration.judging.pupil import may_move, pupil_is_significant, solved_again
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration, Candidate
@@ -254,13 +254,14 @@ def _result(solution: _Solution) -> Calibration:
 
 def _moved(observations: Observations, fit: Fit, tried: Sequence[FittedModel]) -> tuple[Finding, ...]:
     """Return a finding where the lens changed during the session by the chosen model, or else by the model with the
-    least scatter: of images of two lenses a small model may predict best, whose error differs with the boards' places
-    and hides the change."""
+    least scatter, or where the images are of two lenses by both. Of images of two lenses a small model may predict
+    best, whose error differs with the boards' places and hides the change."""
     camera = far_camera(fit.state.camera)
     best = far_camera(min(tried, key=lambda option: option.fit.sigma_px).fit.state.camera)
     other = None if same_model(best, camera) else with_other_lens(observations, fit, best)
     fits = [fit] if other is None else [fit, other]
-    return next((found for one in fits if (found := moved_lens(observations, one, tests=len(fits)))), ())
+    moved = next((found for one in fits if (found := moved_lens(observations, one, tests=len(fits)))), ())
+    return moved or two_groups(observations, fits)
 
 
 def _others(tried: Sequence[FittedModel], model: str) -> list[Candidate]:

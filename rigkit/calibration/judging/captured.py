@@ -14,6 +14,7 @@ import numpy as np
 from rigkit.calibration.certainty.coverage import corner_ranges, covered_by_boards
 from rigkit.calibration.certainty.uncertainty import FarProjection, worst_direction
 from rigkit.calibration.result import Calibration
+from rigkit.cameras.base import image_center
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Rays, quantiles_of
 from rigkit.core.findings import Finding, Severity
@@ -49,6 +50,10 @@ Sensors have square pixels: of 309 calibrations of REAL and RENDERED images, all
 within 0.4 % (stretched paper included). Resizing to another shape changes it by several per cent."""
 STRETCH_SIGMAS = 4.0
 """The same in standard deviations. Boards that do not determine the ratio are called by other findings."""
+
+MAX_AXIS_OFF = 0.08
+"""Distance of the optical axis from the image's middle, as a part of the longer side, from which images are called
+cropped. REAL: 0.002 to 0.035 in 16 sessions, 0.056 in one whose images are halves of wider ones."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -92,6 +97,7 @@ def diagnose_capture(calibration: Calibration, clusters: IntArray, *, upright: b
         *_too_few(images, number),
         *hardly_tilted(calibration),
         *_distances(calibration),
+        *cropped_images(calibration),
         *stretched_images(calibration, upright=upright),
     ]
 
@@ -176,6 +182,24 @@ def stretched_images(c: Calibration, *, upright: bool) -> Iterator[Finding]:
         f"focal lengths are {100.0 * (1.0 - np.exp(-abs(stretch))):.1f} % smaller along {narrower} than along "
         f"{other}, although sensors have square pixels: a program or the camera has stretched the images{squares}",
         "give the images as the sensor has them, or use the calibration only for images stretched in the same way",
+    )
+
+
+def cropped_images(c: Calibration) -> Iterator[Finding]:
+    """Yield a finding where the optical axis is far from the middle of the images."""
+    axis, valid, _, by_parameters = c.camera.project_with_jacobians(np.array([0.0, 0.0, 1.0]))
+    off, size = axis - image_center(c.camera.size_px), max(c.camera.size_px)
+    sigma = c.widening * float(np.sqrt(np.trace(by_parameters @ c.covariance @ by_parameters.T)))
+    far = float(np.linalg.norm(off))
+    if not valid or not far > max(MAX_AXIS_OFF * size, STRETCH_SIGMAS * sigma):
+        return
+    along = int(np.argmax(np.abs(off)))
+    # What is cut off on the left moves the middle to the right.
+    side = (("right", "left"), ("bottom", "top"))[along][int(off[along] < 0.0)]
+    yield Finding.look(
+        f"the optical axis is {far:.0f} px from the middle of the images ({100.0 * far / size:.0f} % of their longer "
+        f"side), although cameras have it there: all images seem cropped, most at the {side}, or the lens is shifted",
+        "give the images as the sensor has them, or use the calibration only for images cropped in the same way",
     )
 
 

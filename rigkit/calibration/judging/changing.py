@@ -16,7 +16,6 @@ import numpy as np
 from rigkit.calibration.assemble import with_solution
 from rigkit.calibration.judging.drift import drifting
 from rigkit.calibration.judging.flipped import flipped_images
-from rigkit.calibration.judging.two_kinds import two_kinds
 from rigkit.calibration.judging.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
@@ -119,8 +118,6 @@ def changing(
         flipped = flipped_images(calibration, evidence, *solved, clusters, shifted=shifted)
         if flipped is not None:
             return [flipped]
-    if not but and changes["lens"].ratio >= MIN_VARIANCE_RATIO and (kinds := two_kinds(calibration, evidence)):
-        return [kinds]
     if not but and (drift := drifting(calibration, evidence)):
         return [drift]
     if solved is not None and changes["lens"].ratio >= MIN_VARIANCE_RATIO and changes["lens"].share >= MIN_SHARE_TRIED:

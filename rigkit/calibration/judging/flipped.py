@@ -18,7 +18,7 @@ import numpy as np
 
 from rigkit.calibration.assemble import with_solution
 from rigkit.calibration.choosing.board_orientation import with_boards_renumbered
-from rigkit.calibration.judging.two_kinds import MIN_LEAD, SIGMAS_DO_NOT_HOLD, split_entropy, split_in_two
+from rigkit.calibration.judging.two_kinds import SIGMAS_DO_NOT_HOLD, ImageScores
 from rigkit.calibration.judging.view_evidence import ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
@@ -39,6 +39,9 @@ MAX_STILL_SHIFTED = 0.2
 """Part of the squares that a shift between images explains after flipping back, over that explained by flipping back.
 Uniformly distributed shifts split into two groups leave a third, normally distributed ones more than half; REAL
 sessions of which half was turned leave 0.003 to 0.1."""
+MIN_LEAD = 6.0
+"""Difference of the Bayesian information criterion of flipped images to that of none: strong evidence (Kass and
+Raftery, "Bayes factors", J. Am. Stat. Assoc. 90, 1995)."""
 ROUNDS = 4
 """Maximal number of rounds in which images change sides."""
 MIN_FIRST_GAIN = 0.1
@@ -92,6 +95,13 @@ def flipped_images(
     return None if now is None else _finding_of(back, before, now)
 
 
+def _split_entropy(second: BoolArray) -> float:
+    """Return twice the entropy of a split into two kinds that both occur (V,), which is added to an information
+    criterion: the kind of each image is estimated from the same residuals."""
+    part = float(second.mean())
+    return float(-2.0 * len(second) * (part * np.log(part) + (1.0 - part) * np.log1p(-part)))
+
+
 def _possible_ways(observations: Observations) -> list[str]:
     """Return the flips after which the boards are still found: mirrored markers and tags cannot be read."""
     readable = not any(board.pattern.identified for board in observations.boards)
@@ -107,12 +117,13 @@ def _initial_flips(
     better, gain, turns = _fitting_better_flipped(way, observations, fit.state, fit)
     if gain > MIN_FIRST_GAIN and not better.all():
         yield better, turns
-    kinds = evidence and split_in_two(
-        evidence, columns_of(evidence.own.shape[1])["shift"], evidence.common_covariance()
-    )
-    if evidence and kinds:
+    if evidence is None:
+        return
+    rows = columns_of(evidence.own.shape[1])["shift"]
+    scores = ImageScores.scaled(evidence.own[:, rows, rows], evidence.along[:, rows], np.zeros((2, 2)))
+    if split := scores.best_split():
         at = np.zeros(len(turns), dtype=bool)
-        at[np.array(evidence.views)[kinds.second]] = True
+        at[np.array(evidence.views)[split[0]]] = True
         yield at, turns
 
 
@@ -185,7 +196,7 @@ def _finding_of(back: _FlippedBack, before: float, evidence: ViewEvidence) -> Fi
     if not 0.0 < part < 1.0 or not changes:
         return None
     # Errors within an image are correlated: each counts as two measurements, of its principal point.
-    if 2.0 * len(at) * np.log(left) + split_entropy(at) > -MIN_LEAD:
+    if 2.0 * len(at) * np.log(left) + _split_entropy(at) > -MIN_LEAD:
         return None
     # Images that shift on the sensor for another reason still do after flipping.
     if left * max(changes[way].share for way in ("shift", "lens")) > MAX_STILL_SHIFTED * (1.0 - left):

@@ -29,7 +29,7 @@ from rigkit.calibration.judging.changing import CHANGES, changing
 from rigkit.calibration.judging.mixed import two_cameras
 from rigkit.calibration.judging.moved import moment
 from rigkit.calibration.judging.pupil import modelled_pupil, moving_pupil
-from rigkit.calibration.judging.two_kinds import KINDS_REMEDY, min_of_a_kind
+from rigkit.calibration.judging.two_kinds import KINDS_REMEDY, listed, min_of_a_kind
 from rigkit.calibration.judging.undistorted import undistorted
 from rigkit.calibration.judging.view_evidence import neighbour_correlation
 from rigkit.calibration.result import Calibration, ViewResult
@@ -218,7 +218,11 @@ def _of_another_kind(c: Calibration, order: Sequence[str]) -> Iterator[Finding]:
     used = {view.image for view in c.views}
     what = f"{len(images)} of {len(used) + len(images)} images are inconsistent with the others and left out, "
     at = moment([image for image in dict.fromkeys(order) if image in used or image in images], images)
-    yield Finding.look(what + (f"all {at}" if at else f"the first of them '{images[0]}'"), KINDS_REMEDY, images[0])
+    yield Finding.look(
+        what + (f"all {at}" if at else f"as those of another camera would be: {listed(images)}"),
+        KINDS_REMEDY,
+        images[0],
+    )
 
 
 def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[Finding]:

@@ -10,7 +10,9 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.judging.two_kinds import CHANCE_OF_GROUPS, MIN_SHARE_OF_TWO, ImageScores
 from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.findings import Severity
@@ -63,8 +65,8 @@ def test_some_images_without_their_distortion(rng: np.random.Generator) -> None:
     camera = lens("reg")
     views = [without_distortion(v, camera) if k % 2 == 0 else v for k, v in enumerate(seen(camera, 18, rng))]
     first, _ = reported(views, rng)
-    assert f"{KINDS} that need different lens parameters: " in first
-    assert first.count(": 9 like '") == 1 and " and 9 like '" in first
+    assert f"{KINDS} that need different lens parameters, as those of two cameras: 9 ('" in first
+    assert "') and 9 like '" in first
     assert "undistorted" in first and "as if some were" not in first
 
 
@@ -189,3 +191,58 @@ def test_copies_of_images_are_no_kind_of_their_own() -> None:
         _, every = reported(copies, rng)
         assert not any(KINDS in verdict for verdict in every)
         assert any("show the board at the pose of another image" in verdict for verdict in every)
+
+
+def image_scores(lenses: FloatArray, rng: np.random.Generator, min_images: int = 1) -> ImageScores:
+    """Return scores of images of these lenses (N, P), as noisy and as different as those of a session."""
+    rows = rng.normal(size=(len(lenses), 12, lenses.shape[1]))
+    score = np.einsum("nkp,nk->np", rows, np.einsum("nkp,np->nk", rows, lenses) + rng.normal(size=rows.shape[:2]))
+    information = np.swapaxes(rows, 1, 2) @ rows
+    common = np.linalg.solve(information.sum(axis=0), score.sum(axis=0))
+    return ImageScores.scaled(information, score - information @ common, np.zeros((4, 4)), min_images)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_images_of_two_lenses_are_parted(count: int, rng: np.random.Generator) -> None:
+    second = np.arange(14) < count
+    scores = image_scores(second[:, None] * np.array([3.0, 0.0, -2.0, 1.0]), rng)
+    found = scores.best_split()
+    assert found is not None and ((found[0] == second).all() or (found[0] != second).all())
+    assert found[1] > MIN_SHARE_OF_TWO and scores.chance_of_split(*found) <= CHANCE_OF_GROUPS
+
+
+@pytest.mark.parametrize("spread", [0.0, 3.0])
+def test_images_whose_lenses_scatter_are_of_no_two_groups(spread: float, rng: np.random.Generator) -> None:
+    for _ in range(5):
+        scores = image_scores(spread * rng.normal(size=(14, 4)), rng)
+        found = scores.best_split()
+        assert found is not None and found[1] < MIN_SHARE_OF_TWO
+
+
+def test_lenses_along_a_line_are_of_two_groups_by_chance_only(rng: np.random.Generator) -> None:
+    """Where the line is that of the focal length, or the split would be called so."""
+    line = np.array([3.0, 0.0, -2.0, 1.0])
+    for _ in range(5):
+        scores = replace(image_scores(rng.uniform(-1.0, 1.0, (14, 1)) * line, rng), focus=None)
+        found = scores.best_split()
+        assert found is not None and found[1] > 0.5
+        first, other = scores._lenses(found[0])
+        assert replace(scores, focus=other - first).chance_of_split(*found) == 1.0
+
+
+def test_too_few_images_are_not_parted(rng: np.random.Generator) -> None:
+    assert image_scores(rng.normal(size=(5, 4)), rng, 3).best_split() is None
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [(6, f"{KINDS} that need different lens parameters"), (1, "another camera seems to have taken 1")],
+)
+def test_images_of_another_camera_at_other_moments_are_listed(count: int, words: str, rng: np.random.Generator) -> None:
+    camera = off_the_middle()
+    other = camera.with_parameters(camera.parameters + np.array([3.0, 3.0, 12.0, -9.0, *[0.0] * 5]))
+    views = [*seen(camera, 14 - count, rng), *seen(other, count, rng, first=14 - count)]
+    first, _ = reported(views, rng)
+    assert words in first and all(f"'{view.image}'" in first for view in views[14 - count :])
+    assert not any(f"'{view.image}'" in first for view in views[1 : 14 - count]) or count > 2
+    assert "principal points 1" in first

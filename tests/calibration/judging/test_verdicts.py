@@ -14,7 +14,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging import verdicts
 from rigkit.calibration.judging.captured import stretched_images
 from rigkit.calibration.judging.changing import CHANGES
-from rigkit.calibration.judging.moved import _ImageScores
+from rigkit.calibration.judging.two_kinds import ImageScores
 from rigkit.calibration.judging.verdicts import diagnose_session
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit, fit_model, identifiable
@@ -80,7 +80,7 @@ def test_equal_places_are_not_split_in_the_order_of_the_images() -> None:
     """Otherwise a split by place is one in time, which then explains the change of a lens."""
     number = np.arange(14)
     score = np.where(number < 7, 1.0, -1.0)[:, None]
-    scores = _ImageScores(np.ones((14, 1, 1)), score, np.full((1, 1), 1e-9), 3)
+    scores = ImageScores(np.ones((14, 1, 1)), score, np.full((1, 1), 1e-9), 3)
     assert (scores.split_by((number % 2).astype(np.float64)) == (number % 2 == 1)).all()
     assert (scores.split_by(number.astype(np.float64)) == (number >= 7)).all()
     assert not scores.split_by(np.zeros(14)).any()
@@ -91,7 +91,7 @@ def test_the_chance_of_a_lens_that_moved_counts_every_model(rng: np.random.Gener
     clusters, ones = np.arange(12), np.ones((12, 1, 1))
     for _ in range(400):
         score = rng.standard_normal((12, 1))
-        scores = _ImageScores(ones, score, np.full((1, 1), 1e-9), 3)
+        scores = ImageScores(ones, score, np.full((1, 1), 1e-9), 3)
         once = scores.chance(clusters, clusters)
         if 0.01 < once <= 0.02:
             break
@@ -155,6 +155,19 @@ def test_stretched_images_are_told(scale: tuple[float, float], words: str, rng: 
     # A turned board tells it from squares that are longer one way.
     assert not printed(result, "or the board's squares are longer")
     assert all("or the board's squares are longer" in str(f) for f in stretched_images(result, upright=True))
+
+
+@pytest.mark.parametrize(("cut", "side"), [((150, 0), "left"), ((0, -150), "bottom"), ((0, 0), "")])
+def test_cropped_images_are_told_with_the_side(cut: tuple[int, int], side: str, rng: np.random.Generator) -> None:
+    """By 150 of 1624 px at one side, filled up at the other: the axis is 9 % off the middle."""
+    views = [
+        replace(view, pixels=view.pixels - np.array(cut))
+        for view in random_views(lens("reg"), 12, rng, reach_deg=20.0, noise_px=0.05)[0]
+    ]
+    inside = [view for view in views if lens("reg").on_image(view.pixels).all()]
+    result = calibrate(inside, SIZE, model="brown", board="flat")
+    assert len(inside) > 5 and printed(result, "the optical axis is") == bool(side)
+    assert printed(result, f"all images seem cropped, most at the {side}") == bool(side)
 
 
 def test_few_images_and_one_bad_view(rng: np.random.Generator) -> None:
