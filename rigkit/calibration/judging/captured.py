@@ -17,7 +17,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import image_center
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Rays, quantiles_of
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding, Severity, worst
 from rigkit.core.printing import digits
 
 FEW_IMAGES = 8
@@ -87,18 +87,25 @@ class Extent:
         )
 
 
-def diagnose_capture(calibration: Calibration, clusters: IntArray, *, upright: bool) -> list[Finding]:
+def diagnose_images(calibration: Calibration, *, upright: bool) -> list[Finding]:
+    """Return findings about what was done to all images alike; `upright`: no board was rotated about its normal."""
+    return [*cropped_images(calibration), *stretched_images(calibration, upright=upright)]
+
+
+def diagnose_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]:
     """Return findings about how the images were taken, the most severe first; `clusters` (V,) are the cluster numbers
-    of the views' images, equal for near-duplicates; `upright`: no board was rotated about its normal."""
+    of the views' images, equal for near-duplicates."""
     images = [view.image for view in calibration.views]
     number = clusters.tolist()
+    few = list(_too_few(images, number))
+    # Seven images in place of eight matter less than how they were taken.
+    far_too_few = worst(few) is Severity.BAD
     return [
         *(_repeated(images, number) if _few_different(images, number) else []),
-        *_too_few(images, number),
+        *(few if far_too_few else []),
         *hardly_tilted(calibration),
         *_distances(calibration),
-        *cropped_images(calibration),
-        *stretched_images(calibration, upright=upright),
+        *([] if far_too_few else few),
     ]
 
 

@@ -21,6 +21,7 @@ from rigkit.calibration.judging.captured import (
     Extent,
     boards_never_rotated,
     diagnose_capture,
+    diagnose_images,
     extrapolated,
     few_repeated,
     hardly_tilted,
@@ -107,8 +108,7 @@ def judge(
     unlike, unclear = ([], []) if mixed else _views(calibration)
     pattern = [] if mixed else list(_pattern(calibration, correlation, in_force, bool(change)))
     effects = list(_uncertain(calibration, far))
-    # Images that contradict each other make the lens uncertain, however many there are. A cause found already explains
-    # why later images are of another lens than the first.
+    # Images that contradict each other make the lens uncertain. A cause found already explains a later other lens, too.
     contradicting, named = worst(effects) is Severity.BAD, bool(mixed) or worst(change) is Severity.BAD
     # Findings that make the quality of the calibration unknown: it is not called good.
     causes = [
@@ -116,8 +116,9 @@ def judge(
         *mixed,
         *_of_another_kind(calibration, order),
         *change,
+        *diagnose_images(calibration, upright=bool(upright)),
         *unlike,
-        *diagnose_capture(calibration, clusters, upright=bool(upright)),
+        *diagnose_capture(calibration, clusters),
         *(pattern if contradicting else []),
         *upright,
         *extrapolated(calibration, extent, far),

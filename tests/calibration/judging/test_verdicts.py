@@ -170,6 +170,17 @@ def test_cropped_images_are_told_with_the_side(cut: tuple[int, int], side: str, 
     assert printed(result, f"all images seem cropped, most at the {side}") == bool(side)
 
 
+def test_what_was_done_to_all_images_comes_before_one_of_them(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    odd = Finding.look("image '003.png' is odd", "retake it")
+    monkeypatch.setattr(verdicts, "_views", lambda _: ([odd], []))
+    views, _, _ = random_views(lens("reg"), 12, rng, reach_deg=33.0, noise_px=0.05)
+    views = [replace(view, pixels=view.pixels * np.array([1.0, 0.9])) for view in views]
+    found = calibrate(views, SIZE, model="brown", board="flat").verdicts
+    assert "stretched the images" in found[0].message and odd in found[1:]
+
+
 def test_few_images_and_one_bad_view(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("reg"), 6, rng, reach_deg=33.0)
     shaken = replace(views[2], pixels=views[2].pixels + 0.8 * rng.normal(size=(54, 2)))

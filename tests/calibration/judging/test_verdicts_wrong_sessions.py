@@ -65,10 +65,14 @@ def test_a_board_moved_by_equal_steps_is_one_camera(rng: np.random.Generator) ->
     assert "mixed" not in str(calibrate(views, SIZE, model="brown", board="flat").verdicts)
 
 
-def test_boards_parallel_to_each_other(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("count", [7, 40])
+def test_boards_parallel_to_each_other(count: int, rng: np.random.Generator) -> None:
+    """Said before seven images in place of eight."""
     about = np.array([0.5, 0.3, 0.0]) + 0.03 * rng.normal(size=(40, 3))
-    result = calibrate(seen(lens("reg"), *poses(rng, 40, about), rng), SIZE, model="brown", board="flat")
+    views = seen(lens("reg"), *poses(rng, 40, about), rng)
+    result = calibrate(views[:count], SIZE, model="brown", board="flat")
     assert "nearly parallel to each other" in first(result)
+    assert ("only 7 images" in str(result.verdicts)) == (count == 7)
 
 
 def test_boards_the_same_way_up(rng: np.random.Generator) -> None:
