@@ -161,14 +161,15 @@ class _Solution:
             return result
         automatic = (("model", request.model), ("board_shape", request.board))
         in_force = [name for name, value in automatic if value == "auto"]
-        moved = _moved(outcome.observations, outcome.chosen.fit, self.tried) if request.folds else ()
+        observations, fit = outcome.observations, outcome.chosen.fit
+        moved = _moved(observations, fit, self.tried) if request.folds else two_groups(observations, [fit])
         verdicts = judge(
             result,
             [*moved, *_largest_size_chosen(outcome.beyond, result, in_force)],
             far=far,
-            clusters=outcome.observations.clusters(),
+            clusters=observations.clusters(),
             in_force=in_force,
-            solved=(outcome.observations, outcome.chosen.fit),
+            solved=(observations, fit),
             order=self.fits.observations.images,
         )
         return replace(result, verdicts=verdicts)
