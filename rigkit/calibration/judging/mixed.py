@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rigkit.calibration.judging.two_kinds import listed
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.views.repeats import close_pairs
 from rigkit.core.arrays import FloatArray, IntArray
@@ -47,10 +48,12 @@ def two_cameras(calibration: Calibration, number: IntArray) -> Iterator[Finding]
     together = np.unique(np.concatenate([number[start], number[end]]))
     chained = np.intersect1d(number[start], number[end])
     enough = len(together) >= MIN_SHARE_PAIRED * len(first)
+    of_one = list(dict.fromkeys(images[k] for k in sorted(start.tolist())))
     if alike >= MIN_PARTNERS and enough and len(chained) <= MAX_SHARE_CHAINED * len(together):
         yield Finding.bad(
             f"images of two cameras are mixed: the board moves in the same way between '{images[start[0]]}' and "
-            f"'{images[end[0]]}' and in {alike - 1} other pairs of images, as in stereo pairs",
+            f"'{images[end[0]]}' and in {alike - 1} other pairs of images, as in stereo pairs, of which one camera "
+            f"took {listed(of_one)}",
             "calibrate each camera from its own images, or both as a rig with [[cameras]]; leave out images "
             "that a program made from others",
         )

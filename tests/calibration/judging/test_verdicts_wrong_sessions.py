@@ -53,6 +53,8 @@ def test_two_cameras_that_see_the_board_at_once(order: str, rng: np.random.Gener
         both.sort(key=lambda view: view.image[1:])
     result = calibrate(both, SIZE, model="brown", board="flat")
     assert "two cameras are mixed" in first(result) and len(names) > 20
+    of_one = first(result).partition("of which one camera took ")[2]
+    assert of_one.count("'a") > 9 > of_one.count("'b") == 0 or of_one.count("'b") > 9 > of_one.count("'a") == 0
     assert worst(result.verdicts) is Severity.BAD
     assert "mixed" not in str(calibrate(views, SIZE, model="brown", board="flat").verdicts)
 
