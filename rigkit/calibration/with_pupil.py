@@ -46,7 +46,7 @@ def solved_with_pupil(found: ModelOutcome, everything: Observations, request: Re
             found = replace(found, observations=reweighted(found.observations, options))
     if not options:
         return None
-    sizes = cross_validated(found.observations, options, request)
+    sizes = cross_validated(found.observations, options, request, "moving pupils")
     return chosen_of_sizes(found.observations, sizes, request, used=found.used, reasons=found.reasons)
 
 
@@ -103,7 +103,7 @@ def against_central(
     the lens with the pupil as a rival of the central one, if it is probable."""
     options = on_same_images(central, moving, (CENTRAL, MOVING))
     if moving.observations is central.observations:
-        options = cross_validated(central.observations, options, request)
+        options = cross_validated(central.observations, options, request, "pupils")
     chosen, likely = choose(options, MIN_SIGMAS), HeldOut.of([options]).likely().get(MOVING, 0.0)
     # Views that the central lens dropped come last.
     state = moving.chosen.fit.state.subset(np.arange(len(central.observations.views)))

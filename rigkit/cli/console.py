@@ -1,4 +1,4 @@
-"""Common functions of the verbs: progress on stderr, results on stdout, arguments of options and options from them."""
+"""Common functions of the verbs: notes on stderr, results on stdout, arguments of options and options from them."""
 
 from __future__ import annotations
 
@@ -6,15 +6,12 @@ import argparse
 import json
 import logging
 import re
-import sys
-import time
-from contextlib import suppress
 from dataclasses import MISSING, fields
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from rigkit.cli.progress import progress_on_stderr as progress_on_stderr
 from rigkit.core.errors import InputError, printable
-from rigkit.core.progress import Progress
 from rigkit.io.disk.schema_builders import attributes_of
 
 if TYPE_CHECKING:
@@ -26,42 +23,7 @@ if TYPE_CHECKING:
     from rigkit.report.pages.page_facts import PageFacts
 
 Options = TypeVar("Options")
-REDRAW_S = 0.1
-REPEAT_S = 5.0
-"""Time after which a stage that goes on says how far it is where there is no terminal to draw a bar on."""
-BAR_WIDTH = 24
 IMAGE_SIZE = re.compile(r"([0-9]{1,6})[xX]([0-9]{1,6})")
-
-
-def progress_on_stderr() -> Progress:
-    """Return a progress callback: a bar on a terminal, elsewhere one line for each finished stage, and some between for
-    those that take long."""
-    started: dict[str, float] = {}
-    drawn = 0.0
-
-    def show(what: str, done: int, total: int) -> None:
-        nonlocal drawn
-        now = time.monotonic()
-        started.setdefault(what, now)
-        finished = done >= total
-        # A closed or full stderr must not stop the work.
-        with suppress(OSError, ValueError):
-            if sys.stderr.isatty():
-                if finished or now - drawn >= REDRAW_S:
-                    drawn = now
-                    filled = BAR_WIDTH * done // max(total, 1)
-                    bar = "#" * filled + "." * (BAR_WIDTH - filled)
-                    end = f" {now - started[what]:.1f} s\n" if finished else ""
-                    print(f"\r{what:<36.36} [{bar}] {done}/{total}{end}", end="", file=sys.stderr, flush=True)
-            elif done and not finished and now - max(drawn, started[what]) >= REPEAT_S:
-                drawn = now
-                print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)
-            elif finished:
-                print(f"{what}: {done} done in {now - started[what]:.1f} s", file=sys.stderr, flush=True)
-        if finished:
-            started.pop(what, None)
-
-    return show
 
 
 def note(text: str) -> None:

@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
+from rigkit.cli.progress import end_bar
 from rigkit.core.errors import InputError, printable
 from rigkit.io.disk.reading import usable_path
 
@@ -74,6 +75,7 @@ class _OnStderr(logging.Handler):
             if record.getMessage() in self._warnings:
                 return
             self._warnings.add(record.getMessage())
+        end_bar()
         try:
             print("\n".join(map(printable, self.format(record).split("\n"))), file=sys.stderr)
         except (OSError, ValueError):

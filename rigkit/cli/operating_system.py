@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from rigkit.cli.progress import end_bar
+
 MAKE_ROOM, PATH = "make room or choose another folder", "correct the path"
 SYSTEM_ERRORS = {
     getattr(errno, name): remedy
@@ -36,6 +38,7 @@ class Terminated(KeyboardInterrupt):
 
 def say(words: str, *, before: str = "") -> None:
     """Print the last line of a run to stderr, if that is open."""
+    end_bar(last=True)
     with contextlib.suppress(OSError, ValueError):
         print(f"{before}rigkit: {words}", file=sys.stderr, flush=True)
 

@@ -43,9 +43,9 @@ def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
                 print(f"probable cause: {cause.text}")
         # Notes come after the causes, so that they are not mistaken for causes.
         _print_notes(done.reports, done.crosschecks)
-        failed = "NOT every pair was validated" if done.failures else "a check FAILED"
+        verdict = "NOT every pair was validated" if done.failures else done.page.badge
         page = "report.html" if "report.html" in done.files else "tables.md"
-        print(f"{'all checks passed' if done.passed else failed}; {out / page}, {done.seconds:.1f} s")
+        print(f"{verdict}; {out / page}, {done.seconds:.1f} s")
     return exit_code_of(done.failures, ExitCode.WELL if done.passed else ExitCode.CHECK_FAILED)
 
 

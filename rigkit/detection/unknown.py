@@ -36,8 +36,8 @@ from rigkit.detection.whole_grids import (
     whole_sizes,
 )
 
-LOOKING = "identifying the board"
-"""Name of the step for progress."""
+LOOKING, READING = "identifying the board", "reading markers"
+"""Names of the steps for progress."""
 
 WITHIN_SQUARES = np.linspace(0.2, 0.8, 9)
 """Sample positions within a square, along either side."""
@@ -104,16 +104,19 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
         plain.append([seen for _, seen in grids])
         if any(_has_empty_squares(images[k], one) for one, _ in grids):
             sure.append(k)
-    for k in (k for k in range(len(images)) if k not in sure):
+    progress(LOOKING, len(images), len(images))
+    read = 0
+    for k in sorted(range(len(images)), key=sure.__contains__):
+        # A tiled floor is a chessboard without markers in every image, but seldom of one size in most.
+        if k in sure and not (tags.seen or markers.images) and _most_show_one_size(plain):
+            break
+        progress(READING, read, len(images))
+        read += 1
         if not tags.look(k, images[k]):
             markers.look(k, images[k])
-    # A tiled floor is a chessboard without markers in every image, but seldom of one size in most.
-    if tags.seen or markers.images or not _most_show_one_size(plain):
-        for k in sure:
-            if not tags.look(k, images[k]):
-                markers.look(k, images[k])
     guess = _guess_from_observations(images, plain, tags, markers, marked=not sure)
-    progress(LOOKING, len(images), len(images))
+    if read:
+        progress(READING, len(images), len(images))
     if guess is not None and guess.board.pattern.type == Chessboard.type:
         return replace(guess, marked=not sure)
     return guess

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigkit.core.tables import Cell, Column, Table
-from rigkit.report.tables import column_label, measured_words, table_notes, text_columns
+from rigkit.report.tables import column_label, measured_words, table_notes, text_columns, without_empty_columns
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -42,6 +42,7 @@ def drawing(svg: str) -> Any:
 
 def table_context(table: Table, pictures: Sequence[str | None] = ()) -> dict[str, Any]:
     """Return a table for the template `table.html`; `pictures` are image sources of the rows."""
+    table = without_empty_columns(table)
     return {
         "title": table.title,
         "head": [(column_label(column), text) for column, text in zip(table.columns, text_columns(table), strict=True)],

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,7 +36,7 @@ LATEX = {letter: rf"\{letter}" for letter in "&%$#_{}"} | {
 def tables_to_markdown(tables: Sequence[Table]) -> str:
     """Return all tables as Markdown: value ± sigma, the paper's value in brackets, best and failed cells bold."""
     parts = []
-    for table in tables:
+    for table in map(without_empty_columns, tables):
         head = [_escape_markdown(column_label(column)) for column in table.columns]
         lines = [
             f"## {_escape_markdown(table.title)}",
@@ -81,7 +83,7 @@ def tables_to_csv(tables: Sequence[Table]) -> str:
 def tables_to_latex(tables: Sequence[Table]) -> str:
     r"""Return all tables as LaTeX floats that need \usepackage{booktabs}, and graphicx for wide ones."""
     parts = []
-    for table in tables:
+    for table in map(without_empty_columns, tables):
         head = " & ".join(_escape_latex(column_label(column)) for column in table.columns)
         lines = [
             r"\begin{table}",
@@ -127,7 +129,7 @@ def tables_to_list(tables: Sequence[Table]) -> list[dict[str, Any]]:
 def tables_to_text(tables: Sequence[Table]) -> str:
     """Return all tables with aligned columns, for a terminal."""
     parts = []
-    for table in tables:
+    for table in map(without_empty_columns, tables):
         grid = [[_one_line(column_label(column)) for column in table.columns]]
         grid += [
             [_one_line(_text(c, column)) for c, column in zip(row, table.columns, strict=True)] for row in table.rows
@@ -145,6 +147,19 @@ TABLE_WRITERS = {"md": tables_to_markdown, "csv": tables_to_csv, "tex": tables_t
 def table_files(tables: Sequence[Table], stem: str, *endings: str) -> dict[str, str]:
     """Return tables as files (name -> content) of all formats, or of these `endings`."""
     return {f"{stem}.{ending}": TABLE_WRITERS[ending](tables) for ending in endings or TABLE_WRITERS}
+
+
+def without_empty_columns(table: Table) -> Table:
+    """Return a table for people: without columns, such as those of measurements, that are empty in every row. CSV and
+    JSON keep these."""
+    filled = [
+        any(c.paper or without_nan(c.value) not in (None, "") for c in own) for own in zip(*table.rows, strict=True)
+    ]
+    return replace(
+        table,
+        columns=tuple(itertools.compress(table.columns, filled)),
+        rows=tuple(tuple(itertools.compress(row, filled)) for row in table.rows),
+    )
 
 
 def _cell_dict(cell: Cell) -> Any:

@@ -105,20 +105,27 @@ function viewer(canvas, scene) {
 
   // Each camera's name behind its tip, where it covers no line of it, and below names that are there already.
   function names(pen, ratio, wire) {
-    const high = 12 * ratio, taken = [];
-    pen.fillStyle = wire;
+    const high = 12 * ratio, rim = 4 * ratio, taken = [];
+    // Around its letters the page shows, so that lines of others end there.
+    const page = getComputedStyle(canvas).getPropertyValue("--page").trim() || "#fff";
+    pen.lineJoin = "round";
     pen.font = `${high}px sans-serif`;
     for (const camera of scene.cameras) {
       const [tip, ...base] = camera.corners.map(project);
       const behind = [0, 1].map((k) => tip[k] - base.reduce((s, q) => s + q[k], 0) / base.length);
       const scale = 8 * ratio / (Math.hypot(...behind) || 1), wide = pen.measureText(camera.name).width;
       const left = tip[0] + scale * behind[0] - (behind[0] < 0 ? wide : 0);
-      const x = Math.max(0, Math.min(left, canvas.width - wide));
+      const x = Math.max(rim, Math.min(left, canvas.width - wide - rim));
       let y = Math.max(high, tip[1] + scale * behind[1] + (behind[1] > 0 ? 0.8 : 0.3) * high);
       while (taken.some((other) => Math.abs(other.y - y) < high && x < other.x + other.wide && other.x < x + wide)) {
         y += 0.25 * high;
       }
       taken.push({x, y, wide});
+      pen.strokeStyle = page;
+      pen.lineWidth = 4 * ratio;
+      pen.strokeText(camera.name, x, y);
+      pen.lineWidth = ratio;
+      pen.fillStyle = wire;
       pen.fillText(camera.name, x, y);
     }
   }

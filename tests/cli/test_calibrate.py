@@ -30,7 +30,7 @@ from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import place_board, sees_paper
 from rigkit.workflows.calibration import next_pictures
-from rigkit.workflows.inputs.corners import first_camera
+from rigkit.workflows.inputs.corners import first_calibration
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "calibration" / "fisheye"
 SESSION = 'schema = "rigkit.session/1"\nimages = "*.jpg"\nboard = "board.toml"\nmodel = "kannala_brandt"\n'
@@ -375,8 +375,8 @@ def test_the_first_camera_is_of_a_model_that_fits(tmp_path: Path) -> None:
     (tmp_path / "board.toml").write_text('id = "board"\n' + BOARD.replace("30.0", "25.0"))
     path = tmp_path / "session.toml"
     path.write_text(SESSION.replace("kannala_brandt", "auto"))
-    first = first_camera(load_session(path), found)
-    assert first is not None and first.model == "brown"
+    first = first_calibration(load_session(path), found)
+    assert first is not None and first.camera.model == "brown"
     path.write_text(SESSION.replace("kannala_brandt", "scaramuzza"))
-    named = first_camera(load_session(path), found)
-    assert named is not None and named.model == "scaramuzza"
+    named = first_calibration(load_session(path), found)
+    assert named is not None and named.camera.model == "scaramuzza"

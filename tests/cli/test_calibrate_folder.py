@@ -29,7 +29,7 @@ from rigkit.io.manifests.session import load_session
 from rigkit.workflows.calibration.calibrate import SessionCalibration, calibrate_session
 from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.inputs.camera_files import import_rig
-from rigkit.workflows.inputs.corners import first_camera
+from rigkit.workflows.inputs.corners import first_calibration
 from rigkit.workflows.inputs.folder_session import cameras_in, session_of_folders
 from rigkit.workflows.inputs.known_cameras import known_cameras, known_cameras_first
 from rigkit.workflows.options.cameras import CalibrateOptions, Known
@@ -276,7 +276,7 @@ def test_a_session_file_from_python_too(pictures: Path, tmp_path: Path) -> None:
     assert isinstance(done, SessionCalibration)
     np.testing.assert_array_equal(again.calibration.camera.parameters, done.calibration.camera.parameters)
     # No camera is found of nothing; why, the calibration itself says.
-    assert first_camera(load_session(session), {"left01.jpg": FoundCorners((640, 480), ())}) is None
+    assert first_calibration(load_session(session), {"left01.jpg": FoundCorners((640, 480), ())}) is None
 
 
 def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(pictures: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Literal
 
 import pytest
 
-from rigkit.cli.console import add_options, options_of, progress_on_stderr
+from rigkit.cli.console import add_options, options_of
 from rigkit.cli.main import VERBS, main
 from rigkit.io.disk.schema_builders import attributes_of
 from rigkit.workflows.options import cameras, check, clouds, coach, plan
@@ -111,14 +111,3 @@ def test_without_docstrings_all_verbs_work() -> None:
     """`python -OO` compiles all packages anew."""
     code = f"from rigkit.cli.main import build_parser\nfor verb in {list(VERBS)}: build_parser(verb).format_help()"
     subprocess.run([sys.executable, "-OO", "-c", code], check=True)
-
-
-def test_a_long_stage_says_how_far_it_is_where_there_is_no_terminal(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    seconds = iter([0.0, 1.0, 6.0, 7.0, 12.0, 13.0])
-    monkeypatch.setattr("rigkit.cli.console.time.monotonic", lambda: next(seconds))
-    show = progress_on_stderr()
-    for done in range(6):
-        show("pairs", done, 5)
-    assert capsys.readouterr().err.splitlines() == ["pairs: 2 of 5", "pairs: 4 of 5", "pairs: 5 done in 13.0 s"]

@@ -51,7 +51,7 @@ def lenses_on_flat_boards(
         fits = [fit_kept(seen, o.fit.state.subset(chosen), o.fit.kept[chosen], settle=True) for o in options]
         options = [replace(option, fit=fit) for option, fit in zip(options, fits, strict=True)]
     seen = reweighted(seen, options)
-    return cross_validated(seen, options, request)
+    return cross_validated(seen, options, request, "models")
 
 
 def best_sizes(cameras: Sequence[Sequence[FittedModel]]) -> list[str]:

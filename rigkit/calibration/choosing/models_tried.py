@@ -145,20 +145,24 @@ def reweighted(observations: Observations, options: list[FittedModel]) -> Observ
     return observations.with_common_error(squared, best.fit.kept)
 
 
-def cross_validated(observations: Observations, options: list[FittedModel], request: Request) -> list[FittedModel]:
-    """Return the options refitted to the same corners where they are not yet, with their held-out errors."""
+def cross_validated(
+    observations: Observations, options: list[FittedModel], request: Request, what: str
+) -> list[FittedModel]:
+    """Return the options refitted to the same corners where they are not yet, with their held-out errors; `what` they
+    are is said with the progress."""
+    stage = f"cross-validation of {what}"
     sigma = [robust_sigma(o.fit, observations) for o in options] if len(options) > 1 else [0.0]
     near = [o.fit.kept for o, s in zip(options, sigma, strict=True) if s <= COMPARABLE * min(sigma)]
     kept = np.any(near, axis=0)
     out = []
     unequal = float(np.ptp(observations.weight[observations.present])) > 0.0
     for i, option in enumerate(options):
-        request.progress("cross-validation", i, len(options))
+        request.progress(stage, i, len(options))
         if option.heldout is not None and (option.fit.kept == kept).all():
             out.append(option)
             continue
         same = (option.fit.kept == kept).all() and not unequal
         fit = option.fit if same else fit_kept(observations, option.fit.state, kept)
         out.append(replace(option, fit=fit, heldout=heldout_squares(observations, fit, request.folds)))
-    request.progress("cross-validation", len(options), len(options))
+    request.progress(stage, len(options), len(options))
     return out

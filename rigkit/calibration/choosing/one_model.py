@@ -58,16 +58,17 @@ def solved(
     request: Request,
 ) -> ModelOutcome:
     """Return the outcome of one camera model, independent of the other models."""
+    model = options[0].model
     keep, reasons = agreeing_views(observations, options)
     if reasons:
         observations = observations.subset(np.flatnonzero(keep))
         options, failed = fit_all(observations, request, wanted)
     observations = reweighted(observations, options)
-    options = cross_validated(observations, options, request)
+    options = cross_validated(observations, options, request, f"{model}'s sizes")
     beyond = [] if request.degree is not None else larger_sizes(choose(options, MIN_SIGMAS))
     if beyond:
         options, unfit = fit_all(observations, request, beyond, options)
-        options = cross_validated(observations, options, request)
+        options = cross_validated(observations, options, request, f"{model}'s larger sizes")
         failed = [*failed, *unfit]
     return chosen_of_sizes(observations, options, request, used=keep, reasons=reasons, failed=failed, beyond=beyond)
 
@@ -152,4 +153,4 @@ def _shapes(
         if "released" not in fits:
             reason = "not tried: residuals of the warp are consistent with noise"
             untried = [Candidate("board released", 0, float("nan"), None, False, reason)]
-    return cross_validated(observations, options, request), untried
+    return cross_validated(observations, options, request, "board shapes"), untried

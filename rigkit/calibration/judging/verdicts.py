@@ -133,7 +133,7 @@ def judge(
     if not mixed:
         found += [
             *unclear,
-            *undistorted(calibration),
+            *undistorted(calibration, sure=far.worst_px <= UNCERTAIN_PX),
             *([] if contradicting else pattern),
             *_overfit(calibration),
             *diagnose_boards(calibration, " if pixels are square" if upright else "", sure=not contradicting),

@@ -36,6 +36,7 @@ from rigkit.calibration.rig.views.frames import (
     view_distances_px,
     with_common_orientation,
 )
+from rigkit.calibration.rig.views.mispaired import mixup_of_all_frames, typical_px
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews
 from rigkit.calibration.solving.solver import Solution
 from rigkit.calibration.views.folds import folds_of
@@ -360,14 +361,30 @@ def _require_agreement(views: RigViews, left: int, shared: int) -> None:
         ) from error
 
 
+def early_disagreement(views: RigViews) -> str | None:
+    """Return words where the mount that fits most frames leaves cameras that are calibrated alone as far apart as the
+    joint solution does not permit; None without enough frames. The solution may bring them together yet: it estimates
+    lags. REAL: 0.25 of the boards' size for images of different moments; 0.001 to 0.005 for pairs, without a common
+    trigger too, 0.05 for boards in hand before free-running cameras."""
+    distance_px, size_px = typical_px(views), _boards_px(views.seen)
+    if not np.isfinite(distance_px) or distance_px <= MAX_DISTANCE_OF_SIZE * size_px:
+        return None
+    cause = mixup_of_all_frames(views)
+    return _far_apart(distance_px, size_px, views.seen) if cause is None else cause.text
+
+
 def _require_common_moments(distance_px: float, size_px: float, seen: Sequence[FrameObservations]) -> None:
     """Raise DegenerateError where the typical distance between views that share a pose is a large part of the boards'
     size in the images."""
     if distance_px > MAX_DISTANCE_OF_SIZE * size_px:
-        raise DegenerateError(
-            f"rig: the views of a frame disagree by {distance_px:.0f} px on the boards' poses (boards are "
-            f"{size_px:.0f} px large); {_advice(seen)}"
-        )
+        raise DegenerateError(f"rig: {_far_apart(distance_px, size_px, seen)}")
+
+
+def _far_apart(distance_px: float, size_px: float, seen: Sequence[FrameObservations]) -> str:
+    return (
+        f"the views of a frame disagree by {distance_px:.0f} px on the boards' poses (boards are {size_px:.0f} px "
+        f"large); {_advice(seen)}"
+    )
 
 
 def _advice(seen: Sequence[FrameObservations]) -> str:

@@ -103,13 +103,17 @@ def _uncertain(rig: RigCalibration, far: Sequence[FarProjection]) -> Iterator[Fi
                 f"the projection uncertainty of camera '{camera.name}' reaches {worst:.1f} px where boards were seen",
                 "take more frames, with the boards tilted",
             )
-    for a, b in combinations([c.name for c in rig.cameras], 2):
-        transfer = transfer_uncertainty(rig, a, b)
-        if transfer is not None and transfer.median_px > UNCERTAIN_PX:
-            yield Finding.bad(
-                f"points transferred from camera '{a}' to camera '{b}' are uncertain by {transfer.median_px:.1f} px",
-                "take more frames in which both see the board, or that link them by other cameras",
-            )
+    transfers = [transfer_uncertainty(rig, a, b) for a, b in combinations([c.name for c in rig.cameras], 2)]
+    words = [
+        f"from camera '{t.a}' to camera '{t.b}' by {t.median_px:.1f} px"
+        for t in transfers
+        if t is not None and t.median_px > UNCERTAIN_PX
+    ]
+    if words:
+        yield Finding.bad(
+            f"transferred points are uncertain, {', '.join(words)}",
+            "take more frames in which both see the board, or that link them by other cameras",
+        )
 
 
 def _timing(rig: RigCalibration) -> str:

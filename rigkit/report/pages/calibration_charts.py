@@ -203,7 +203,7 @@ def lens_svg(calibration: Calibration) -> str:
     ):
         inside = curve <= top
         plot.line(theta[inside], curve[inside], SOFT, width=1.2, dashes=dashes)
-    plot.words(WIDTH - RIGHT, HEIGHT - BOTTOM - 26, "dotted: perspective", "end", FAINT_WORDS)
+    plot.words(WIDTH - RIGHT, HEIGHT - BOTTOM - 34, "dotted: perspective", "end", FAINT_WORDS)
     plot.words(WIDTH - RIGHT, HEIGHT - BOTTOM - 10, "dashed: equidistant", "end", FAINT_WORDS)
     known = np.isfinite(band)
     times = round_down(0.1 * top / max(float(np.nanmedian(band)), 1e-9)) if known.any() else 1.0
@@ -212,9 +212,7 @@ def lens_svg(calibration: Calibration) -> str:
     outline = " ".join(f"{plot.u(a):.1f},{plot.v(float(np.clip(r, 0.0, top))):.1f}" for a, r in both)
     plot.parts.append(f'<polygon points="{outline}" fill="{INK}" fill-opacity=".18"/>')
     plot.line(angle, radius, INK, width=2.2)
-    plot.words(
-        LEFT + 10, TOP + 12, f"{focal:.1f} px a radian on the axis; band: one sigma, {times:g} times", colour=INK
-    )
+    plot.words(LEFT + 10, TOP + 12, f"band: one sigma, {times:g} times magnified", colour=INK)
     plot.below(_ticks(0.0, reach))
     return plot.done()
 

@@ -40,7 +40,9 @@ class ValidationVerdict:
     @property
     def badge(self) -> str:
         """The verdict in a word or two."""
-        return "all checks passed" if self.passed else "a check failed" if self.failed else "not complete"
+        if self.passed or not self.failed:
+            return "all checks passed" if self.passed else "not complete"
+        return "a cross-check disagrees" if all(f.what == BY_OTHERS for f in self.failed) else "a check failed"
 
     @property
     def sentences(self) -> tuple[str, ...]:

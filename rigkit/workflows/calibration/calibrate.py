@@ -32,10 +32,18 @@ from rigkit.validation.check import Check, compare_angle, compare_baseline, comp
 from rigkit.validation.checks import COVERAGE
 from rigkit.workflows.calibration.rigid_boards import named_as_listed, named_by_rule, require_distinct
 from rigkit.workflows.calibration.session_page import plans_of, rig_page, session_page
-from rigkit.workflows.inputs.corners import SessionCorners, given_corners, named_images, session_corners, session_views
+from rigkit.workflows.inputs.corners import (
+    FirstCheck,
+    SessionCorners,
+    given_corners,
+    named_images,
+    session_corners,
+    session_views,
+)
 from rigkit.workflows.inputs.identify_board import why_misplaced
 from rigkit.workflows.inputs.image_faults import black_borders, interlaced, wrong_print
 from rigkit.workflows.inputs.known_cameras import known_cameras, known_cameras_first, with_known
+from rigkit.workflows.inputs.layout_evidence import check_of_moments
 from rigkit.workflows.options.cameras import CalibrateOptions
 from rigkit.workflows.outputs.calibration_paths import boards_path, calibration_paths, camera_exports, camera_path
 from rigkit.workflows.outputs.export_camera import foreign_files, foreign_rig_files
@@ -105,11 +113,14 @@ def calibrate_session(
     )
 
 
-def corners_of(session: Session, options: CalibrateOptions, *, progress: Progress = silent) -> SessionCorners:
-    """Return the corners of a camera's images, from the file `options.corners` or detected."""
+def corners_of(
+    session: Session, options: CalibrateOptions, *, check: FirstCheck | None = None, progress: Progress = silent
+) -> SessionCorners:
+    """Return the corners of a camera's images, from the file `options.corners` or detected; `check` as for
+    `session_corners`."""
     if options.corners is not None:
         return given_corners(session, options.corners)
-    return session_corners(session, cache=options.cache, progress=progress)
+    return session_corners(session, cache=options.cache, check=check, progress=progress)
 
 
 def session_inputs(session: Session | RigSession, options: CalibrateOptions) -> list[Path]:
@@ -229,14 +240,19 @@ def calibrate_rig_session(
         known_cameras(session)  # complaints before the work
         images = {name: [str(image) for image in own.images] for name, own in session.cameras.items()}
         # Without images, the corners that were kept are used.
-        if len(images) > 1 and all(images.values()) and session.frames != "order":
+        named = len(images) > 1 and all(images.values()) and session.frames != "order"
+        if named:
             frames_of_images(images, session.frames)
         require_distinct(session)
     names = list(session.cameras)
     targets = calibration_paths(names, options, rigid_boards=bool(session.rigid_boards))
     ensure_writable(targets, force=options.force, inputs=session_inputs(session, options))
     with about(session.path):
-        corners = {name: corners_of(own, options, progress=progress) for name, own in session.cameras.items()}
+        # Boards on one mount are known apart by the joint solution only.
+        check = check_of_moments(session) if named and not session.rigid_boards else None
+        corners = {
+            name: corners_of(own, options, check=check, progress=progress) for name, own in session.cameras.items()
+        }
         rig = rig_from(session, corners, pupil=options.pupil, progress=progress)
         checks = measured_checks(session, rig)
     files: dict[Path, str] = {}

@@ -111,7 +111,7 @@ def calibrate_folders(
 
     Also writes a session file, beside `options.output` or in the common folder of all images. An existing session file
     is kept if it states the same; else it is refused, or replaced with `options.force`. If the calibration fails, no
-    file changes except the corner cache (`options.cache`).
+    file changes except the corner cache (`options.cache`) of a session that existed.
 
     Raises InputError: no board given, no images, a file that cannot be written, and as `calibrate_session_file`;
     DegenerateError: the views do not determine a camera.
@@ -136,15 +136,19 @@ def calibrate_folders(
     ensure_writable([*new, *results], force=options.force, inputs=[*(set(wanted) - set(new)), *declared])
     before = {path: read_bytes(path, "session") for path in new if path.exists()}
     write_together(new, force=options.force)
+    made = list(set(new) - set(before))
     try:
         with _errors_about(folders, session):
+            if session in made:
+                caches = [own.corners_path for own in load_any_session(session).cameras.values()]
+                made += [path for path in caches if not path.exists()]
             if corners and options.cache is Cache.UPDATE and options.corners is None:
                 _keep_corners(session, corners)
             return calibrate_session_file(session, options, progress=progress)
     except BaseException:
         if before:
             write_together(before, force=True)
-        for path in set(new) - set(before):
+        for path in made:
             with suppress(OSError):
                 path.unlink()
         raise

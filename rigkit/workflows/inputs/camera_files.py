@@ -135,7 +135,7 @@ def warn_if_bad(path: str | Path, verdicts: Iterable[Finding] | None = None) -> 
     them."""
     bad = bad_verdict_in_file(path) if verdicts is None else bad_verdict(verdicts)
     if bad is not None:
-        _log.warning("'%s': %s", path, bad.message)
+        _log.warning("'%s': %s", path, bad.text)
     return bad
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -33,6 +33,9 @@ ODD_SIZES = 3
 """A few images of another size are left out; if they are one in three or more, the session is ambiguous."""
 LOOSE = 1.5
 """A first calibration whose residuals exceed the corners' own sigmas by this factor does not fit the lens."""
+
+FirstCheck = Callable[[Session, Mapping[str, FoundCorners], Calibration], None]
+"""Called with a camera's session, corners and first calibration."""
 
 _log = logging.getLogger(__name__)
 
@@ -122,11 +125,18 @@ def _common_size(session: Session, found: Mapping[str, FoundCorners]) -> tuple[i
     return counts[0][0]
 
 
-def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Progress = silent) -> SessionCorners:
+def session_corners(
+    session: Session,
+    *,
+    cache: Cache = Cache.READ,
+    check: FirstCheck | None = None,
+    progress: Progress = silent,
+) -> SessionCorners:
     """Return the corners of every image by name, detected or from the cache beside the session.
 
     Corners are detected twice. A first calibration gives the distortion at every corner, which few large squares
-    through a wide lens do not show, and where the board is occluded; the second detection uses it. An image that cannot
+    through a wide lens do not show, and where the board is occluded; the second detection uses it, after `check` was
+    called with the corners so far and this calibration. An image that cannot
     be read goes into `unreadable`; its error is raised if no image can be read.
     """
     kept = CornerCache(None if cache is Cache.OFF else session.corners_path, session.boards)
@@ -144,14 +154,8 @@ def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Pr
         what = " ".join(words if session.camera is None else (*words, "of", session.camera))
         out = {}
         progress(what, 0, len(names))
-
-        def found_of(name: str) -> FoundCorners | InputError:
-            try:
-                return found_in(paths[name], session, camera)
-            except InputError as error:
-                return error
-
-        for i, (name, found) in enumerate(zip(names, in_threads(found_of, names), strict=True), start=1):
+        each = in_threads(lambda name: _found_or_error(paths[name], session, camera), names)
+        for i, (name, found) in enumerate(zip(names, each, strict=True), start=1):
             progress(what, i, len(names))
             if not isinstance(found, InputError):
                 kept.put(name, hashes[name], found, lens)
@@ -171,8 +175,10 @@ def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Pr
     # All of them, or the corners would depend on which images were added when.
     through = {name: item for name in usable if (item := kept.get(name, hashes[name], lens)) is not None}
     if len(through) < len(usable):
-        camera = first_camera(session, first)
-        through = {} if camera is None else look(usable, camera, lens)
+        calibration = first_calibration(session, first)
+        if check is not None and calibration is not None:
+            check(session, first, calibration)
+        through = {} if calibration is None else look(usable, calibration.camera, lens)
     if cache is Cache.UPDATE:
         kept.keep(first)
         _save(kept)
@@ -234,14 +240,15 @@ def found_in(path: Path, session: Session, camera: Camera | None = None) -> Foun
     return FoundCorners((image.shape[1], image.shape[0]), detect_boards(image, session.boards, camera=camera))
 
 
-def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera | None:
-    """Return a camera calibrated quickly from `found`; None if that fails: the final calibration reports why."""
-    first = first_calibration(session, found)
-    return None if first is None else first.camera
+def _found_or_error(path: Path, session: Session, camera: Camera | None) -> FoundCorners | InputError:
+    try:
+        return found_in(path, session, camera)
+    except InputError as error:
+        return error
 
 
 def first_calibration(session: Session, found: Mapping[str, FoundCorners]) -> Calibration | None:
-    """Return a quick calibration from `found`, without verdicts; None if that fails."""
+    """Return a quick calibration from `found`, without verdicts; None if that fails: the final calibration reports why."""
     try:
         corners = SessionCorners(found=found, unreadable={}, source="")
         views, size_px, _ = session_views(session, corners)

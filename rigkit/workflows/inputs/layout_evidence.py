@@ -4,13 +4,14 @@ in the same way at every moment."""
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.joint import early_disagreement
 from rigkit.calibration.rig.views.frames import mounts_of
 from rigkit.calibration.rig.views.mispaired import typical_px
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews, frame_observations
@@ -19,9 +20,11 @@ from rigkit.core.errors import InputError
 from rigkit.core.processes import in_threads
 from rigkit.core.progress import Progress
 from rigkit.io.corners.corner_cache import FoundCorners
+from rigkit.io.manifests.rig_session import RigSession, frames_of_images
 from rigkit.io.manifests.session import Session
 from rigkit.io.media.images import images_below
 from rigkit.workflows.inputs.corners import (
+    FirstCheck,
     SessionCorners,
     first_calibration,
     found_in,
@@ -111,11 +114,39 @@ def on_one_mount(
         calibration = first_calibration(session, found)
         if calibration is None:
             return None
-        views, _, _ = session_views(session, SessionCorners(found=found, unreadable={}, source=""))
         moment_of = dict(zip(named_images(session), moments, strict=True))
-        seen.append(frame_observations([(moment_of[view.image], view) for view in views], calibration))
+        seen.append(_observations(session, found, calibration, moment_of))
         single.append(calibration)
     return _move_alike(RigViews(list(layout.cameras), seen, tuple(single), {}))
+
+
+def check_of_moments(session: RigSession) -> FirstCheck:
+    """Return a function for the corners and the first calibration of one camera of a rig after the other. It warns as
+    soon as cameras seem not to have been on one mount at the same moments: the calibration refuses these in the end
+    only."""
+    images = {name: list(named_images(own)) for name, own in session.cameras.items()}
+    frames = frames_of_images(images, session.frames)
+    names, seen, single, warned = list[str](), list[FrameObservations](), list[Calibration](), list[str]()
+
+    def check(own: Session, found: Mapping[str, FoundCorners], calibration: Calibration) -> None:
+        name = own.camera or ""
+        names.append(name)
+        seen.append(_observations(own, found, calibration, frames[name]))
+        single.append(calibration)
+        words = None if len(seen) < 2 else early_disagreement(RigViews(names, seen, tuple(single), {}))
+        if words is not None and not warned:
+            warned.append(words)
+            _log.warning(f"as it seems so far, {words}; the calibration goes on and will tell")
+
+    return check
+
+
+def _observations(
+    session: Session, found: Mapping[str, FoundCorners], calibration: Calibration, moment_of: Mapping[str, str]
+) -> FrameObservations:
+    """Return the observations of a camera by moment, from its corners and its calibration."""
+    views, _, _ = session_views(session, SessionCorners(found=found, unreadable={}, source=""))
+    return frame_observations([(moment_of[view.image], view) for view in views], calibration)
 
 
 def _look(session: Session, corners: dict[Path, FoundCorners], progress: Progress) -> None:
