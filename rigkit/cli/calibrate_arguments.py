@@ -70,7 +70,8 @@ def _output(text: str) -> Path:
     """Return the file to write, a new one without suffix with .json; raises InputError for a folder."""
     path = Path(text)
     if path.is_dir() or text.endswith(("/", os.sep)):
-        raise InputError(f"calibrate: -o '{path}' is a folder; give a file, such as '{path / 'calibration.json'}'")
+        what = "is" if path.is_dir() else "names"
+        raise InputError(f"calibrate: -o '{text}' {what} a folder; give a file, such as '{path / 'calibration.json'}'")
     known = path.suffix or path.exists() or path.is_symlink()
     return path if known else path.with_name(f"{path.name}.json")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 
 from rigkit.core.errors import InputError
 
@@ -15,6 +16,23 @@ def last_number(name: str) -> str:
     """Return the last number in a name, without leading zeros; the name itself where it has none."""
     numbers = re.findall(r"\d+", name)
     return str(int(numbers[-1])) if numbers else name
+
+
+def known_name(name: str, known: Collection[str]) -> str | None:
+    """Return the one of `known` that is this name, if need be apart from its case, and with l for left and r for right;
+    None if there is none, or several.
+
+    >>> known_name("L", ["left", "right"]), known_name("top", ["left", "right"])
+    ('left', None)
+    """
+    if name in known:
+        return name
+    alike = [one for one in known if _side(one) == _side(name)]
+    return alike[0] if len(alike) == 1 else None
+
+
+def _side(name: str) -> str:
+    return {"l": "left", "r": "right"}.get(name.lower(), name.lower())
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:

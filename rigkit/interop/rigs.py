@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,8 +10,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import Pixels
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.interop.colmap_cameras import write_colmap_cameras
-from rigkit.interop.colmap_model import quaternion_wxyz
+from rigkit.interop.colmap_rig import write_colmap_rig
 from rigkit.interop.exchange import MM_PER_M, Written
 from rigkit.interop.kalibr import write_kalibr
 from rigkit.interop.mrcal import write_cameramodel
@@ -104,25 +102,9 @@ def _ros(rig: Rig, outlines: Outlines) -> ForeignRig:
 
 
 def _colmap(rig: Rig, outlines: Outlines) -> ForeignRig:
-    """Return COLMAP's rig_config.json, for images in one folder for each camera; the first camera is the reference."""
-    ids = {name: k for k, name in enumerate(rig, start=1)}
-    seen = {ids[name]: outline for name, outline in outlines.items() if name in ids}
-    _, written = write_colmap_cameras({ids[name]: camera for name, (camera, _) in rig.items()}, seen)
-    reference = next(iter(rig.values()))[1]
-    cameras: list[dict[str, object]] = []
-    for (name, (_, pose)), line in zip(rig.items(), written.values(), strict=True):
-        _, model, _, _, *values = line.text.split()
-        entry: dict[str, object] = {"image_prefix": f"{name}/"}
-        if cameras:
-            from_reference = pose @ reference.inverse()
-            entry["cam_from_rig_rotation"] = quaternion_wxyz(from_reference.rotation).tolist()
-            entry["cam_from_rig_translation"] = from_reference.translation_mm.tolist()
-        else:
-            entry["ref_sensor"] = True
-        cameras.append({**entry, "camera_model_name": model, "camera_params": [float(value) for value in values]})
-    text = json.dumps([{"cameras": cameras}], indent=1, allow_nan=False) + "\n"
+    text, written = write_colmap_rig(rig, outlines)
     what = "rig_config.json of COLMAP; one folder of images a camera, lengths in mm"
-    return _foreign(rig, {"": text}, written.values(), what)
+    return _foreign(rig, {"": text}, written, what)
 
 
 def _stereo(rig: Rig, outlines: Outlines, format_name: str) -> tuple[str, str, OpenCVStereo]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rigkit.cameras.pinhole import camera_matrix
 from rigkit.core.errors import InputError
+from rigkit.core.identifiers import known_name
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.disk.reading import about
@@ -197,14 +198,15 @@ def _pairs(
     """Return the paired images of each camera, and the errors of images without a partner."""
     if isinstance(images, (str, Path)):
         cameras = cameras_in([Path(images)])
-        missing = [name for name in names if name not in cameras]
+        own_names = [known_name(name, cameras) for name in names]
+        missing = [name for name, own in zip(names, own_names, strict=True) if own is None]
         if missing:
             there = ", ".join(cameras) if len(cameras) > 1 else "those of one camera only"
             raise InputError(
                 f"rectify: in '{images}' no images are named after the rig's camera '{missing[0]}': there are {there}; "
                 f"give two folders, that of '{names[0]}' first"
             )
-        found = [images_of_camera(cameras[n]) for n in names]
+        found = [images_of_camera(cameras[own]) for own in own_names if own is not None]
     elif not all(Path(image).is_dir() for image in images):
         one, two = images
         if is_video(one) != is_video(two) or Path(one).is_dir() != Path(two).is_dir():

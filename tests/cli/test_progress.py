@@ -27,8 +27,8 @@ class Terminal(io.StringIO):
 def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     """Return a function that sets the time; nothing goes on by itself."""
     at = [0.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: at[0])
-    monkeypatch.setattr(progress.threading.Thread, "start", lambda thread: None)
+    monkeypatch.setattr("rigkit.cli.progress.time.monotonic", lambda: at[0])
+    monkeypatch.setattr("rigkit.cli.progress.threading.Thread.start", lambda thread: None)
 
     def set_to(seconds: float) -> None:
         at[0] = seconds

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -173,6 +174,17 @@ def test_folders_of_a_pair_are_rectified_with_their_geometry(
         assert main(["rectify", *given, "--rig", str(rig), "--interpolation", "linear", "-o", str(into)]) == 0
         for name in poses:
             assert (into / name / "2.png").read_bytes() == (out / name / "2.png").read_bytes()
+    # Those of left and right may be called l and r.
+    for name in poses:
+        for image in (tmp_path / name).iterdir():
+            image_of_side = tmp_path / "sides" / f"{name[0]}{image.name}"
+            image_of_side.parent.mkdir(exist_ok=True)
+            shutil.copy(image, image_of_side)
+    start = ["rectify", str(tmp_path / "sides"), "--rig", str(rig), "--interpolation", "linear"]
+    assert main([*start, "--names", "L", "R", "-o", str(tmp_path / "of-sides")]) == 0
+    for name in poses:
+        written = tmp_path / "of-sides" / name / f"{name[0]}2.png"
+        assert written.read_bytes() == (out / name / "2.png").read_bytes()
     # Folders that are called as the cameras are theirs, in whatever order they come.
     assert main(["rectify", *both[::-1], *command[3:], "-o", str(tmp_path / "turned")]) == 0
     for name in poses:

@@ -15,7 +15,7 @@ import pytest
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.core.errors import InputError
-from rigkit.core.tables import Cell, Column, Table
+from rigkit.core.tables import Cell, Column, Table, cells, columns
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.report.render import render, table_context
 from rigkit.report.tables import (
@@ -25,6 +25,7 @@ from rigkit.report.tables import (
     tables_to_latex,
     tables_to_markdown,
     tables_to_text,
+    without_empty_columns,
 )
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.tables import PaperTables, best_method, best_report, build_tables, check_table, plane_table
@@ -254,3 +255,14 @@ def test_what_estimators_share_is_one_row_and_another_angle_than_a_right_one_has
     names = [str(row[0].value) for row in plane_table([other], other.affine_method, PaperTables()).rows]
     assert any(name.startswith("angle error plane1") for name in names)
     assert not any(name.startswith("orthogonality") for name in names)
+
+
+def test_columns_that_are_empty_in_every_row_are_for_programs_only() -> None:
+    heads = columns("pair | measured [mm] | how | shift [mm] | turn [deg] | remark")
+    rows = (cells("a", None, "", 0.0, float("nan"), ""), cells("b", None, "", 0.0, None, "late"))
+    table = Table("t", "T", heads, rows)
+    assert [column.label for column in without_empty_columns(table).columns] == ["pair", "shift", "remark"]
+    for text in (tables_to_markdown([table]), tables_to_latex([table]), tables_to_text([table])):
+        assert "shift" in text and "late" in text and "measured" not in text and "turn" not in text
+    assert [label for label, _ in table_context(table)["head"]] == ["pair", "shift, mm", "remark"]
+    assert "measured [mm]" in tables_to_csv([table]) and '"measured": null' in tables_to_json([table])

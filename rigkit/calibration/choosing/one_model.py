@@ -64,11 +64,11 @@ def solved(
         observations = observations.subset(np.flatnonzero(keep))
         options, failed = fit_all(observations, request, wanted)
     observations = reweighted(observations, options)
-    options = cross_validated(observations, options, request, f"{model}'s sizes")
+    options = cross_validated(observations, options, request, model)
     beyond = [] if request.degree is not None else larger_sizes(choose(options, MIN_SIGMAS))
     if beyond:
         options, unfit = fit_all(observations, request, beyond, options)
-        options = cross_validated(observations, options, request, f"{model}'s larger sizes")
+        options = cross_validated(observations, options, request, f"larger {model}")
         failed = [*failed, *unfit]
     return chosen_of_sizes(observations, options, request, used=keep, reasons=reasons, failed=failed, beyond=beyond)
 

@@ -16,9 +16,11 @@ from rigkit.cameras.moving_pupil import pupil_shift_of_rays_mm
 from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding, Severity
+from rigkit.core.identifiers import known_name
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.camera_formats import FOREIGN_FORMATS
 from rigkit.interop.colmap_cameras import colmap_cameras_text
+from rigkit.interop.colmap_rig import read_colmap_rig
 from rigkit.interop.kalibr import read_kalibr
 from rigkit.interop.matlab import is_matlab_pair, matlab_text, read_matlab_pair
 from rigkit.interop.opencv import read_opencv_stereo
@@ -53,15 +55,6 @@ def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[i
     return known.camera
 
 
-def _refuse_colmap_rig(text: str, name: str) -> None:
-    """Raise InputError for a rig_config.json of COLMAP."""
-    if COLMAP_RIG.search(text):
-        raise InputError(
-            f"'{name}': a rig_config.json of COLMAP does not say how large images are, so rigkit cannot read it; give "
-            "the rig that it was made of, or cameras.txt of the model"
-        )
-
-
 def import_near_camera(path: str | Path) -> Camera:
     """Return the camera of a file for points in mm: a `NearCamera` if the pupil moves, else as `import_camera`."""
     known = _camera_or_calibration(Path(path), None, None)
@@ -73,7 +66,8 @@ def _camera_or_calibration(source: Path, kind: str | None, size_px: tuple[int, i
     text, name = camera_text(source), str(source)
     kind = kind or camera_format(text)
     if kind is None:
-        _refuse_colmap_rig(text, name)
+        if COLMAP_RIG.search(text):
+            raise InputError(f"'{name}' is a rig; `rigkit export {name} --names CAMERA -o CAMERA.json` takes out one")
         raise InputError(f"'{name}': none of the known camera formats ({', '.join(READ_FORMATS)}); check the file")
     if kind not in READ_FORMATS:
         raise InputError(f"'{kind}' is no camera format; known are {', '.join(READ_FORMATS)}")
@@ -185,12 +179,12 @@ def rig_of_file(path: str | Path) -> SavedRig:
     return load_saved_rig(path) if is_rig_file(path) else SavedRig(cameras=import_rig(path), covariance=None)
 
 
-def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
-    """Return (camera, cam_from_rig in mm) by name from a rig of rigkit, a Kalibr camchain, or a stereo pair of OpenCV
-    or MATLAB. The cameras are central; warns if an entrance pupil moves.
+def import_rig(path: str | Path, *, size_px: tuple[int, int] | None = None) -> dict[str, tuple[Camera, Rigid3]]:
+    """Return (camera, cam_from_rig in mm) by name from a rig of rigkit, a Kalibr camchain, a rig_config.json of COLMAP,
+    or a stereo pair of OpenCV or MATLAB. The cameras are central; warns if an entrance pupil moves.
 
-    Kalibr's cameras are named cam0, cam1, ..., those of a pair left and right. Raises InputError for any other file or
-    a damaged one.
+    Kalibr's cameras are named cam0, cam1, ..., those of a pair left and right. `size_px` is the size of images where a
+    file of COLMAP does not state it. Raises InputError for any other file or a damaged one.
     """
     if is_rig_file(path):
         rig = load_saved_rig(path)
@@ -207,9 +201,11 @@ def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
         return {"left": (left, Rigid3.identity()), "right": (right, right_from_left)}
     if kind == "rigkit":
         return load_rig(path)
-    _refuse_colmap_rig(text, name)
+    if COLMAP_RIG.search(text):
+        return read_colmap_rig(text, name, size_px)
     raise InputError(
-        f"'{name}': no rig of rigkit, Kalibr (camchain), OpenCV (M1, D1, M2, D2, R, T) or MATLAB; check the file"
+        f"'{name}': no rig of rigkit, Kalibr (camchain), OpenCV (M1, D1, M2, D2, R, T), COLMAP or MATLAB; check the "
+        "file"
     )
 
 
@@ -241,10 +237,12 @@ def import_pair(
     and for an unknown camera.
     """
     rig = rig_of_file(path).near_cameras if near else import_rig(path)
-    chosen = names or tuple(rig)[:2]
-    missing = [name for name in chosen if name not in rig]
-    if missing or len(chosen) != 2:
-        raise InputError(f"'{path}': no camera '{', '.join(missing)}'; there are {', '.join(rig)}")
+    wanted = names or tuple(rig)[:2]
+    chosen = [own for name in wanted if (own := known_name(name, rig)) is not None]
+    if len(set(chosen)) != 2:
+        missing = [name for name in wanted if known_name(name, rig) is None]
+        what = f"no camera '{', '.join(missing)}'" if missing else f"'{', '.join(wanted)}' are not two cameras"
+        raise InputError(f"'{path}': {what}; there are {', '.join(rig)}")
     warn_if_bad(path)
     (camera1, cam1_from_rig), (camera2, cam2_from_rig) = (rig[name] for name in chosen)
     return (chosen[0], chosen[1]), (camera1, camera2), cam2_from_rig @ cam1_from_rig.inverse()

@@ -97,7 +97,7 @@ def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence
             f"export: say the rig's format with --to, one of {', '.join(RIG_FORMATS)}, or take one camera out: --names "
             "ONE -o ONE.json"
         )
-    rig = import_rig(source)
+    rig = import_rig(source, size_px=options.size_px)
     warn_if_bad(source)
     missing = [name for name in names if name not in rig]
     if missing or len(set(names)) != len(names):

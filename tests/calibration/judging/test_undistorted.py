@@ -38,3 +38,13 @@ def test_a_narrow_lens_may_have_none(rng: np.random.Generator) -> None:
     views, _, _ = random_views(narrow, 16, rng, reach_deg=6.0, noise_px=0.05)
     found = calibrate(views, SIZE, model="pinhole", board="flat", folds=0)
     assert not any(WORDS in str(verdict) for verdict in found.verdicts)
+
+
+def test_a_lens_that_few_parts_of_the_image_show_is_not_said_to_be_without(rng: np.random.Generator) -> None:
+    """A pinhole is fitted to boards in a corner: their few degrees determine no distortion."""
+    views, _, _ = random_views(SLIGHT, 60, rng, reach_deg=25.0, noise_px=0.3)
+    aside = [view for view in views if (view.pixels.mean(axis=0) > (900.0, 650.0)).all()]
+    assert len(aside) >= 5
+    found = calibrate(aside, SIZE, model="pinhole", board="flat", folds=0)
+    assert any("the projection uncertainty reaches" in str(verdict) for verdict in found.verdicts)
+    assert not any(WORDS in str(verdict) for verdict in found.verdicts)

@@ -6,6 +6,8 @@ import re
 
 from helpers.pages import page_of, reported
 
+from rigkit.report.pages.validation_verdict import BY_OTHERS, FailedFact, ValidationVerdict
+
 
 def words_of(page: str) -> str:
     """The words before the first heading of a section."""
@@ -29,3 +31,11 @@ def test_a_passed_verdict_is_in_the_users_units_with_the_accuracy_of_the_ruler()
     assert "lengths to 0.50 mm" in first and "angles to 0.000 deg" in first
     assert "The measurement (±2 mm) is less precise" in first
     assert "probably" not in first
+
+
+def test_a_verdict_says_whether_a_measurement_or_another_method_disagrees() -> None:
+    by_others = FailedFact(what=BY_OTHERS, pair_id="p", methods=(), words="")
+    own = FailedFact(what="FAILED", pair_id="p", methods=("3SDIR",), words="")
+    for failed, words in (((by_others,), "a cross-check disagrees"), ((own, by_others), "a check failed")):
+        verdict = ValidationVerdict(passed=False, headline="", fineness="", failed=failed, causes=())
+        assert verdict.badge == words

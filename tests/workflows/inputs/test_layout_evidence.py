@@ -16,7 +16,7 @@ from helpers.stereo_pictures import FRAMES
 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
-from rigkit.core.errors import InputError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.progress import silent
 from rigkit.detection.detect import detect_boards
 from rigkit.io.boards.board_words import board_of_words
@@ -136,3 +136,22 @@ def test_an_image_and_its_copy_are_of_one_camera(pictures: Path, tmp_path: Path,
         image = read_image(path)
         cv2.imwrite(str(tmp_path / f"{k}b.jpg"), np.ascontiguousarray(image[::-1, ::-1]) if turned else image)
     assert list(cameras_seen([tmp_path], [BOARD], tmp_path / "session.toml", silent)[0]) == [""]
+
+
+def test_images_of_other_moments_are_told_of_early_and_nothing_is_left(
+    pictures: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The right images of a rig in another order."""
+    for side, step in (("left", 1), ("right", 3)):
+        (tmp_path / side).mkdir()
+        images = sorted(pictures.glob(f"{side}*.jpg"))
+        assert len(images) % 3
+        for k, path in enumerate(images):
+            shutil.copy(path, tmp_path / side / f"{k * step % len(images):02d}.jpg")
+    folders, before = [tmp_path / "left", tmp_path / "right"], set(tmp_path.rglob("*"))
+    declared = FolderOptions(boards=("9x6x30",), model="brown")
+    options = CalibrateOptions(output=tmp_path / "new.json", cache=Cache.UPDATE)
+    with caplog.at_level("WARNING"), pytest.raises(DegenerateError, match="disagree"):
+        calibrate_sources(folders, declared, options)
+    assert [r.message.partition(",")[0] for r in caplog.records].count("as it seems so far") == 1
+    assert set(tmp_path.rglob("*")) == before

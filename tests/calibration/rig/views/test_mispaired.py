@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from helpers.rig_scenes import Views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.joint import early_disagreement
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.views.mispaired import mixup_of_all_frames
 from rigkit.calibration.rig.views.observations import RigViews, frame_observations
@@ -220,3 +221,23 @@ def test_one_picture_of_a_camera_in_two_frames(rng: np.random.Generator) -> None
 
 def test_half_of_the_pictures_exchanged(rng: np.random.Generator) -> None:
     assert re.search(HALF_EXCHANGED, cause(half_exchanged(pair(rng))))
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        (range(FRAMES), None),
+        ([3, 8, 0, 6, 1, 9, 5, 2, 7, 4], r"disagree by \d+ px on the boards' poses \(boards are \d+ px large\)"),
+        ([*range(1, FRAMES), 0], "the images of 'right' belong to"),
+    ],
+)
+def test_images_of_other_moments_show_before_the_rig_is_solved(
+    order: Sequence[int], words: str | None, rng: np.random.Generator
+) -> None:
+    views = pair(rng)
+    frames = [frame for frame, _ in views["right"]]
+    views["right"] = [(frames[order[k]], view) for k, (_, view) in enumerate(views["right"])]
+    alone = [calibrate([v for _, v in own], LENS.size_px, model="brown", degree=4, folds=0) for own in views.values()]
+    seen = [frame_observations(own, one) for own, one in zip(views.values(), alone, strict=True)]
+    found = early_disagreement(RigViews(tuple(views), seen, tuple(alone), {}))
+    assert found is None if words is None else found is not None and re.search(words, found)
