@@ -63,10 +63,12 @@ def describe(calibration: Calibration) -> str:
 
 
 def left_out(calibration: Calibration) -> list[str]:
-    """Return one line for each reason why images, or parts of used images, are left out."""
+    """Return one line for each reason, which no verdict states, why images, or parts of used images, are left out."""
     used = {view.image for view in calibration.views}
     images: dict[tuple[str, str], list[str]] = {}
-    for image, reason in calibration.dropped:
+    stated = tuple(finding.message for finding in calibration.verdicts)
+    unsaid = (entry for entry in calibration.dropped if not any(words.endswith(f": {entry[1]}") for words in stated))
+    for image, reason in unsaid:
         images.setdefault(("left out of" if image in used else "dropped", reason), []).append(image)
     return [
         f"{how} {_first_names(some)}: {reason}" for (how, reason), some in sorted(images.items(), key=lambda i: i[0][0])

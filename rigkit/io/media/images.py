@@ -242,7 +242,7 @@ def require_pixels(size_px: tuple[int, int], what: str) -> None:
     width, height = size_px
     if width * height > MAX_PIXELS:
         raise InputError(
-            f"{what}: {width} x {height} px are more than {MAX_PIXELS // 10**6} million; use a smaller image"
+            f"{what} has {width} x {height} px, more than {MAX_PIXELS // 10**6} million; use a smaller image"
         )
 
 

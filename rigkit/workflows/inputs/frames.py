@@ -8,8 +8,8 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -88,15 +88,16 @@ def frames_of_videos(
         chosen, shots = _chosen_moments(sources, videos, moments, boards, max_frames, progress)
     _claim_folder(folder, sources, live)
     images: dict[str, tuple[Path, ...]] = dict.fromkeys(sources, ())
-    for number, pictures in shots.items() if live else moments_of_videos(sources, list(chosen), timestamps):
-        for name in chosen[number].views:
-            path = folder / name / f"{number:06d}.png"
-            write_atomic(path, np.asarray(cv2.imencode(".png", pictures[name], PNG_FAST)[1]).tobytes(), force=True)
-            images[name] += (path,)
-    if not live:
-        stored = {name: [path.relative_to(folder).as_posix() for path in paths] for name, paths in images.items()}
-        record = json.dumps({"schema": FRAMES_SCHEMA, "asked": asked, "images": stored}, indent=1)
-        write_atomic(folder / RECORD, record + "\n", force=True)
+    with nullcontext() if live else _removed_after_failure(folder, sources):
+        for number, pictures in shots.items() if live else moments_of_videos(sources, list(chosen), timestamps):
+            for name in chosen[number].views:
+                path = folder / name / f"{number:06d}.png"
+                write_atomic(path, np.asarray(cv2.imencode(".png", pictures[name], PNG_FAST)[1]).tobytes(), force=True)
+                images[name] += (path,)
+        if not live:
+            stored = {name: [path.relative_to(folder).as_posix() for path in paths] for name, paths in images.items()}
+            record = json.dumps({"schema": FRAMES_SCHEMA, "asked": asked, "images": stored}, indent=1)
+            write_atomic(folder / RECORD, record + "\n", force=True)
     return images
 
 
@@ -272,8 +273,27 @@ def _claim_folder(folder: Path, sources: Iterable[str], live: bool) -> None:
     would be taken for images of this one."""
     if not live:
         write_atomic(folder / RECORD, json.dumps({"schema": FRAMES_SCHEMA, "asked": None}) + "\n", force=True)
-    for earlier in (path for name in sources for path in (folder / name).glob("[0-9]" * 6 + ".png")):
-        earlier.unlink()
+    _remove_frames(folder, sources)
+
+
+def _remove_frames(folder: Path, sources: Iterable[str]) -> None:
+    for frame in (path for name in sources for path in (folder / name).glob("[0-9]" * 6 + ".png")):
+        frame.unlink()
+
+
+@contextmanager
+def _removed_after_failure(folder: Path, sources: Collection[str]) -> Iterator[None]:
+    """Remove the frames, and folders that are empty without them, if the block fails: videos give them again."""
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            _remove_frames(folder, sources)
+            (folder / RECORD).unlink()
+        for place in (*(folder / name for name in sources if name), folder):
+            with suppress(OSError):
+                place.rmdir()
+        raise
 
 
 def _kept_before(folder: Path, asked: Mapping[str, object]) -> dict[str, tuple[Path, ...]] | None:

@@ -231,3 +231,22 @@ def test_frames_of_an_interrupted_choice_are_not_taken_for_those_of_an_earlier_o
         frames_of_videos({"": paths[1]}, tmp_path / "out", [BOARD])
     again = [read_image(path) for path in frames_of_videos({"": paths[0]}, tmp_path / "out", [BOARD])[""]]
     assert np.array_equal(again, first)
+
+
+def test_nothing_is_left_of_frames_that_do_not_fit_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shots = [picture((0.0, 0.3 * k, 0.0), 0.0) for k in range(2)]
+    for sources in ({"": "a"}, {"left": "a", "right": "a"}):
+        videos = {name: video(tmp_path / f"{source}.avi", shots) for name, source in sources.items()}
+        count = 0
+
+        def full(path: Path, data: bytes, *, force: bool) -> None:
+            nonlocal count
+            count += path.suffix == ".png"
+            if count == 2:
+                raise InputError("no space")
+            write_atomic(path, data, force=force)
+
+        with monkeypatch.context() as patched, pytest.raises(InputError, match="no space"):
+            patched.setattr(frames, "write_atomic", full)
+            frames_of_videos(videos, tmp_path / "out", [BOARD])
+        assert count == 2 and {path.name for path in tmp_path.iterdir()} == {"a.avi"}
