@@ -100,7 +100,9 @@ def _pose(entry: Mapping[str, Any], name: str) -> Rigid3:
         raise InputError(f"'{name}': no {missing[0]}; calibrate the rig, or let COLMAP estimate it, and write it there")
     rotation, shift = (numbers(entry[key], name, key, count) for key, count in zip(keys, (4, 3), strict=True))
     if abs(np.linalg.norm(rotation) - 1.0) > MAX_OFF_UNIT:
-        raise InputError(f"'{name}': {keys[0]} is no rotation: its length is {np.linalg.norm(rotation):.4g}, not 1")
+        raise InputError(
+            f"'{name}': {keys[0]} is no rotation: its length is {np.linalg.norm(rotation):.4g}, not 1; correct it"
+        )
     return Rigid3(_rotation(rotation), shift)
 
 

@@ -284,6 +284,7 @@ KINDS: dict[str, Kind] = {
     "opencv-stereo": Kind("stereo.yaml", (("export", "{case}", "--to", "kalibr", "-o", "{out}/new.yaml"),)),
     "ros": _camera_file("ros.yaml", ("export", "{case}", "--from", "ros", "-o", "{out}/new.json")),
     "colmap": _camera_file("cameras.txt"),
+    "colmap-rig": Kind("rig_config.json", (("export", "{case}", "--to", "kalibr", "-o", "{out}/new.yaml"),)),
     "mrcal": _camera_file("lens.cameramodel"),
     "mrcal-spline": _camera_file("spline.cameramodel"),
     "ocamcalib": _camera_file("calib_results.txt"),

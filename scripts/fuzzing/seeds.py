@@ -16,6 +16,7 @@ from rigkit.core.cloud import OrientedCloud
 from rigkit.core.detections import BoardDetection
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.colmap_cameras import write_colmap_cameras
+from rigkit.interop.colmap_rig import write_colmap_rig
 from rigkit.interop.kalibr import write_kalibr
 from rigkit.interop.mrcal import write_cameramodel
 from rigkit.interop.ocamcalib import write_ocamcalib
@@ -232,6 +233,9 @@ def _write_cameras(folder: Path) -> None:
         "stereo.yaml": opencv_stereo(brown, brown, turned).text,
         "ros.yaml": write_camera_info(brown).text,
         "cameras.txt": write_colmap_cameras({1: brown})[0],
+        "rig_config.json": write_colmap_rig(
+            {"left": (brown, Rigid3(np.eye(3), np.zeros(3))), "right": (fisheye, turned)}, {}
+        )[0],
         "lens.cameramodel": write_cameramodel(brown).text,
         "spline.cameramodel": write_cameramodel(fisheye).text,
         "calib_results.txt": write_ocamcalib(fisheye).text,
