@@ -105,13 +105,11 @@ def _uncertain(rig: RigCalibration, far: Sequence[FarProjection]) -> Iterator[Fi
             )
     transfers = [transfer_uncertainty(rig, a, b) for a, b in combinations([c.name for c in rig.cameras], 2)]
     words = [
-        f"from camera '{t.a}' to camera '{t.b}' by {t.median_px:.1f} px"
-        for t in transfers
-        if t is not None and t.median_px > UNCERTAIN_PX
+        f"'{t.a}' to '{t.b}' by {t.median_px:.1f} px" for t in transfers if t is not None and t.median_px > UNCERTAIN_PX
     ]
     if words:
         yield Finding.bad(
-            f"transferred points are uncertain, {', '.join(words)}",
+            f"points transferred between cameras are uncertain: {', '.join(words)}",
             "take more frames in which both see the board, or that link them by other cameras",
         )
 

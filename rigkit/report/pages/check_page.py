@@ -178,7 +178,8 @@ def check_table(check: CalibrationCheck) -> Table:
         rows.append(cells(change.hypothesis.words, f"{change.chance:.2g}", Cell(change.gain, best=named), amounts))
     none = cells("these images determine no change", "", None, "")
     heads = columns("if this alone changed | p-value of no such change | explains .1 | amount")
-    return Table("causes", "Possible changes", heads, tuple(rows) or (none,))
+    note = "Explains: by how much the weighted sum of squared errors falls with this change."
+    return Table("causes", "Possible changes", heads, tuple(rows) or (none,), note)
 
 
 def check_to_dict(check: CalibrationCheck) -> dict[str, Any]:
@@ -204,7 +205,7 @@ def check_to_dict(check: CalibrationCheck) -> dict[str, Any]:
 def check_page(check: CalibrationCheck, title: str, provenance: Mapping[str, str]) -> str:
     """Return the check as self-contained HTML."""
     chance = check.holds and check.chance >= ALARM_CHANCE
-    moves = "not significant; magnified" if chance else "image displacement by the best explanation"
+    moves = "image displacement by the best explanation" + (", which is not significant" if chance else "")
     return build_facts_page(
         title,
         check_facts(check),
@@ -224,7 +225,8 @@ def change_svg(check: CalibrationCheck, c: int) -> str:
     longest = float(np.linalg.norm(by, axis=1).max(initial=0.0))
     zoom = DRAWN_WIDTH / before.size_px[0]
     times = svg.round_down(ARROW_LENGTH * before.size_px[0] / longest) if longest > 1e-6 else 0.0
-    words = f"{longest:.3g} px at most, drawn {times:g} times as long" if times else "nothing moves"
+    words = "nothing moves" if not times else f"{longest:.3g} px at most, drawn "
+    words += "" if not times else "to scale" if times == 1.0 else f"{times:g} times as long"
     return (
         svg.image_ground(words, DRAWN_WIDTH, zoom * before.size_px[1])
         + f'<path d="{svg.strokes(zoom * start, zoom * times * by)}" stroke="{INK}" stroke-width="1.3" fill="none"/>'
