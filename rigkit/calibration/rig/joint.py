@@ -59,6 +59,12 @@ BAD_COST_SIGMAS = 10.0
 worse than its cameras."""
 MIN_SHARE = 0.5
 """Largest part of the shared targets that may be left out."""
+STAGES: Mapping[Timing, str] = {
+    "readouts": "rig",
+    "lags": "rig without readout times",
+    "trigger": "rig without lags",
+}
+"""Names of the joint solutions for progress."""
 MAX_ROUNDS = 8
 """Maximal number of solutions, each without the frames that disagreed in the one before."""
 NAMED = 3
@@ -153,7 +159,7 @@ def solve_jointly(
     left_out = separate_distant_views(seen, view_distances_px(views, mounts))
     sigma = _sigma(single)
     for i in range(MAX_ROUNDS):
-        progress("rig", i, MAX_ROUNDS)
+        progress(STAGES[timing], i, MAX_ROUNDS)
         _require_agreement(views, len(left_out), shared)
         observations, solution = _solved(views, mounts, sigma, known)
         observations, solution = _with_lags(views, observations, solution, sigma, timing)
@@ -170,7 +176,7 @@ def solve_jointly(
             separate_views(seen, key)
         state = solution.state
         mounts = [Rigid3(r, t) for r, t in zip(state.mount_rotation, state.mount_mm, strict=True)]
-    progress("rig", MAX_ROUNDS, MAX_ROUNDS)
+    progress(STAGES[timing], MAX_ROUNDS, MAX_ROUNDS)
     typical_sigmas = float(np.sqrt(typical) / max(sigma, MIN_PX))
     typical_px, size_px = typical_distance_px(observations, cost), _boards_px(seen)
     _require_common_moments(typical_px, size_px, seen)

@@ -139,4 +139,6 @@ def _worse(rig: RigCalibration) -> Iterator[Finding]:
     if together > WORSE * typical:
         several = len(rig.cameras) > 1
         cause = f"{_timing(rig)}, or the rig is not rigid" if several else "the boards are not rigidly mounted"
-        yield Finding.look(f"held-out RMS is {together / typical:.1f} times that of the cameras alone: {cause}")
+        yield Finding.look(
+            f"held-out frames are predicted {together / typical:.1f} times worse than by the cameras alone: {cause}"
+        )
