@@ -175,7 +175,10 @@ def _read(path: str | Path) -> dict[str, Any]:
         raise InputError(f"calibration '{source}' does not exist; run `rigkit calibrate` first")
     remedy = "calibrate again, or bring another program's camera in with `rigkit export FILE -o camera.json`"
     if (json_schema(source) or "").startswith("rigkit.rig/"):
-        remedy = f"of a rig give the file of the one camera, which is called as '{source.stem}-NAME.json' beside it"
+        raise InputError(
+            f"'{source}' is a rig, but a single camera is needed here; give the file of the one camera, which is "
+            f"called as '{source.stem}-NAME.json' beside it"
+        )
     return read_json(source, CALIBRATION_SCHEMA, CALIBRATION_KEYS, "calibration file", remedy=remedy)
 
 
