@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import re
 from dataclasses import MISSING, fields
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -16,13 +18,14 @@ from rigkit.io.disk.schema_builders import attributes_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
 
     from rigkit.core.arrays import FloatArray
     from rigkit.geometry.rigid3 import Rigid3
     from rigkit.report.pages.page_facts import PageFacts
 
 Options = TypeVar("Options")
+FILE = re.compile(r"[A-Z]+\.\w+")
+"""A placeholder of a file: CORNERS.csv."""
 IMAGE_SIZE = re.compile(r"([0-9]{1,6})[xX]([0-9]{1,6})")
 
 
@@ -71,6 +74,7 @@ def _argument_of(own: Any, default: Any, places: list[str]) -> dict[str, Any]:
     out: dict[str, Any] = {"default": default} if default is not MISSING else {"required": True}
     if places:
         out["metavar"] = tuple(places) if len(places) > 1 else places[0].removesuffix("...")
+        own = file_path if own is Path and FILE.fullmatch(places[0]) else own
     if get_origin(own) is tuple:
         own, *others = get_args(own)
         if others != [...]:
@@ -78,6 +82,13 @@ def _argument_of(own: Any, default: Any, places: list[str]) -> dict[str, Any]:
         else:
             out |= {"default": [], **({"nargs": "+"} if places[0].endswith("...") else {"action": "append"})}
     return out | ({"choices": get_args(own)} if get_origin(own) is Literal else {"type": own})
+
+
+def file_path(text: str) -> Path:
+    """Return the path of a file; raises InputError for a text that ends as folders do."""
+    if text.endswith(("/", os.sep)):
+        raise InputError(f"'{text}' names a folder; give a file in it")
+    return Path(text)
 
 
 def options_of(kind: type[Options], args: argparse.Namespace, /, **others: Any) -> Options:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import add_options, options_of, progress_on_stderr, size_of_words
+from rigkit.cli.console import add_options, file_path, options_of, progress_on_stderr, size_of_words
 from rigkit.cli.dataset_arguments import add_planes_argument
 from rigkit.core.errors import InputError
 from rigkit.workflows.inputs.formats import CAMERA_FORMATS, CLOUD_FORMATS, PLY_FORMATS, READ_FORMATS
@@ -26,7 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source", type=Path, metavar="SOURCE", help="a camera file, a rig, a cloud as PLY, or a data set (then --pair)"
     )
-    add_options(parser, ExportCloudOptions, output="-o")
+    # A text, as only that of a COLMAP model may end as folders do.
+    parser.add_argument("-o", "--output", required=True, help="file to write (a folder for a COLMAP model)")
     parser.add_argument(
         "--to", choices=sorted({*CAMERA_FORMATS, *CLOUD_FORMATS}), help="format of OUTPUT (default: by its ending)"
     )
@@ -44,7 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.source.is_dir() or args.source.suffix in (".toml", ".ply"):
+    is_cloud = args.source.is_dir() or args.source.suffix in (".toml", ".ply")
+    args.output = Path(args.output) if is_cloud and args.to in (None, "colmap") else file_path(args.output)
+    if is_cloud:
         return _export_cloud(args)
     if args.single_precision:
         raise InputError("export: --float is for clouds written as PLY; leave it out")

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from rigkit.cli.aim_arguments import add_board_argument
+from rigkit.cli.console import file_path
 from rigkit.cli.init_manifest import POSE_TYPES, parse_length, run_manifest
 from rigkit.core.errors import ExitCode, InputError
 
@@ -65,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="measured angle between every two boards, such as 90+-0.3, of all pairs or of those whose names match "
         "(repeatable; the first match counts)",
     )
-    parser.add_argument("-o", "--output", type=Path, help="default: dataset.toml (session.toml) in the folder")
+    parser.add_argument("-o", "--output", type=file_path, help="default: dataset.toml (session.toml) in the folder")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     add_board_argument(parser, "board in the images, such as 9x6x25 (repeatable; instead of --square-mm)")
     session = parser.add_argument_group("sessions")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import add_options, options_of, print_json, progress_on_stderr
+from rigkit.cli.console import add_options, file_path, options_of, print_json, progress_on_stderr
 from rigkit.core.errors import ExitCode
 from rigkit.workflows.options.clouds import MeshOptions
 
@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CLOUD.ply",
         help="point cloud with normals, of `rigkit reconstruct` or any other program",
     )
-    parser.add_argument("-o", "--output", type=Path, metavar="MESH.ply", help="default: CLOUD-mesh.ply beside it")
+    parser.add_argument("-o", "--output", type=file_path, metavar="MESH.ply", help="default: CLOUD-mesh.ply beside it")
     add_options(parser, MeshOptions, depth="", cut="SHARE", one_view="", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

@@ -9,15 +9,15 @@ examples:
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
+from rigkit.cli.console import file_path
 from rigkit.core.errors import ExitCode
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", nargs="?", metavar="NAME", help="file format (default: list all)")
     parser.add_argument("--keys", action="store_true", help="print a table of keys instead of JSON Schema")
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE.json", help="file to write")
+    parser.add_argument("-o", "--output", type=file_path, metavar="FILE.json", help="file to write")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
 
 

@@ -111,3 +111,27 @@ def test_without_docstrings_all_verbs_work() -> None:
     """`python -OO` compiles all packages anew."""
     code = f"from rigkit.cli.main import build_parser\nfor verb in {list(VERBS)}: build_parser(verb).format_help()"
     subprocess.run([sys.executable, "-OO", "-c", code], check=True)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "export camera.json --to opencv -o new/",
+        "detect a.png --board 9x6x30 -o new/",
+        "plan camera.json -r new/",
+        "check camera.json a.png --register new/",
+        "mesh cloud.ply -o new/",
+        "init photos --session -o new/",
+        "schema session -o new/",
+        "history register.jsonl -r new/",
+        "calibrate photos -o new/",
+    ],
+)
+def test_a_file_is_not_called_as_folders_are(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without the slash it would be written as a file of that name."""
+    monkeypatch.chdir(tmp_path)
+    assert main(command.split()) == 2
+    assert "'new/' names a folder; give a file" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
