@@ -371,7 +371,8 @@ def early_disagreement(views: RigViews) -> str | None:
     """Return words where the mount that fits most frames leaves cameras that are calibrated alone as far apart as the
     joint solution does not permit; None without enough frames. The solution may bring them together yet: it estimates
     lags. REAL: 0.25 of the boards' size for images of different moments; 0.001 to 0.005 for pairs, without a common
-    trigger too, 0.05 for boards in hand before free-running cameras."""
+    trigger too, 0.05 for boards in hand before free-running cameras. SIMULATED: 0.0013 at most for 36 pairs of 4 and 10
+    frames, 0.17 and more with the frames of one camera permuted."""
     distance_px, size_px = typical_px(views), _boards_px(views.seen)
     if not np.isfinite(distance_px) or distance_px <= MAX_DISTANCE_OF_SIZE * size_px:
         return None
