@@ -229,8 +229,11 @@ def _session_path(places: Sequence[Path], output: Path | None) -> Path:
     """Return the path of the session file, named after `output`: two results in one folder have a session each."""
     if output is not None:
         return usable_path(usable_path(output).with_name(f"{output.stem}-session.toml"))
-    place = places[0] if len(places) == 1 else Path(os.path.commonpath([p.absolute() for p in places]))
-    return place / SESSION_NAME
+    if len(places) == 1:
+        return places[0] / SESSION_NAME
+    # Named as they were given: results are called "rig.json" where the folders are called "left" and "right".
+    absolute = any(place.is_absolute() for place in places)
+    return Path(os.path.commonpath([place.absolute() if absolute else place for place in places])) / SESSION_NAME
 
 
 def _results(cameras: Sequence[str], session: Path, options: CalibrateOptions) -> list[Path]:
