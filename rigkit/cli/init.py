@@ -56,8 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--baseline-mm",
         **repeatable,
-        metavar="PAIR=MM+-SIGMA",
-        help="measured baseline of a pair, such as first=300+-2 (repeatable)",
+        metavar="[PAIR=]MM+-SIGMA",
+        help="measured baseline of a pair, such as first=300+-2, or 300+-2 of the only one (repeatable)",
     )
     parser.add_argument(
         "--angle-deg",

@@ -180,14 +180,18 @@ def _value_of(declared: Sequence[tuple[str, Value]], name: str) -> Value | None:
 
 
 def _parse_baselines(declared: Sequence[str], pairs: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Return pair -> (mm, sigma mm) from PAIR=MM+-SIGMA; raises InputError for unknown pairs and invalid lengths."""
+    """Return pair -> (mm, sigma mm) from PAIR=MM+-SIGMA, of a single pair MM+-SIGMA; raises InputError for unknown
+    pairs and invalid lengths."""
     out = {}
     for text in declared:
-        name, of, value = text.partition("=")
+        name, of, value = text.rpartition("=")
         number, _, sigma = value.partition("+-")
-        if not of:
-            raise InputError(f"init: --baseline-mm '{text}' names no pair: write PAIR=MM+-SIGMA, such as first={text}")
-        if pairs and name not in pairs:
+        if not of and len(pairs) > 1:
+            raise InputError(
+                f"init: --baseline-mm '{text}' names no pair: write PAIR=MM+-SIGMA, such as {pairs[0]}={text}"
+            )
+        name = name if of else pairs[0]
+        if name not in pairs:
             raise InputError(f"init: --baseline-mm names '{name}'; pairs found: {', '.join(sorted(pairs))}")
         what = f"--baseline-mm '{text}': write PAIR=MM+-SIGMA, such as {name}=300+-2"
         out[name] = (parse_length(what, number), parse_length(what, sigma))

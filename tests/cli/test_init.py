@@ -129,10 +129,17 @@ def test_impossible_lengths_are_refused(options: list[str], tmp_path: Path, caps
 
 
 def test_a_baseline_of_no_pair(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(IMAGES / "fisheye-general", tmp_path / "first")
-    options = ["--square-mm", "50", "--baseline-mm", "120+-1"]
-    assert main(["init", str(tmp_path), "--calibration", "c.json", "--pose-type", "general", *options]) == 2
-    assert "'120+-1' names no pair: write PAIR=MM+-SIGMA, such as first=120+-1" in capsys.readouterr().err
+    """A single pair needs no name."""
+    shutil.copytree(IMAGES / "fisheye-general", tmp_path / "mine")
+    shutil.copy(CALIBRATION, tmp_path / "c.json")
+    options = ["--square-mm", "50", "--pose-type", "general", "--baseline-mm", "120+-1"]
+    command = ["init", str(tmp_path), "--calibration", str(tmp_path / "c.json"), *options]
+    assert main(command) == 0
+    baseline = load_dataset(tmp_path).pairs[0].truth.baseline
+    assert baseline is not None and (baseline.value_mm, baseline.sigma_mm) == (120.0, 1.0)
+    shutil.copytree(IMAGES / "fisheye-general", tmp_path / "other")
+    assert main([*command, "--force"]) == 2
+    assert "'120+-1' names no pair: write PAIR=MM+-SIGMA, such as mine=120+-1" in capsys.readouterr().err
 
 
 def test_a_calibration_of_another_image_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
