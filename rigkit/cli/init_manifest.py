@@ -183,7 +183,8 @@ def _parse_baselines(declared: Sequence[str], pairs: Sequence[str]) -> dict[str,
     """Return pair -> (mm, sigma mm) from PAIR=MM+-SIGMA, of a single pair MM+-SIGMA; raises InputError for unknown
     pairs and invalid lengths."""
     out = {}
-    for text in declared:
+    # Images without any pair are refused afterwards, with how to name them.
+    for text in declared if pairs else ():
         name, of, value = text.rpartition("=")
         number, _, sigma = value.partition("+-")
         if not of and len(pairs) > 1:

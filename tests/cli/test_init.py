@@ -130,10 +130,14 @@ def test_impossible_lengths_are_refused(options: list[str], tmp_path: Path, caps
 
 def test_a_baseline_of_no_pair(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A single pair needs no name."""
-    shutil.copytree(IMAGES / "fisheye-general", tmp_path / "mine")
+    (tmp_path / "mine").mkdir()
+    shutil.copy(IMAGES / "fisheye-general" / "view1.jpg", tmp_path / "mine")
     shutil.copy(CALIBRATION, tmp_path / "c.json")
     options = ["--square-mm", "50", "--pose-type", "general", "--baseline-mm", "120+-1"]
     command = ["init", str(tmp_path), "--calibration", str(tmp_path / "c.json"), *options]
+    assert main(command) == 2
+    assert "no two images look like a pair" in capsys.readouterr().err
+    shutil.copy(IMAGES / "fisheye-general" / "view2.jpg", tmp_path / "mine")
     assert main(command) == 0
     baseline = load_dataset(tmp_path).pairs[0].truth.baseline
     assert baseline is not None and (baseline.value_mm, baseline.sigma_mm) == (120.0, 1.0)
