@@ -28,6 +28,7 @@ from rigkit.calibration.rig.solving.known import KnownCameras
 from rigkit.calibration.rig.solving.lags import TIMINGS
 from rigkit.calibration.rig.verdicts import diagnose_rig
 from rigkit.calibration.rig.views.board_places import board_places
+from rigkit.calibration.rig.views.copies import with_copies_matched
 from rigkit.calibration.rig.views.mispaired import duplicate_images, mixup_of_all_frames, mixups_of_frames
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews, frame_observations
 from rigkit.calibration.rig.views.slipped import MIN_FRAMES_OF_PART, slipped_camera
@@ -92,9 +93,7 @@ def calibrate_rig(
     }
     each_alone = partial(_each_alone, requests=requests, known=known, candidate_fits=candidate_fits, progress=progress)
     same = duplicate_images(views)
-    every, notes = each_alone(views), tuple[Finding, ...]()
-    if rigid_boards:
-        every, notes = _on_rigid_boards(every, views, rigid_boards, each_alone, shaped=board != "flat")
+    every, notes = _matched(views, rigid_boards, each_alone, shaped=board != "flat")
     with _mistakes_named(every):
         joint, heldout = _best_timing(every, known, folds, progress)
     rig, far = assemble_rig(joint, heldout)
@@ -120,16 +119,15 @@ def _best_timing(
     return joint, best
 
 
-def _on_rigid_boards(
-    alone: RigViews,
-    views: Views,
-    groups: Sequence[Sequence[str]],
-    each_alone: Callable[[Views], RigViews],
-    *,
-    shaped: bool,
+def _matched(
+    views: Views, groups: Sequence[Sequence[str]], each_alone: Callable[[Views], RigViews], *, shaped: bool
 ) -> tuple[RigViews, tuple[Finding, ...]]:
-    """Return the views with boards identified and oriented by their arrangement, and findings; `shaped`: whether the
-    boards' shapes were solved for."""
+    """Return the views with boards that look alike told apart by their arrangement, and findings: those of the `groups`
+    of rigid boards identified and oriented or, without groups, copies in a frame matched between the cameras; `shaped`:
+    whether the boards' shapes were solved for."""
+    alone = each_alone(views)
+    if not groups:
+        return with_copies_matched(alone), ()
     boards = _boards(views, groups)
     every, notes = board_places(groups, alone, boards)
     if shaped and _renamed(alone.seen, every.seen):

@@ -24,8 +24,9 @@ def require_distinct(session: RigSession) -> None:
     for kind in board_kinds(next(iter(session.cameras.values())).boards):
         if len(kind.ids) > 1 and not any(set(kind.ids) <= set(group.boards) for group in session.rigid_boards):
             raise InputError(
-                f"{session.path}: boards {', '.join(kind.ids)} look alike, so that two cameras cannot match them; "
-                "use boards of different sizes, or mount them to each other and list them as [[rigid_boards]]"
+                f"{session.path}: boards {', '.join(kind.ids)} look alike, so that images do not tell which is "
+                "which; list one of them (copies are matched by their arrangement), or mount them to each other and "
+                "list them as [[rigid_boards]]"
             )
 
 

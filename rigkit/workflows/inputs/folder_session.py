@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import logging
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -30,6 +31,8 @@ from rigkit.io.media.video import is_video
 from rigkit.workflows.inputs.identify_board import Suggestion, suggestion
 from rigkit.workflows.inputs.layouts import CameraLayout, layouts_of
 from rigkit.workflows.options.cameras import Known
+
+_log = logging.getLogger(__name__)
 
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
 """Common names of a rig's cameras."""
@@ -168,6 +171,8 @@ def boards_seen(places: Sequence[Path], side_mm: float, progress: Progress = sil
         raise InputError(
             f"calibrate: no board is seen in the images{doubt}{other}; if one is, give it, such as --board {WORDS_HELP}"
         )
+    if shown.beside:
+        _log.info(f"also seen, and left out: --board {' --board '.join(shown.beside)}; give all boards that are yours")
     return tuple(with_length(words, side_mm) for words in shown.words.split(" --board "))
 
 

@@ -252,12 +252,14 @@ class Suggestion:
     Attributes
     ----------
     words : argument of `--board`; None if undetermined.
+    beside : arguments for chessboards in the same images, which may be background.
     part : description of a board that is only partly determined.
     fault : what is wrong with the images.
     doubt : description of what may be a board.
     """
 
     words: str | None = None
+    beside: tuple[str, ...] = ()
     part: str | None = None
     fault: str | None = None
     doubt: str | None = None
@@ -278,7 +280,8 @@ def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion
     # Other chessboards may be background. A tag is on one board of a rig: a board with the same is of other images.
     boards = [guess.board]
     boards += [board for board in guess.beside if board.identified and not any(_share_tags(board, b) for b in boards)]
-    return Suggestion(" --board ".join(map(words_of_board, boards)))
+    beside = tuple(words_of_board(board) for board in guess.beside if not board.identified)
+    return Suggestion(" --board ".join(map(words_of_board, boards)), beside)
 
 
 def _share_tags(one: Board, other: Board) -> bool:
