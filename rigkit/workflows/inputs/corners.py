@@ -248,7 +248,7 @@ def _found_or_error(path: Path, session: Session, camera: Camera | None) -> Foun
 
 
 def first_calibration(session: Session, found: Mapping[str, FoundCorners]) -> Calibration | None:
-    """Return a quick calibration from `found`, without verdicts; None if that fails: the final calibration reports why."""
+    """Return a quick calibration from `found`, without verdicts; None if that fails, which the final one explains."""
     try:
         corners = SessionCorners(found=found, unreadable={}, source="")
         views, size_px, _ = session_views(session, corners)

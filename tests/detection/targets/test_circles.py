@@ -7,7 +7,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from detection_bench.blanks import BLANKS, blank
 from detection_bench.circle_bound import circle_information
 from detection_bench.corner_bound import position_bound
 from detection_bench.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, bench_field_deg, one_board
@@ -18,7 +17,7 @@ from helpers.detection_scenes import errors_by_place
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.circles import Circles
-from rigkit.detection.circles.search import CircleSearch, find_grids
+from rigkit.detection.circles.search import find_grids
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
 from rigkit.geometry.rigid3 import Rigid3
@@ -327,31 +326,6 @@ def test_sigmas_hold_under_glare(board: Board, middle: float) -> None:
     assert HONEST_UNDER_GLARE[0] < np.sqrt((np.concatenate(relative) ** 2).mean()) < HONEST_UNDER_GLARE[1]
 
 
-def test_a_grid_of_another_size_is_no_board() -> None:
-    rng = np.random.default_rng(0)
-    scene = one_board(rng, lens="regular", board=REGULAR)
-    image = scene.render(noise_levels=2.0, rng=rng)
-    smaller = replace(REGULAR, board_id="s", columns=9, rows=7)
-    assert detect_boards(image, [smaller]) == ()
-    larger = replace(REGULAR, board_id="m", columns=11, rows=8)
-    assert all(found.board_id is None for found in detect_boards(image, [larger]))
-    assert detect_boards(image, [replace(REGULAR, pattern=Circles(diameter_mm=15.0, inverted=True))]) == ()
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("name", sorted(set(BLANKS) - {"dots", "staggered"}))
-def test_nothing_is_found_where_no_circles_are(name: str) -> None:
-    for seed in range(3):
-        assert find_grids(blank(name, np.random.default_rng(seed))) == []
-
-
-def test_octagons_are_no_circles() -> None:
-    """Without the eighth harmonic of their edges 23 of these were a grid."""
-    octagons = blank("panels", np.random.default_rng(611), (640, 480))
-    assert find_grids(octagons) == []
-    assert max(grid.evidence.corners for grid in CircleSearch(octagons).seen() if len(grid) == 23) > 0.025
-
-
 def test_real_circles_that_motion_joins_are_found() -> None:
     """The first fits, without motion, leave 28 of 336 circles."""
     image = read_grey(shared_data("public/circles-hexagonal") / "image01.jpg")
@@ -361,20 +335,6 @@ def test_real_circles_that_motion_joins_are_found() -> None:
     assert found.complete
     in_sigmas = (found.pixels - still.pixels) / found.sigma_px[:, None]
     assert np.sqrt((in_sigmas**2).mean()) < HONEST[1]
-
-
-def test_cloth_that_moves_is_no_grid_of_circles() -> None:
-    """Its threads become ellipses, nearly, in an even lattice: each alone would do, all that they are not together does
-    not."""
-    moved = degraded("motion", 6.0, blank("weave", np.random.default_rng(2)), np.random.default_rng(0))[0]
-    assert find_grids(np.asarray(moved, np.uint8)) == []
-
-
-def test_chessboards_are_no_grids_of_circles() -> None:
-    for blur_px in (0.7, 2.0):
-        rng = np.random.default_rng(5)
-        scene = one_board(rng, lens="regular", board=Board("b", 9, 6, 30.0, 30.0))
-        assert find_grids(grey_image(scene.render(blur_px=blur_px, noise_levels=2.0, rng=rng))) == []
 
 
 def test_the_bound_of_a_sharper_picture_is_lower() -> None:
@@ -404,42 +364,3 @@ def test_centres_are_as_fine_as_the_pixels_allow(board: Board, lens: str) -> Non
             assert found.complete
             relative.append((off**2).sum(axis=1).mean() / np.trace(bound, axis1=1, axis2=2).mean())
     assert np.sqrt(np.mean(relative)) < MAX_BOUND
-
-
-@pytest.mark.parametrize(
-    ("board", "blur_px", "smoothed_px"),
-    [(REGULAR, 3.0, 0.0), (HEXAGONAL, 2.0, 0.0), (REGULAR, 0.7, 1.5)],
-    ids=["blurred", "blurred into neighbours", "smoothed after the noise"],
-)
-def test_sigmas_hold_where_blur_joins_circles_or_neighbouring_pixels(
-    board: Board, blur_px: float, smoothed_px: float
-) -> None:
-    """White noise alone says a quarter of what noise does that was smoothed after it came."""
-    off, sigma = [], []
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        scene = one_board(rng, lens="regular", board=board)
-        image = grey_image(scene.render(blur_px=blur_px, noise_levels=4.0, rng=rng))
-        if smoothed_px:
-            image = np.asarray(cv2.GaussianBlur(image, (0, 0), smoothed_px), np.float32)
-        truth = scene.truth()[0].pixels
-        for found in find_grids(image):
-            nearest = np.linalg.norm(found.pixels[:, None] - truth, axis=2).argmin(axis=1)
-            off.append(found.pixels - truth[nearest])
-            sigma.append(found.sigma_px)
-    ratio = np.concatenate(off) / np.concatenate(sigma)[:, None]
-    assert len(ratio) > 200
-    assert 0.8 < np.sqrt((ratio**2).mean()) < 1.25
-
-
-def test_blur_brings_no_light_of_neighbours_into_sizes() -> None:
-    """Circles that end half their radius from the next seem smaller under blur, and those at the rim lie off."""
-    board = Board("tight", 10, 8, 25.0, 25.0, pattern=Circles("hexagonal", diameter_mm=20.0))
-    scene = one_board(np.random.default_rng(2), lens="regular", board=board)
-    found = find_grids(grey_image(scene.render(blur_px=1.8)))[0]
-    truth = scene.truth()[0].pixels
-    off = np.linalg.norm(found.pixels[:, None] - truth, axis=2).min(axis=1)
-    assert len(found) == board.corner_count
-    # Each circle fitted as if it were alone: 0.3969 and 0.017 px.
-    assert found.radius == pytest.approx(0.4, abs=0.001)
-    assert np.sqrt((off**2).mean()) < 0.005
