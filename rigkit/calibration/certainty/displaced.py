@@ -313,7 +313,8 @@ def _amounts_like(
             shown, valid = moved.project(at.rays)
         except InputError:
             continue
-        off = ((np.where(valid[:, None], shown, np.inf) - at.pixels - shift_px) / whole[:, None]).ravel()
+        # A ray that leaves the moved camera's field is not moved: rounding decides which rays are at the rim.
+        off = ((np.where(valid[:, None], shown, at.pixels) - at.pixels - shift_px) / whole[:, None]).ravel()
         error = float((off**2).sum())
         if error < best:
             best, amounts = error, tried
