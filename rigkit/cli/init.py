@@ -1,7 +1,7 @@
 r"""`rigkit init`: write a data set manifest or a session for a folder of images, asking for what images cannot show.
 
 examples:
-  rigkit init lab --square-mm 50 --calibration camera.json --pose-type general --baseline-mm first=300+-2 \
+  rigkit init lab --square-mm 50 --calibration camera.json --pose-type general --baseline-mm 300+-2 \
       --angle-deg 90+-0.3                            as measured by ruler and set square
   rigkit init lab --square-mm 50 --calibration left.json --calibration right.json --pose-type standard
   rigkit init lab --square-mm 50 --calibration wide=w.json --calibration tele=t.json \

@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
         print(args.output)
     elif args.keys:
         for key, kind, words in key_rows(schema_named(args.name)):
-            print(f"{key:40}{kind:30}{words}")
+            print(f"{key + '  ':40}{kind + '  ':30}{words}")
     else:
         print(schema_text(args.name), end="")
     return ExitCode.WELL

@@ -88,9 +88,9 @@ def best_accepted(
             reach = min(np.degrees(c.reach_rad), np.degrees(c.camera.max_angle_rad))
             note += f" within {reach:.0f} degrees of the axis ({100.0 * c.covered:.0f} % of the image); wrong beyond"
         if c.max_px > MIN_REPORTED_PX:
-            degree = "" if kind.order is None else f" and degree = {kind.order}"
-            setting = f'model = "{kind.model}"{degree} in the session'
-            note += f"; with {setting if fewer else f'--model {kind.model}'} nothing is lost when calibrating"
+            of_order = f'model = "{kind.model}" and degree = {kind.order} in the session'
+            setting = f"--model {kind.model}" if kind.order is None else of_order
+            note += f"; with {setting} nothing is lost when calibrating"
         cost = max(c.max_px, OUTSIDE_WEIGHT * c.outside_px)
         found.append((cost, Written(c.camera, c.max_px, c.covered, note)))
     if not found:

@@ -37,9 +37,11 @@ def test_a_refit_is_good_where_boards_were(outline: Pixels) -> None:
         errors[known is None] = np.linalg.norm(read.project(rays)[0] - pixels, axis=-1).max()
         if known is None:
             assert "elsewhere" not in written.cameras[0].note
+            assert "with --model kannala_brandt nothing is lost" in written.cameras[0].note
             continue
         assert errors[False] < SAMPLED * written.cameras[0].max_error_px
         assert "where boards were" in written.cameras[0].note
+        assert 'with model = "brown" and degree = 4 in the session' in written.cameras[0].note
     assert errors[False] < 0.7 * errors[True]
 
 

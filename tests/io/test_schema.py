@@ -188,6 +188,8 @@ def test_every_key_is_said_and_every_schema_is_one(capsys: pytest.CaptureFixture
         assert len(undocumented) <= 9, (name, undocumented)
     assert main(["schema", "session", "--keys"]) == 0
     assert "cameras[].calibration" in capsys.readouterr().out
+    assert main(["schema", "board", "--keys"]) == 0
+    assert "`circles`  what is printed" in capsys.readouterr().out, "long cells are set apart, too"
     assert main(["schema", "nothing"]) == 2
     assert main(["schema", "rig", "-o", str(tmp_path / "rig.json")]) == 0
     assert ANY_OF in (tmp_path / "rig.json").read_text()
