@@ -26,7 +26,7 @@ print(calibration)
 
 # %% What is good, and what is not.
 for finding in calibration.verdicts:
-    print(finding.severity, finding.message, finding.remedy or "")
+    print(finding)
 
 # %% Points to pixels and back, with what the lens is sure of.
 pixels, seen = calibration.camera.project(np.array([[100.0, -50.0, 800.0], [0.0, 0.0, 500.0]]))
