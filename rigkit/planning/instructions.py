@@ -1,4 +1,4 @@
-"""The pose of a board as an instruction for a person: "top right corner, 40 cm away, left side 35 degrees nearer"."""
+"""The pose of a board as an instruction for a person: "top edge, 40 cm away, tilted 35 degrees, left side nearer"."""
 
 from __future__ import annotations
 
