@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigkit.cli.board_identify import identify
-from rigkit.cli.console import add_options
+from rigkit.cli.console import add_options, file_path
 from rigkit.core.errors import InputError
 from rigkit.workflows.options.cameras import PrintOptions
 
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--square-mm", type=float, metavar="MM", help="side of a square (with COLUMNSxROWS)")
     add_options(parser, PrintOptions, paper="")
-    parser.add_argument("-o", "--output", metavar="NAME", help="write NAME.pdf, NAME.svg and NAME.toml")
+    parser.add_argument("-o", "--output", type=file_path, metavar="NAME", help="write NAME.pdf, NAME.svg and NAME.toml")
     add_options(parser, PrintOptions, force="")
     charuco = parser.add_argument_group("ChArUco", "markers in the white squares (with COLUMNSxROWS)")
     charuco.add_argument("--charuco", metavar="DICTIONARY", help="name of an OpenCV dictionary, such as DICT_5X5_100")
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         return _store_measured(args)
     if args.output is None:
         raise InputError("board: -o is missing; give a name for the files, such as -o boards/a9x6_30")
-    for path in print_board(board, PrintOptions(output=Path(args.output), paper=args.paper, force=args.force)):
+    for path in print_board(board, PrintOptions(output=args.output, paper=args.paper, force=args.force)):
         print(path)
     return 0
 

@@ -22,7 +22,7 @@ def identify(args: argparse.Namespace) -> int:
 
     if args.square_mm is not None and not 0.0 < args.square_mm < float("inf"):
         raise InputError(f"board: --square-mm {args.square_mm:g} must be positive")
-    path = None if args.output is None else Path(args.output).with_suffix(".toml")
+    path = None if args.output is None else args.output.with_suffix(".toml")
     if path is not None and args.square_mm is None:
         raise InputError("board identify: images cannot tell the scale; give --square-mm, the side of a square or tag")
     places = [place for path in args.images for place in videos_inside(Path(path))]

@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
+from rigkit.cli.console import file_path
 from rigkit.cli.progress import end_bar
 from rigkit.core.errors import InputError, printable
 from rigkit.io.disk.reading import usable_path
@@ -25,7 +26,7 @@ def add_log_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the log arguments of every verb."""
     group = parser.add_argument_group("log")
     group.add_argument("-v", "--verbose", action="store_true", help="log each step to stderr")
-    group.add_argument("--log-file", type=Path, metavar="FILE", help="append this log, with times, to FILE")
+    group.add_argument("--log-file", type=file_path, metavar="FILE", help="append this log, with times, to FILE")
 
 
 def _appending(path: Path) -> logging.Handler:

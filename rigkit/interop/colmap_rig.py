@@ -60,15 +60,20 @@ def read_colmap_rig(
     """
     try:
         (rig,) = json.loads(text)
-        entries = [(str(entry["image_prefix"]), dict(entry)) for entry in rig["cameras"]]
+        entries = [(entry["image_prefix"], dict(entry)) for entry in rig["cameras"]]
         if not entries:
             raise ValueError("no camera")
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"'{name}': not a rig_config.json with one rig ({error}); is the file whole?") from error
+    references = sum(entry.get("ref_sensor") is True for _, entry in entries)
+    if references > 1:
+        raise InputError(
+            f"'{name}': {references} cameras are ref_sensor, at one place; leave one, give poses of others"
+        )
     out: dict[str, tuple[Camera, Rigid3]] = {}
     for prefix, entry in entries:
-        camera = PurePosixPath(prefix).name
-        if not camera or camera in out:
+        camera = PurePosixPath(prefix).name if isinstance(prefix, str) else ""
+        if camera in ("", "..", *out):
             raise InputError(f"'{name}': image_prefix '{prefix}' names no camera of its own; give each another folder")
         out[camera] = (_camera(entry, f"{name}, camera {camera}", size_px), _pose(entry, f"{name}, camera {camera}"))
     return out

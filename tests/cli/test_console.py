@@ -125,6 +125,9 @@ def test_without_docstrings_all_verbs_work() -> None:
         "schema session -o new/",
         "history register.jsonl -r new/",
         "calibrate photos -o new/",
+        "calibrate photos -r new/",
+        "board 9x6 --square-mm 25 -o new/",
+        "detect a.png --log-file new/",
     ],
 )
 def test_a_file_is_not_called_as_folders_are(

@@ -47,6 +47,9 @@ def test_a_file_of_colmap_is_read_with_the_size_of_its_images() -> None:
         ({"camera_model_name": ...}, "give cameras.txt"),
         ({"width": 640.5, "height": 480}, "no number of pixels"),
         ({"image_prefix": "other/left/"}, "names no camera of its own"),
+        ({"image_prefix": "other/.."}, "names no camera of its own"),
+        ({"image_prefix": None}, "names no camera of its own"),
+        ({"ref_sensor": True}, "2 cameras are ref_sensor"),
         ({"image_prefix": ...}, "not a rig_config.json with one rig"),
     ],
 )
