@@ -30,6 +30,15 @@ def test_residuals_far_above_those_of_the_board_raise_sigmas() -> None:
     assert np.count_nonzero(np.isclose(sigma_px, 0.01)) == 18 and np.isnan(sigma_px[3, 4])
 
 
+def test_residuals_that_grow_towards_a_side_leave_sigmas() -> None:
+    """At the rim of a fisheye image sigmas of squares seen obliquely are large already, and right."""
+    every = np.ones((4, 9))
+    lattice = Lattice(np.stack(np.meshgrid(np.arange(9.0), np.arange(4.0)), axis=-1), 100.0 * every, True)
+    residual = np.array([2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 4.0, 8.0, 16.0]) * every
+    sigma_px = sigmas_beside_edges(RefinedLattice(lattice, 0.01 * every, every, residual, residual))
+    np.testing.assert_array_equal(sigma_px, 0.01)
+
+
 @pytest.mark.parametrize("taken", ["080508550", "080518213"])
 def test_real_boards_with_markers_under_a_cover(taken: str) -> None:
     """Of these some corners at the edge of the cover were 8 sigmas off."""
