@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs, reduced
 from rigkit.detection.circles.certainty import centre_sigmas
-from rigkit.detection.circles.evidence import GridEvidence, noise_levels
+from rigkit.detection.circles.evidence import OCTAGONAL, GridEvidence, noise_levels
 from rigkit.detection.circles.fit import ITERATIONS, PLAIN_ITERATIONS, CircleFit, edge_reach, fit_circles
 from rigkit.detection.circles.grid import CircleGrid
 from rigkit.detection.circles.local_map import (
@@ -373,7 +373,7 @@ def _evidence(grey: GreyImage, draft: _Draft) -> GridEvidence:
         unexplained=float(np.sqrt(np.median(beyond_noise))),
         misshapen=float(np.median(np.sqrt((fit.growth**2).sum(axis=1)))),
         displaced=float(np.median(off[sure])) if sure.any() else np.inf,
-        corners=float(np.hypot(*fit.harmonics.mean(axis=0).T).max()),
+        corners=float((np.hypot(*fit.harmonics.mean(axis=0).T) * [1, 1, 1, 1, OCTAGONAL, OCTAGONAL]).max()),
     )
 
 

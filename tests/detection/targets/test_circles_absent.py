@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from detection_bench.blanks import BLANKS, blank
@@ -37,11 +38,16 @@ def test_nothing_is_found_where_no_circles_are(name: str) -> None:
         assert find_grids(blank(name, np.random.default_rng(seed))) == []
 
 
+def test_octagons_out_of_focus_are_no_circles() -> None:
+    octagons = cv2.GaussianBlur(blank("panels", np.random.default_rng(7048), (480, 360)), (0, 0), 2.0)
+    assert find_grids(octagons) == []
+
+
 def test_octagons_are_no_circles() -> None:
     """Without the eighth harmonic of their edges 23 of these were a grid."""
     octagons = blank("panels", np.random.default_rng(611), (640, 480))
     assert find_grids(octagons) == []
-    assert max(grid.evidence.corners for grid in CircleSearch(octagons).seen() if len(grid) == 23) > 0.025
+    assert max(grid.evidence.corners for grid in CircleSearch(octagons).seen() if len(grid) > 15) > 0.075
 
 
 def test_cloth_that_moves_is_no_grid_of_circles() -> None:
