@@ -25,9 +25,10 @@ square a part of a board passes for the part that begins a square further."""
 MIN_MATCHED = 3
 """Smallest number of boards that determine a mount where no board is known to be the same: two of each camera may fit
 by chance."""
-MAX_RIVAL = 0.75
-"""Largest number of boards that another mount may match, as a part of those that the best one matches. Boards in a row
-with equal gaps, each taken for the next, match but for the last."""
+RIVAL = 0.5
+"""Number of boards that another mount matches, as a part of those that the best one matches, from which neither is
+believed. In a row with equal gaps each board may be taken for the next, and of two such mounts the wrong one matches
+more where each camera sees another end of the row: 2 of 3 for three boards, 2 of 4 for two rows of two."""
 MAX_MOUNTS_TRIED = 256
 """Number of mounts tried. One of two copies in two orientations is a quarter of the pairs, one of eight a sixteenth."""
 MOUNTS_AT_ONCE = 32
@@ -174,7 +175,7 @@ def _same_boards(pairs: _Pairs) -> list[int]:
     mine = fits[best]
     others = 2 * (fits & mine).sum(axis=1) < mine.sum()
     rival = int(count[others].max(initial=0))
-    if count[best] < (1 if pairs.known.any() else MIN_MATCHED) or rival > MAX_RIVAL * count[best]:
+    if count[best] < (1 if pairs.known.any() else MIN_MATCHED) or rival >= RIVAL * count[best]:
         return []
     rotation = nearest_rotation(np.median(pairs.rotation[mine], axis=0))
     off = pairs.off_squares(rotation[None], np.median(pairs.shift_mm[mine], axis=0)[None])[0]

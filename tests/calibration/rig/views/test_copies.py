@@ -107,6 +107,14 @@ def test_boards_in_a_row_with_equal_gaps_may_be_the_next_ones() -> None:
     assert shared(matched(left, right)) == []
 
 
+@pytest.mark.parametrize("count", [4, 5])
+def test_cameras_that_see_another_end_of_a_row_do_not_share_it(count: int) -> None:
+    """A mount that takes each board for the next matches all that both see, the true one all but one."""
+    poses = row()[:count]
+    left, right = observations([named(poses[1:], "left")]), observations([named(in_right(poses[:-1]), "right")])
+    assert shared(matched(left, right)) == []
+
+
 def test_a_board_with_a_name_of_its_own_settles_the_row(rng: np.random.Generator) -> None:
     left, right = observations([named(row(), "left")]), observations([named(in_right(row()), "right")])
     (pose,) = scattered(rng, 1)
