@@ -175,7 +175,9 @@ def _same_boards(pairs: _Pairs) -> list[int]:
     mine = fits[best]
     others = 2 * (fits & mine).sum(axis=1) < mine.sum()
     rival = int(count[others].max(initial=0))
-    if count[best] < (1 if pairs.known.any() else MIN_MATCHED) or rival >= RIVAL * count[best]:
+    # A mount matches the board with a name from which it was taken, in each orientation.
+    own = int(pairs.known.any())
+    if count[best] < (1 if own else MIN_MATCHED) or rival - own >= RIVAL * (count[best] - own):
         return []
     rotation = nearest_rotation(np.median(pairs.rotation[mine], axis=0))
     off = pairs.off_squares(rotation[None], np.median(pairs.shift_mm[mine], axis=0)[None])[0]

@@ -98,6 +98,15 @@ def test_a_mount_that_fits_two_boards_only_is_not_believed(rng: np.random.Genera
     assert shared(matched(observations([named(poses, "left")]), observations([named(in_right(poses), "right")]))) == []
 
 
+def test_a_board_with_a_name_that_looks_the_same_turned_settles_a_single_one_of_two(rng: np.random.Generator) -> None:
+    poses = scattered(rng, 3)
+    left, right = observations([named(poses[:2], "left")]), observations([named(in_right(poses[:1]), "right")])
+    for seen, (*_, cam_from_board) in ((left, poses), (right, in_right(poses))):
+        own = observation(Board("own", 9, 5, 20.0, 20.0), "0", cam_from_board)
+        seen[own.key] = own
+    assert len(shared(matched(left, right))) == 2
+
+
 def row() -> list[Rigid3]:
     return [Rigid3(exp_so3(np.array([0.2, 0.1, 0.3])), [STEP_MM * (k - 2.5), -40.0, 700.0]) for k in range(ROW)]
 
