@@ -23,18 +23,23 @@ from rigkit.calibration.judging.two_kinds import (
     CHANCE_OF_GROUPS,
     KINDS_REMEDY,
     MIN_OF_A_KIND,
+    MIN_PREDICTED,
     MIN_SHARE_OF_TWO,
     SIGMAS_DO_NOT_HOLD,
     ImageScores,
     listed,
     min_of_a_kind,
 )
-from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.solving.fit import Fit, fit_model
 from rigkit.calibration.solving.solver import FROM_OPTIMUM, solve
 from rigkit.calibration.solving.state import State, weighted_squares
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
+from rigkit.cameras.kannala_brandt import KannalaBrandt
+from rigkit.cameras.moving_pupil import far_camera
+from rigkit.cameras.scaramuzza import Scaramuzza
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
 
 MIN_IMAGES_FOR_HALVES = 10
@@ -92,7 +97,8 @@ def moved_lens(observations: Observations, fit: Fit, *, tests: int = 1) -> tuple
 
 def two_groups(observations: Observations, fits: Sequence[Fit]) -> tuple[Finding, ...]:
     """Return a finding if the images, in any order, are of two lenses according to the fits of all models: errors of a
-    model, too, make groups, but others with another model. Near-duplicates count as one image."""
+    model, too, make groups, but others with another model: a flexible one is fitted if there is none. Near-duplicates
+    count as one image."""
     number = observations.clusters()
     if number.max() + 1 < 2 * MIN_OF_A_KIND:
         return ()
@@ -102,16 +108,35 @@ def two_groups(observations: Observations, fits: Sequence[Fit]) -> tuple[Finding
         if again is None:
             return ()
         found = found or again
-    return () if found is None else (_groups_named(observations, *found),)
+    if found is None or not (_any_flexible(fits) or _again(observations, fits[0])):
+        return ()
+    return (_groups_named(observations, *found),)
 
 
-def _group(splits: _Splits) -> tuple[BoolArray, _Difference] | None:
-    """Return which images (N,) are of the second of two lenses, and the lenses; None if they are of one."""
+def _any_flexible(fits: Sequence[Fit]) -> bool:
+    return any(isinstance(far_camera(fit.state.camera), KannalaBrandt | Scaramuzza) for fit in fits)
+
+
+def _again(observations: Observations, fit: Fit) -> bool:
+    """Return whether the images are of two lenses by a model for all fields of view, too, wherever the boards were."""
+    try:
+        again = fit_model(observations, fit.state.camera.size_px, KannalaBrandt, None)
+    except (DegenerateError, InputError):
+        return False
+    return _group(_Splits.of(observations, again, observations.clusters(), min_images=1), against=0.0) is not None
+
+
+def _group(splits: _Splits, against: float = AGAINST_PLACE_SEARCHED) -> tuple[BoolArray, _Difference] | None:
+    """Return which images (N,) are of the second of two lenses, and the lenses; None if they are of one, `against`
+    splits by place."""
     found = splits.scores.best_split()
     if found is None or found[1] < MIN_SHARE_OF_TWO:
         return None
-    apart = splits.difference(found[0], against=AGAINST_PLACE_SEARCHED)
+    apart = splits.difference(found[0], against=against)
     if apart is None or splits.scores.chance_of_split(*found) > CHANCE_OF_GROUPS:
+        return None
+    halves = ImageScores.of_halves(splits.observations, splits.fit, splits.number)
+    if halves.predicted_across(found[0]) < MIN_PREDICTED:
         return None
     return found[0], apart
 

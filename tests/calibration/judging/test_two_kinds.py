@@ -10,7 +10,7 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.judging.two_kinds import CHANCE_OF_GROUPS, MIN_SHARE_OF_TWO, ImageScores
+from rigkit.calibration.judging.two_kinds import CHANCE_OF_GROUPS, MIN_PREDICTED, MIN_SHARE_OF_TWO, ImageScores
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
@@ -159,6 +159,14 @@ def test_boards_left_and_right_before_a_lens_unlike_its_model(rng: np.random.Gen
     assert not any(KINDS in verdict for verdict in every)
 
 
+def test_groups_by_a_model_that_fails_at_the_rim_are_not_of_two_cameras() -> None:
+    """Eight good images, four left and four right, of a wide lens for which a model has too few terms."""
+    views = random_views(lens("wide"), 40, np.random.default_rng(18), reach_deg=55.0, noise_px=NOISE_PX)[0]
+    order = np.argsort([view.pixels[:, 0].mean() for view in views])
+    chosen = [views[k] for k in (*order[:4], *order[-4:])]
+    assert KINDS not in str(calibrate(chosen, SIZE, model="brown", board="flat", folds=0).verdicts)
+
+
 def test_a_third_of_the_images_contradicts_the_others(rng: np.random.Generator) -> None:
     """So few that the others hold: they are left out, and said to be of another kind; two are mishaps."""
     camera = lens("reg")
@@ -209,6 +217,16 @@ def test_images_of_two_lenses_are_parted(count: int, rng: np.random.Generator) -
     found = scores.best_split()
     assert found is not None and ((found[0] == second).all() or (found[0] != second).all())
     assert found[1] > MIN_SHARE_OF_TWO and scores.chance_of_split(*found) <= CHANCE_OF_GROUPS
+
+
+def test_halves_of_images_of_two_lenses_tell_the_same(rng: np.random.Generator) -> None:
+    """Other errors are not the same in both halves, and found by the search as well as lenses are."""
+    second = np.arange(14) % 2 == 0
+    lenses = 3.0 * np.where(second[:, None], 1.0, -1.0) * np.array([1.0, 0.0, -1.0, 1.0])
+    of_halves = image_scores(np.tile(lenses, (2, 1)), rng)
+    assert of_halves.predicted_across(second) > MIN_PREDICTED
+    errors = image_scores(np.concatenate([lenses, lenses[rng.permutation(14)]]), rng)
+    assert errors.predicted_across(second) < MIN_PREDICTED
 
 
 @pytest.mark.parametrize("spread", [0.0, 3.0])
