@@ -162,7 +162,7 @@ class _Solution:
         automatic = (("model", request.model), ("board_shape", request.board))
         in_force = [name for name, value in automatic if value == "auto"]
         observations, fit = outcome.observations, outcome.chosen.fit
-        moved = _moved(observations, fit, self.tried) if request.folds else two_groups(observations, [fit])
+        moved = _moved(observations, fit, self.tried, in_halves=request.folds > 0)
         verdicts = judge(
             result,
             [*moved, *_largest_size_chosen(outcome.beyond, result, in_force)],
@@ -253,16 +253,21 @@ def _result(solution: _Solution) -> Calibration:
     return replace(central, candidates=(*central.candidates, *compared))
 
 
-def _moved(observations: Observations, fit: Fit, tried: Sequence[FittedModel]) -> tuple[Finding, ...]:
-    """Return a finding where the lens changed during the session by the chosen model, or else by the model with the
-    least scatter, or where the images are of two lenses by both. Of images of two lenses a small model may predict
-    best, whose error differs with the boards' places and hides the change."""
+def _moved(
+    observations: Observations, fit: Fit, tried: Sequence[FittedModel], *, in_halves: bool
+) -> tuple[Finding, ...]:
+    """Return a finding where the lens changed during the session (if looked for `in_halves`) by the chosen model, or
+    else by the model with the least scatter, or where the images are of two lenses by both. Of images of two lenses a
+    small model may predict best, whose error differs with the boards' places and hides the change."""
+    one_model = len(models_of(tried)) == 1
+    if not in_halves:
+        return two_groups(observations, [fit], one_model=one_model)
     camera = far_camera(fit.state.camera)
     best = far_camera(min(tried, key=lambda option: option.fit.sigma_px).fit.state.camera)
     other = None if same_model(best, camera) else with_other_lens(observations, fit, best)
     fits = [fit] if other is None else [fit, other]
     moved = next((found for one in fits if (found := moved_lens(observations, one, tests=len(fits)))), ())
-    return moved or two_groups(observations, fits)
+    return moved or two_groups(observations, fits, one_model=one_model)
 
 
 def _others(tried: Sequence[FittedModel], model: str) -> list[Candidate]:

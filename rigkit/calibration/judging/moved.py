@@ -95,10 +95,10 @@ def moved_lens(observations: Observations, fit: Fit, *, tests: int = 1) -> tuple
     return (Finding.bad(message, "calibrate the images before it and those from it on separately, or retake all"),)
 
 
-def two_groups(observations: Observations, fits: Sequence[Fit]) -> tuple[Finding, ...]:
+def two_groups(observations: Observations, fits: Sequence[Fit], *, one_model: bool) -> tuple[Finding, ...]:
     """Return a finding if the images, in any order, are of two lenses according to the fits of all models: errors of a
-    model, too, make groups, but others with another model: a flexible one is fitted if there is none. Near-duplicates
-    count as one image."""
+    model, too, make groups, but others with another model: where `one_model` was tried, a flexible one is fitted.
+    Near-duplicates count as one image."""
     number = observations.clusters()
     if number.max() + 1 < 2 * MIN_OF_A_KIND:
         return ()
@@ -108,13 +108,13 @@ def two_groups(observations: Observations, fits: Sequence[Fit]) -> tuple[Finding
         if again is None:
             return ()
         found = found or again
-    if found is None or not (_any_flexible(fits) or _again(observations, fits[0])):
+    if found is None or (one_model and not _is_flexible(fits[0]) and not _again(observations, fits[0])):
         return ()
     return (_groups_named(observations, *found),)
 
 
-def _any_flexible(fits: Sequence[Fit]) -> bool:
-    return any(isinstance(far_camera(fit.state.camera), KannalaBrandt | Scaramuzza) for fit in fits)
+def _is_flexible(fit: Fit) -> bool:
+    return isinstance(far_camera(fit.state.camera), KannalaBrandt | Scaramuzza)
 
 
 def _again(observations: Observations, fit: Fit) -> bool:
