@@ -118,21 +118,22 @@ def _is_flexible(fit: Fit) -> bool:
 
 
 def _again(observations: Observations, fit: Fit) -> bool:
-    """Return whether the images are of two lenses by a model for all fields of view, too, wherever the boards were."""
+    """Return whether the images are of two lenses by a model for all fields of view, too: two lenses explain so
+    much."""
     try:
         again = fit_model(observations, fit.state.camera.size_px, KannalaBrandt, None)
     except (DegenerateError, InputError):
         return False
-    return _group(_Splits.of(observations, again, observations.clusters(), min_images=1), against=0.0) is not None
+    found = ImageScores.of(again, observations.clusters(), 1).best_split()
+    return found is not None and found[1] >= MIN_SHARE_OF_TWO
 
 
-def _group(splits: _Splits, against: float = AGAINST_PLACE_SEARCHED) -> tuple[BoolArray, _Difference] | None:
-    """Return which images (N,) are of the second of two lenses, and the lenses; None if they are of one, `against`
-    splits by place."""
+def _group(splits: _Splits) -> tuple[BoolArray, _Difference] | None:
+    """Return which images (N,) are of the second of two lenses, and the lenses; None if they are of one."""
     found = splits.scores.best_split()
     if found is None or found[1] < MIN_SHARE_OF_TWO:
         return None
-    apart = splits.difference(found[0], against=against)
+    apart = splits.difference(found[0], against=AGAINST_PLACE_SEARCHED)
     if apart is None or splits.scores.chance_of_split(*found) > CHANCE_OF_GROUPS:
         return None
     halves = ImageScores.of_halves(splits.observations, splits.fit, splits.number)
