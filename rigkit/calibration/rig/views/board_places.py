@@ -101,14 +101,13 @@ def _rename(own: FrameObservations, scene: Sequence[_BoardInScene], labelling: L
     """Set the ids of the boards of one scene, in the observations of their camera, and the key of their target."""
     old = [own.pop(entry.key) for entry in scene]
     for k, (entry, before) in enumerate(zip(scene, old, strict=True)):
-        frame, board_id = before.frame, entry.key[1]
         label = None if labelling is None else labelling.get(k)
         if label is not None:
-            own[(frame, label.board_id)] = replace(label, key=(frame, target))
+            own[(before.frame, label.board_id)] = replace(label, key=(before.frame, target))
             continue
         # Its pose on the target is unknown: it remains a view of an independent board.
-        alone = f"{frame}, camera {entry.camera + 1} alone"
-        own[(alone, board_id)] = replace(before, key=(alone, board_id))
+        alone = before.alone(entry.camera)
+        own[alone.key] = alone
 
 
 def _unidentified_board(

@@ -25,11 +25,11 @@ square a part of a board passes for the part that begins a square further."""
 MIN_MATCHED = 3
 """Smallest number of boards that determine a mount where no board is known to be the same: two of each camera may fit
 by chance."""
-RIVAL = 0.5
+MIN_SHARE_OF_RIVAL = 0.5
 """Number of boards that another mount matches, as a part of those that the best one matches, from which neither is
 believed. In a row with equal gaps each board may be taken for the next, and of two such mounts the wrong one matches
 more where each camera sees another end of the row: 2 of 3 for three boards, 2 of 4 for two rows of two."""
-MAX_MOUNTS_TRIED = 256
+MAX_MOUNTS_TRIED = 128
 """Number of mounts tried. One of two copies in two orientations is a quarter of the pairs, one of eight a sixteenth."""
 MOUNTS_AT_ONCE = 32
 
@@ -47,11 +47,11 @@ def with_copies_matched(views: RigViews) -> RigViews:
     out = [dict(own) for own in views.seen]
     for c, own in enumerate(out):
         for frame, name in copies[c]:
-            own[frame, name] = replace(own[frame, name], key=(f"{frame}, camera {c + 1} alone", name))
+            own[frame, name] = own[frame, name].alone(c)
     for j in range(1, len(out)):
         for i in range(j):
             # Those that an earlier camera sees, too, share its key already.
-            open_ones = [place for place in copies[j] if out[j][place].key[0] != place[0]]
+            open_ones = [place for place in copies[j] if out[j][place].is_alone]
             for first, second in _matches(out[i], out[j], copies[i], open_ones):
                 board = out[i][first].view.board
                 key = (first[0], board.board_id)
@@ -177,7 +177,7 @@ def _same_boards(pairs: _Pairs) -> list[int]:
     rival = int(count[others].max(initial=0))
     # A mount matches the board with a name from which it was taken, in each orientation.
     own = int(pairs.known.any())
-    if count[best] < (1 if own else MIN_MATCHED) or rival - own >= RIVAL * (count[best] - own):
+    if count[best] < (1 if own else MIN_MATCHED) or rival - own >= MIN_SHARE_OF_RIVAL * (count[best] - own):
         return []
     rotation = nearest_rotation(np.median(pairs.rotation[mine], axis=0))
     off = pairs.off_squares(rotation[None], np.median(pairs.shift_mm[mine], axis=0)[None])[0]

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -128,4 +127,4 @@ def separate_views(seen: Sequence[FrameObservations], key: Key) -> None:
     for k, own in enumerate(seen):
         for place, entry in own.items():
             if entry.key == key:
-                own[place] = replace(entry, key=(f"{entry.frame}, camera {k + 1} alone", entry.board_id))
+                own[place] = entry.alone(k)

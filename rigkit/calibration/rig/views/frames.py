@@ -119,10 +119,17 @@ def mounts_of(views: RigViews) -> tuple[list[Rigid3], tuple[Finding, ...]]:
         i, j = max(edges, key=lambda e: len(targets[e[0]].keys() & targets[e[1]].keys()))
         shared = sorted(targets[i].keys() & targets[j].keys())
         if not shared:
+            alike = any(entry.is_alone for entry in views.seen[j].values())
+            remedy = (
+                "images show several boards that look alike, and their arrangement leaves open which is which; declare "
+                "boards of each size with their own squares, or mark one of them"
+                if alike
+                else "take frames in which both see a whole board, and check that simultaneous images have the same "
+                "name or number"
+            )
             raise InputError(
                 f"rig: camera '{names[j]}' shares no board in any frame with '{names[0]}' or the cameras connected to "
-                "it; take frames in which both see a whole board, and check that simultaneous images have the same "
-                "name or number"
+                f"it; {remedy}"
             )
         motion, rival = _motion([(targets[i][key], targets[j][key]) for key in shared])
         if rival is not None:

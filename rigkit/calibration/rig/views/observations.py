@@ -43,6 +43,15 @@ class Observation:
     def board_id(self) -> str:
         return self.view.board.board_id
 
+    @property
+    def is_alone(self) -> bool:
+        """Whether no other view shares its pose, whatever it shows."""
+        return self.key[0] != self.frame
+
+    def alone(self, camera: int) -> Observation:
+        """Return the observation with a pose of its own, as one of the camera of this number."""
+        return replace(self, key=(f"{self.frame}, camera {camera + 1} alone", self.board_id))
+
     def turned(self, quarter_turns: int, board: Board | None = None) -> Observation:
         """Return the observation with the board numbered from another corner, and as that of `board` if given, which
         has to have the size after the turn."""

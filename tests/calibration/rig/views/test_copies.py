@@ -11,9 +11,11 @@ from helpers.rig_scenes import Views
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.views.copies import with_copies_matched
+from rigkit.calibration.rig.views.frames import mounts_of
 from rigkit.calibration.rig.views.observations import FrameObservations, Observation, RigViews
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
@@ -95,7 +97,10 @@ def test_a_name_does_not_count_where_another_camera_sees_two_of_them(rng: np.ran
 
 def test_a_mount_that_fits_two_boards_only_is_not_believed(rng: np.random.Generator) -> None:
     poses = scattered(rng, 2)
-    assert shared(matched(observations([named(poses, "left")]), observations([named(in_right(poses), "right")]))) == []
+    views = matched(observations([named(poses, "left")]), observations([named(in_right(poses), "right")]))
+    assert shared(views) == []
+    with pytest.raises(InputError, match=r"'right' shares no board .* leaves open which is which"):
+        mounts_of(views)
 
 
 def test_a_board_with_a_name_that_looks_the_same_turned_settles_a_single_one_of_two(rng: np.random.Generator) -> None:
