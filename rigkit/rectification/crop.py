@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, sampling_step
 from rigkit.core.errors import DegenerateError
 from rigkit.rectification.rectify import RectifyMap
 
@@ -36,7 +36,7 @@ def largest_rectangle(seen: BoolArray) -> tuple[int, int, int, int]:
 
     It is the largest one of coarse cells, grown by single rows and columns as far as possible.
     """
-    step = max(-(-max(seen.shape) // COARSE), 1)
+    step = sampling_step(max(seen.shape), COARSE)
     rows, columns = (size // step for size in seen.shape)
     cells = seen[: rows * step, : columns * step].reshape(rows, step, columns, step)
     left, top, right, bottom = (step * edge for edge in _largest_true_rectangle(np.asarray(cells.all(axis=(1, 3)))))

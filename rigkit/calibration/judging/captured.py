@@ -53,7 +53,7 @@ STRETCH_SIGMAS = 4.0
 
 MAX_AXIS_OFF = 0.08
 """Distance of the optical axis from the image's middle, as a part of the longer side, from which images are called
-cropped. REAL: 0.002 to 0.035 in 16 sessions, 0.056 in one whose images are halves of wider ones."""
+cropped. REAL: 0.002 to 0.035 in 14 sessions, 0.056 in one whose images are halves of wider ones."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

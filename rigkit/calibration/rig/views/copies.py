@@ -6,6 +6,7 @@ the boards of one camera to those of the other, in all frames.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ import numpy as np
 from rigkit.calibration.choosing.board_orientation import symmetry_turns
 from rigkit.calibration.rig.views.frames import target_poses
 from rigkit.calibration.rig.views.observations import FrameObservations, Observation, RigViews, outer_corners
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Points, sampling_step
 from rigkit.geometry.rotation import nearest_rotation, unit
 
 MAX_OFF_SQUARES = 0.25
@@ -164,8 +165,8 @@ def _matches(
 def _same_boards(pairs: _Pairs) -> list[int]:
     """Return the pairs that fit the best mount, the nearest first; none if no mount is clearly the best."""
     some = np.flatnonzero(pairs.known) if pairs.known.any() else np.arange(len(pairs.owner))
-    tried = some[:: -(-len(some) // MAX_MOUNTS_TRIED)]
-    blocks = np.array_split(tried, -(-len(tried) // MOUNTS_AT_ONCE))
+    tried = some[:: sampling_step(len(some), MAX_MOUNTS_TRIED)]
+    blocks = np.array_split(tried, math.ceil(len(tried) / MOUNTS_AT_ONCE))
     off = np.concatenate([pairs.off_squares(pairs.rotation[block], pairs.shift_mm[block]) for block in blocks])
     fits = off <= MAX_OFF_SQUARES
     starts = np.flatnonzero(np.diff([-1, *pairs.owner]))
