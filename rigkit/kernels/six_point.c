@@ -1,6 +1,13 @@
 /* Essential matrices from six linear equations (rigkit.relative_pose.solvers.minimal). */
 #include "minimal.h"
 
+/* A pivot below this part of the largest is rounding. */
+#define ROUNDING 1e-16
+/* A direction that turns by less in a step of inverse iteration is the singular vector, far below any noise of the rows. */
+#define STEADY 1e-13
+/* A step takes a tenth of a microsecond; where so many do not suffice, Jacobi's rotations take ten. */
+#define INVERSE_STEPS 40
+
 /* Rotate the `size` columns of `m`, of `length` numbers each, until they are orthogonal, and set `v` (size columns of size) to the
  * rotations: a singular value decomposition by one-sided Jacobi, which is accurate for small singular values, too (Golub and Van
  * Loan, "Matrix Computations"). */
@@ -56,6 +63,81 @@ INLINE int extreme(const double *m, int length, int size, double sign)
     return found;
 }
 
+/* Replace the columns of `m` (size columns of size numbers) by those of R of its QR decomposition, its diagonal by the reciprocals:
+ * Householder reflections. A pivot of nothing but rounding is taken for the rounding. Return whether `m` is finite and not zero. */
+INLINE int triangle(double *m, int size)
+{
+    double largest = 0.0;
+    for (int k = 0; k < size; k++) {
+        double *v = m + size * k, square = 0.0;
+        for (int i = k; i < size; i++)
+            square += v[i] * v[i];
+        const double length = v[k] < 0.0 ? -sqrt(square) : sqrt(square);
+        largest = fmax(largest, fabs(length));
+        const double first = v[k] + length;
+        if (first != 0.0)
+            for (int j = k + 1; j < size; j++) {
+                double *column = m + size * j, along = first * column[k];
+                for (int i = k + 1; i < size; i++)
+                    along += v[i] * column[i];
+                const double share = along / (length * first);
+                column[k] -= share * first;
+                for (int i = k + 1; i < size; i++)
+                    column[i] -= share * v[i];
+            }
+        v[k] = -length;
+    }
+    if (!(largest > 0.0 && largest < INFINITY))
+        return 0;
+    for (int k = 0; k < size; k++)
+        m[(size + 1) * k] = 1.0 / (fabs(m[(size + 1) * k]) > ROUNDING * largest ? m[(size + 1) * k] : ROUNDING * largest);
+    return 1;
+}
+
+/* Write the right singular vector `x` of `triangle`'s matrix for its smallest singular value: inverse iteration. Return 0 where it
+ * does not converge soon, because the two smallest are nearly equal. */
+INLINE int least_direction(const double *m, double *x, int size)
+{
+    double y[CUBICS], kept[CUBICS] = {0.0};
+    for (int step = 0; step < INVERSE_STEPS; step++) {
+        for (int i = 0; i < size; i++) {
+            double sum = 0.0;
+            for (int k = 0; k < i; k++)
+                sum += m[size * i + k] * y[k];
+            /* The first right side is of ones, with signs for which the solution is long: it is not perpendicular to `x`. */
+            const double right = step ? kept[i] : sum > 0.0 ? -1.0 : 1.0;
+            y[i] = (right - sum) * m[(size + 1) * i];
+        }
+        double square = 0.0, change = 0.0;
+        for (int i = size - 1; i >= 0; i--) {
+            x[i] = y[i] * m[(size + 1) * i];
+            for (int k = 0; k < i; k++)
+                y[k] -= m[size * i + k] * x[i];
+            square += x[i] * x[i];
+        }
+        const double scale = 1.0 / sqrt(square);
+        for (int i = 0; i < size; i++) {
+            x[i] *= scale;
+            change += (x[i] - kept[i]) * (x[i] - kept[i]);
+            kept[i] = x[i];
+        }
+        if (change < STEADY * STEADY)
+            return 1;
+    }
+    return 0;
+}
+
+/* Write the right singular vector `x` of `m` (size columns of size numbers, destroyed) for its smallest singular value. */
+INLINE void smallest_singular_vector(double *m, double *x, int size)
+{
+    double v[CUBICS * CUBICS], copy[CUBICS * CUBICS];
+    memcpy(copy, m, sizeof(double) * (size_t)(size * size));
+    if (triangle(copy, size) && least_direction(copy, x, size))
+        return;
+    orthogonalise(m, size, v, size);
+    memcpy(x, v + size * extreme(m, size, size, -1.0), sizeof(double) * (size_t)size);
+}
+
 /* Replace E by the nearest essential matrix of unit norm (eight_point.essential_nearest). */
 INLINE void make_essential(double *E)
 {
@@ -82,14 +164,13 @@ INLINE void solve_six(const double *rows, double *E)
     /* The multiplicity of each among the products of three of y, z, 1, and the index of each product. */
     static const double OFTEN[CUBICS] = {1.0, 3.0, 3.0, 3.0, 6.0, 3.0, 1.0, 3.0, 3.0, 1.0};
     static const int PRODUCTS[3][9] = {{0, 1, 2, 1, 3, 4, 2, 4, 5}, {1, 3, 4, 3, 6, 7, 4, 7, 8}, {2, 4, 5, 4, 7, 8, 5, 8, 9}};
-    double basis[4 * 9] = {0.0}, cubics[CUBICS][MONOMIALS], m[CUBICS * CUBICS], v[CUBICS * CUBICS];
+    double basis[4 * 9] = {0.0}, cubics[CUBICS][MONOMIALS], m[CUBICS * CUBICS], found[CUBICS];
     null_space(rows, 6, basis + 9);
     constraints(basis, cubics);
     for (int k = 0; k < CUBICS; k++)
         for (int i = 0; i < CUBICS; i++)
             m[CUBICS * k + i] = cubics[i][WITHOUT_X[k]] / sqrt(OFTEN[k]);
-    orthogonalise(m, CUBICS, v, CUBICS);
-    const double *found = v + CUBICS * extreme(m, CUBICS, CUBICS, -1.0);
+    smallest_singular_vector(m, found, CUBICS);
     double products[27], turn[9];
     for (int i = 0; i < 27; i++)
         products[i] = found[PRODUCTS[i / 9][i % 9]] / sqrt(OFTEN[PRODUCTS[i / 9][i % 9]]);
