@@ -14,6 +14,7 @@ Each is tried, and reported if it resolves the disagreement.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -25,6 +26,7 @@ from rigkit.calibration.rig.views.disagree import shared_keys
 from rigkit.calibration.rig.views.frames import mounts_of, view_distances_px, with_common_orientation
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews
 from rigkit.calibration.views.flips import FLIP_SIGNS, Flip
+from rigkit.calibration.views.repeats import close_pairs
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
@@ -63,9 +65,11 @@ def duplicate_images(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> li
     """
     out: list[Finding] = []
     shown = {name: {(frame, view.board.board_id): view for frame, view in own} for name, own in views.items()}
+    centres = {name: _centres(own) for name, own in shown.items()}
     for (a, own), (b, other) in combinations(shown.items(), 2):
         shared = own.keys() & other.keys()
-        frames = _in_order({key[0] for key in shared if _same_image(own[key], other[key])})
+        near = [key for key in shared if math.dist(centres[a][key], centres[b][key]) <= SAME_IMAGE_PX]
+        frames = _in_order({key[0] for key in near if _same_image(own[key], other[key])})
         if not frames:
             continue
         total = len({frame for frame, _ in shared})
@@ -87,8 +91,10 @@ def _repeated_images(shown: Mapping[str, Mapping[Key, BoardView]]) -> Iterator[F
     to all cameras."""
     for name, own in shown.items():
         others = [other for camera, other in shown.items() if camera != name]
-        for one, again in combinations(own, 2):
-            if one[1] != again[1] or one[0] == again[0] or not _same_image(own[one], own[again]):
+        keys, centres = list(own), np.array(list(_centres(own).values()))
+        for i, j in zip(*close_pairs(centres, SAME_IMAGE_PX), strict=True) if keys else ():
+            one, again = keys[i], keys[j]
+            if one[1] != again[1] or not _same_image(own[one], own[again]):
                 continue
             both = [other for other in others if one in other and again in other]
             if any(not _same_image(other[one], other[again], MOVED_PX) for other in both):
@@ -273,6 +279,11 @@ def _flipped(own: FrameObservations, camera: Camera, flip: Flip) -> FrameObserva
         )
         for key, entry in own.items()
     }
+
+
+def _centres(own: Mapping[Key, BoardView]) -> dict[Key, tuple[float, float]]:
+    """Return the mean of each view's corners: those of copies are no further apart than their corners."""
+    return {key: (float(view.pixels[:, 0].mean()), float(view.pixels[:, 1].mean())) for key, view in own.items()}
 
 
 def _same_image(one: BoardView, other: BoardView, within_px: float = SAME_IMAGE_PX) -> bool:
