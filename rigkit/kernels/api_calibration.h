@@ -122,9 +122,9 @@ EXPORT int64_t close_pairs(
 /* leverage.c */
 
 EXPORT void sum_series(
-    ARRAY(const double, leverage, clusters, n, n), ARRAY(const double, pull, clusters, n), int64_t clusters, int64_t n,
-    double bound, ARRAY(const double, series, terms), int64_t terms, SCRATCH(double, memory, 3 * n),
-    RESULT(double, out, clusters, n));
+    ARRAY(const double, leverage, clusters, n, n), ARRAY(const double, pull, clusters, columns, n), int64_t clusters,
+    int64_t columns, int64_t n, double bound, ARRAY(const double, series, terms), int64_t terms,
+    SCRATCH(double, memory, 3 * n), RESULT(double, out, clusters, columns, n));
 
 /* coverage.c */
 

@@ -13,13 +13,14 @@ INLINE void centred(const double *restrict M, const double *restrict z, int64_t 
     }
 }
 
-/* Set `out` to the Chebyshev series of the leverage matrices M, with eigenvalues from 0 to `bound`, times the scores z (`pull`). */
+/* Set `out` to the Chebyshev series of the leverage matrices M, with eigenvalues from 0 to `bound`, times their `columns` scores z
+ * each (`pull`). */
 EXPORT FOR_EACH_PROCESSOR void sum_series(
-    const double *leverage, const double *pull, int64_t clusters, int64_t n, double bound, const double *series, int64_t terms,
-    double *memory, double *out)
+    const double *leverage, const double *pull, int64_t clusters, int64_t columns, int64_t n, double bound, const double *series,
+    int64_t terms, double *memory, double *out)
 {
-    for (int64_t c = 0; c < clusters; c++) {
-        const double *M = leverage + c * n * n;
+    for (int64_t c = 0; c < clusters * columns; c++) {
+        const double *M = leverage + c / columns * n * n;
         double *before = memory, *term = memory + n, *next = memory + 2 * n, *sum = out + c * n;
         memcpy(before, pull + c * n, (size_t)n * sizeof(double));
         centred(M, before, n, bound, term);

@@ -87,7 +87,7 @@ def schur_step(
 
 
 def chebyshev_series(matrices: FloatArray, vectors: FloatArray, bound: float, series: FloatArray) -> FloatArray:
-    """Return sum_k series[k] T_k(2 M / bound - 1) z for symmetric matrices M (N, n, n) and vectors z (N, n).
+    """Return sum_k series[k] T_k(2 M / bound - 1) z for symmetric matrices M (N, n, n) and vectors z (N, K, n).
 
     `series` has two terms or more; the eigenvalues of M lie between 0 and `bound`.
     """

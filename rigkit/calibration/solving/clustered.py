@@ -145,7 +145,7 @@ def clustered_covariance(
     data = information.sum(axis=0)
     root = root_of_inverse(data + prior)
     leverage = root.T @ information @ root
-    pull = without_leverage(leverage, score @ root / sigma_px)
+    pull = without_leverage(leverage, (score @ root / sigma_px)[:, None])[:, 0]
     expected = root.T @ data @ root
     # Images of high leverage count for several.
     share = np.einsum("vii->v", leverage)
@@ -178,8 +178,8 @@ def products_between(root: FloatArray, information: FloatArray, score: FloatArra
     (N, n, K) its scores: of residuals, and of displacements that they may contain.
     """
     leverage = root.T @ information @ root
-    pull = np.stack([without_leverage(leverage, own @ root) for own in np.moveaxis(score, -1, 0)], axis=-1)
-    return np.asarray(np.einsum("vpj,vpk->jk", pull, pull))
+    pull = np.moveaxis(without_leverage(leverage, np.swapaxes(score, 1, 2) @ root), 1, 0).reshape(score.shape[-1], -1)
+    return np.asarray(pull @ pull.T)
 
 
 def square_of_rest(products: FloatArray, second: FloatArray, mean: FloatArray) -> float:
@@ -189,7 +189,7 @@ def square_of_rest(products: FloatArray, second: FloatArray, mean: FloatArray) -
 
 
 def without_leverage(leverage: FloatArray, pull: FloatArray) -> FloatArray:
-    """Return (I - M)^-1/2 z (N, n) of clusters with leverages M (N, n, n) and z (N, n)."""
+    """Return (I - M)^-1/2 z (N, K, n) of clusters with leverages M (N, n, n) and K scores z (N, K, n) each."""
     out, size = np.empty_like(pull), np.sqrt((leverage * leverage).sum(axis=(1, 2)))
     # The Frobenius norm bounds the eigenvalues of M. Where it is well below one, a series is faster than all of them.
     small = size < MAX_FOR_SERIES
@@ -204,9 +204,9 @@ def without_leverage(leverage: FloatArray, pull: FloatArray) -> FloatArray:
         series[0] *= 0.5
         out[small] = chebyshev_series(leverage[small], pull[small], bound, series)
     if not small.all():
-        left, axes = np.linalg.eigh(np.eye(pull.shape[1]) - leverage[~small])
-        along = np.swapaxes(axes, -1, -2) @ pull[~small, :, None]
-        out[~small] = (axes @ (along / np.sqrt(np.maximum(left, MIN_LEFT))[..., None]))[..., 0]
+        left, axes = np.linalg.eigh(np.eye(pull.shape[-1]) - leverage[~small])
+        along = pull[~small] @ axes / np.sqrt(np.maximum(left, MIN_LEFT))[:, None]
+        out[~small] = along @ np.swapaxes(axes, -1, -2)
     return out
 
 

@@ -26,8 +26,9 @@ from rigkit.calibration.rig.views.disagree import shared_keys
 from rigkit.calibration.rig.views.frames import mounts_of, view_distances_px, with_common_orientation
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews
 from rigkit.calibration.views.flips import FLIP_SIGNS, Flip
-from rigkit.calibration.views.repeats import close_pairs
+from rigkit.calibration.views.repeats import close_pairs, places_of
 from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
@@ -68,7 +69,7 @@ def duplicate_images(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> li
     centres = {name: _centres(own) for name, own in shown.items()}
     for (a, own), (b, other) in combinations(shown.items(), 2):
         shared = own.keys() & other.keys()
-        near = [key for key in shared if math.dist(centres[a][key], centres[b][key]) <= SAME_IMAGE_PX]
+        near = (key for key in shared if math.dist(centres[a][key], centres[b][key]) <= SAME_IMAGE_PX)
         frames = _in_order({key[0] for key in near if _same_image(own[key], other[key])})
         if not frames:
             continue
@@ -83,16 +84,20 @@ def duplicate_images(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> li
                 "give each camera its own images, and calibrate again",
             )
         )
-    return [*out, *_repeated_images(shown)]
+    return [*out, *_repeated_images(shown, centres)]
 
 
-def _repeated_images(shown: Mapping[str, Mapping[Key, BoardView]]) -> Iterator[Finding]:
+def _repeated_images(
+    shown: Mapping[str, Mapping[Key, BoardView]], centres: Mapping[str, Mapping[Key, FloatArray]]
+) -> Iterator[Finding]:
     """Yield a finding for every two frames with copies of one camera's image; a board that nobody moved looks the same
-    to all cameras."""
+    to all cameras. `centres` are those of the views."""
     for name, own in shown.items():
         others = [other for camera, other in shown.items() if camera != name]
-        keys, centres = list(own), np.array(list(_centres(own).values()))
-        for i, j in zip(*close_pairs(centres, SAME_IMAGE_PX), strict=True) if keys else ():
+        keys = list(own)
+        if len(keys) < 2:
+            continue
+        for i, j in zip(*close_pairs(np.stack(list(centres[name].values())), SAME_IMAGE_PX), strict=True):
             one, again = keys[i], keys[j]
             if one[1] != again[1] or not _same_image(own[one], own[again]):
                 continue
@@ -281,9 +286,9 @@ def _flipped(own: FrameObservations, camera: Camera, flip: Flip) -> FrameObserva
     }
 
 
-def _centres(own: Mapping[Key, BoardView]) -> dict[Key, tuple[float, float]]:
-    """Return the mean of each view's corners: those of copies are no further apart than their corners."""
-    return {key: (float(view.pixels[:, 0].mean()), float(view.pixels[:, 1].mean())) for key, view in own.items()}
+def _centres(own: Mapping[Key, BoardView]) -> dict[Key, FloatArray]:
+    """Return the mean (2,) of each view's corners: those of copies are no further apart than their corners."""
+    return dict(zip(own, places_of([view.pixels for view in own.values()])[:, 1:3], strict=True)) if own else {}
 
 
 def _same_image(one: BoardView, other: BoardView, within_px: float = SAME_IMAGE_PX) -> bool:
