@@ -21,6 +21,8 @@ for bouguet and bumblebee2, 0.0 for both undistorted by OpenCV with the paramete
 MIN_FIELD_DEG = 12.0
 """A lens that is seen less far off its axis may have so little distortion."""
 MIN_IMAGES_OF_FIELD = 5
+CORNERS_COMPARED = 500
+"""Of more corners, every second, third, ... is used: the pinhole camera has eight unknowns."""
 MIN_ALONG_AXIS = 0.2
 """Cosine of the angle from the axis that pinhole images hardly reach."""
 
@@ -30,8 +32,8 @@ def undistorted(calibration: Calibration, *, sure: bool) -> list[Finding]:
     the projection is `sure`: what a few parts of the image do not determine, the smallest model leaves out."""
     if not sure:
         return []
-    used = calibration.corners.kept
-    pixels = calibration.corners.pixels[used]
+    pixels = calibration.corners.pixels[calibration.corners.kept]
+    pixels = pixels[:: max(1, len(pixels) // CORNERS_COMPARED)]
     rays, valid = calibration.camera.unproject(pixels)
     if len({view.image for view in calibration.views}) < MIN_IMAGES_OF_FIELD or not valid.all():
         return []
