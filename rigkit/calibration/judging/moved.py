@@ -27,6 +27,7 @@ from rigkit.calibration.judging.two_kinds import (
     MIN_SHARE_OF_TWO,
     SIGMAS_DO_NOT_HOLD,
     ImageScores,
+    explained_by_focus,
     listed,
     min_of_a_kind,
 )
@@ -134,7 +135,9 @@ def _group(splits: _Splits) -> tuple[BoolArray, _Difference] | None:
     if found is None or found[1] < MIN_SHARE_OF_TWO:
         return None
     apart = splits.difference(found[0], against=AGAINST_PLACE_SEARCHED)
-    if apart is None or splits.scores.chance_of_split(*found) > CHANCE_OF_GROUPS:
+    if apart is None:
+        return None
+    if splits.scores.chance_of_split(*found, explained_by_focus(splits.fit, splits.number)) > CHANCE_OF_GROUPS:
         return None
     halves = ImageScores.of_halves(splits.observations, splits.fit, splits.number)
     if halves.predicted_across(found[0]) < MIN_PREDICTED:

@@ -85,21 +85,19 @@ def contradicting_images(verdicts: Sequence[Finding]) -> Finding | None:
 @dataclass(frozen=True, eq=False, slots=True)
 class ImageScores:
     """Information (N, P, P) and score (N, P) of N images on the lens, poses eliminated, in coordinates in which their
-    sum with the prior (P, P) is the identity; each part of a split has at least `min_images` images. `focus` (P,) is a
-    change of the focal length, if known."""
+    sum with the prior (P, P) is the identity; each part of a split has at least `min_images` images."""
 
     information: FloatArray
     score: FloatArray
     prior: FloatArray
     min_images: int
-    focus: FloatArray | None = None
 
     @classmethod
     def of(cls, fit: Fit, number: IntArray, min_images: int | None = None) -> ImageScores:
         """Return those of the images `number` (V,) of the views, with all other unknowns held; by default a part has at
         least `min_of_a_kind` images."""
         information, score = _of_images(fit, fit.data.products[0], number)
-        return cls.scaled(information, score, _prior(fit), min_images, _longer_focus(fit.state.camera))
+        return cls.scaled(information, score, _prior(fit), min_images)
 
     @classmethod
     def of_halves(cls, observations: Observations, fit: Fit, number: IntArray) -> ImageScores:
@@ -117,48 +115,47 @@ class ImageScores:
         score: FloatArray,
         prior: FloatArray,
         min_images: int | None = None,
-        focus: FloatArray | None = None,
     ) -> ImageScores:
         """Return those of images with this information (N, P, P), score (N, P) and prior (P, P) in any coordinates."""
-        every = information.sum(axis=0) + prior
-        root = root_of_inverse(every)
+        root = root_of_inverse(information.sum(axis=0) + prior)
         ridge = RIDGE_OF_STEP * np.eye(root.shape[1])
         if min_images is None:
             min_images = int(np.ceil(min_of_a_kind(len(score))))
-        own = None if focus is None else root.T @ every @ focus
-        return cls(root.T @ information @ root, score @ root, root.T @ prior @ root + ridge, min_images, own)
+        return cls(root.T @ information @ root, score @ root, root.T @ prior @ root + ridge, min_images)
 
     def gains(self, order: IntArray) -> FloatArray:
-        """Return the first-order decrease of the cost when the first k images in this order (N,) and the others have
-        separate lenses, against one common lens, for each k that leaves both parts enough images."""
-        at = slice(self.min_images - 1, len(order) - self.min_images)
-        return self._gain(self.information[order].cumsum(axis=0)[at], self.score[order].cumsum(axis=0)[at])
+        """Return the first-order decrease of the cost when the first k images in this order (..., N) and the others
+        have separate lenses, against one common lens, for each k that leaves both parts enough images."""
+        at = slice(self.min_images - 1, order.shape[-1] - self.min_images)
+        information, score = self.information[order].cumsum(axis=-3), self.score[order].cumsum(axis=-2)
+        return self._gain(information[..., at, :, :], score[..., at, :])
 
     def split_at(self, order: IntArray) -> int:
         """Return the number of images in this order (N,) before the split with the largest decrease."""
         return self.min_images + int(np.argmax(self.gains(order)))
 
     def split_by(self, values: FloatArray) -> BoolArray:
-        """Return the images above the threshold of these `values` (N,) with the largest decrease; none if there is no
-        threshold. Equal values are not split: they would be in the order of the images."""
+        """Return the images above the threshold of these `values` (..., N) with the largest decrease; none if there is
+        no threshold. Equal values are not split: they would be in the order of the images."""
         order = np.argsort(values, kind="stable")
-        ranked = values[order]
-        below = ranked[self.min_images - 1 : len(order) - self.min_images]
-        above = ranked[self.min_images : len(order) - self.min_images + 1]
+        ranked = np.take_along_axis(values, order, axis=-1)
+        below = ranked[..., self.min_images - 1 : -self.min_images]
+        above = ranked[..., self.min_images : values.shape[-1] - self.min_images + 1]
         gains = np.where(below < above, self.gains(order), -np.inf)
-        best = int(np.argmax(gains))
-        return np.asarray(values > (below[best] if np.isfinite(gains[best]) else np.inf))
+        best = np.argmax(gains, axis=-1)[..., None]
+        split = np.isfinite(np.take_along_axis(gains, best, axis=-1))
+        return np.asarray(values > np.where(split, np.take_along_axis(below, best, axis=-1), np.inf))
 
     def gain_of(self, second: BoolArray) -> float:
         """Return the decrease for separate lenses of the images `second` (N,) and the others."""
-        return float(self._gain(self.information[second].sum(axis=0)[None], self.score[second].sum(axis=0)[None])[0])
+        return float(self._gain(self.information[second].sum(axis=0), self.score[second].sum(axis=0)))
 
     def _gain(self, information: FloatArray, score: FloatArray) -> FloatArray:
-        """Return the decrease for K first parts with these sums (K, P, P) and (K, P)."""
+        """Return the decrease (...) for first parts with these sums (..., P, P) and (..., P)."""
         every, pull = self.information.sum(axis=0), self.score.sum(axis=0)
         gain = -pull @ np.linalg.solve(every + self.prior, pull)
         for own, part in ((information, score), (every - information, pull - score)):
-            gain = gain + (part[:, None] @ np.linalg.solve(own + self.prior, part[..., None]))[:, 0, 0]
+            gain = gain + (part[..., None, :] @ np.linalg.solve(own + self.prior, part[..., None]))[..., 0, 0]
         return np.asarray(gain)
 
     def gain_of_effects(self, *effects: FloatArray | BoolArray) -> float:
@@ -181,11 +178,13 @@ class ImageScores:
         explained, axes = float((own**2).sum()), np.linalg.svd(own, full_matrices=False)[2][:STARTS]
         across = np.einsum("kp,npq,kq->kn", axes, self.information, axes, optimize=True)
         amounts = axes @ self.score.T / np.maximum(across, np.finfo(float).tiny)
-        guesses = [guess for guess in map(self.split_by, amounts) if guess.any()]
-        if not guesses or not explained > 0.0:
+        guesses = self.split_by(amounts)
+        guesses = guesses[guesses.any(axis=1)]
+        if not len(guesses) or not explained > 0.0:
             return None
-        best = max((self._alternated(guess) for guess in guesses), key=self.gain_of)
-        return best, self.gain_of(best) / explained
+        found = self._alternated(guesses)
+        gains = self._gain(np.tensordot(found, self.information, 1), found @ self.score)
+        return found[np.argmax(gains)], float(gains.max()) / explained
 
     def predicted_across(self, second: BoolArray) -> float:
         """Return how well one half of an image tells the lens, of the images `second` (N,) or of the others, that
@@ -202,19 +201,20 @@ class ImageScores:
         whole = float(np.abs(lead).sum())
         return float((np.sign(lead) * lead[::-1]).sum()) / whole if whole > 0.0 else 0.0
 
-    def chance_of_split(self, second: BoolArray, share: float) -> float:
+    def chance_of_split(self, second: BoolArray, share: float, by_focus: float = 0.0) -> float:
         """Return the p-value of the best split `second` (N,) with this `share`; 1 as soon as it exceeds
         `CHANCE_OF_GROUPS`.
 
         The reference are images whose own amounts are uniformly distributed, with the same second moments, along the
-        principal axes of these. Where other focal lengths from image to image explain as much as the two lenses, it is
-        images whose lenses are uniformly distributed along the difference of the two: all else in the scores is kept.
+        principal axes of these. Where other focal lengths from image to image explain as much as the two lenses
+        (`by_focus`, see `explained_by_focus`), it is images whose lenses are uniformly distributed along the difference
+        of the two: all else in the scores is kept.
         """
         own, back = self._own_amounts()
         first, other = self._lenses(second)
         along = self.information @ (other - first)
         amount, explained = _amounts(along, other - first, self.score)
-        if self._explained_by_focus() < AS_MUCH_BY_FOCUS * self.gain_of(second):
+        if by_focus < AS_MUCH_BY_FOCUS * self.gain_of(second):
             rest, (_, size, axes) = np.zeros_like(own), np.linalg.svd(own, full_matrices=False)
             spread = (size / np.sqrt(len(own)))[:, None] * axes
         else:
@@ -231,10 +231,6 @@ class ImageScores:
                 return 1.0
         return reached / (DRAWS + 1)
 
-    def _explained_by_focus(self) -> float:
-        """Return what another focal length for every image explains, if known."""
-        return 0.0 if self.focus is None else _amounts(self.information @ self.focus, self.focus, self.score)[1]
-
     def _own_amounts(self) -> tuple[FloatArray, FloatArray]:
         """Return the images' scores on combinations of unit information (N, P), whose squares are what a lens of its
         own explains of each image, and the matrices (N, P, P) that make scores of them."""
@@ -245,24 +241,26 @@ class ImageScores:
         return own[..., 0], (vectors * size[:, None]) @ turned
 
     def _alternated(self, second: BoolArray) -> BoolArray:
-        """Return the split (N,) that alternating leads to from a first guess."""
+        """Return the splits (G, N) that alternating leads to from first guesses."""
         for _ in range(SIDES_ROUNDS):
             lenses = self._lenses(second)
-            explained = [self.score @ lens - 0.5 * (self.information @ lens) @ lens for lens in lenses]
+            along = np.tensordot(lenses, self.information, (2, 1))
+            explained = lenses @ self.score.T - 0.5 * (along @ lenses[..., None])[..., 0]
             closer = explained[1] > explained[0]
-            if (closer == second).all() or not self.min_images <= closer.sum() <= len(closer) - self.min_images:
+            size = closer.sum(axis=1)
+            moved = (size >= self.min_images) & (size <= closer.shape[1] - self.min_images)
+            moved &= (closer != second).any(axis=1)
+            if not moved.any():
                 break
-            second = closer
+            second = np.where(moved[:, None], closer, second)
         return second
 
-    def _lenses(self, second: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return the lens (P,) that explains most of the images that are not `second` (N,), and that of those."""
-
-        def of(side: BoolArray) -> FloatArray:
-            information, score = self.information[side].sum(axis=0), self.score[side].sum(axis=0)
-            return np.asarray(np.linalg.solve(information + self.prior, score))
-
-        return of(~second), of(second)
+    def _lenses(self, second: BoolArray) -> FloatArray:
+        """Return the lens that explains most of the images that are not `second` (..., N), and that of those,
+        (2, ..., P)."""
+        sides = np.stack([~second, second]).astype(np.float64)
+        information = np.tensordot(sides, self.information, 1) + self.prior
+        return np.asarray(np.linalg.solve(information, (sides @ self.score)[..., None])[..., 0])
 
     def chance(self, clusters: IntArray, number: IntArray, tests: int = 1) -> float:
         """Return the p-value of the permutation test: the part of random orders with a split at least as good as in the
@@ -284,6 +282,13 @@ def _of_images(fit: Fit, products: FloatArray, number: IntArray) -> tuple[FloatA
     p = fit.state.camera.parameters.size
     rows = np.r_[:p, -7:0] % products.shape[-1]
     return reduced_by_cluster(products[:, rows[:, None], rows], p, number)
+
+
+def explained_by_focus(fit: Fit, number: IntArray) -> float:
+    """Return what another focal length for every image explains, of the images `number` (V,) of the views."""
+    information, score = _of_images(fit, fit.data.products[0], number)
+    step = _longer_focus(fit.state.camera)
+    return _amounts(information @ step, step, score)[1]
 
 
 def _prior(fit: Fit) -> FloatArray:

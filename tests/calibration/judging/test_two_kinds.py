@@ -241,11 +241,10 @@ def test_lenses_along_a_line_are_of_two_groups_by_chance_only(rng: np.random.Gen
     """Where the line is that of the focal length, or the split would be called so."""
     line = np.array([3.0, 0.0, -2.0, 1.0])
     for _ in range(5):
-        scores = replace(image_scores(rng.uniform(-1.0, 1.0, (14, 1)) * line, rng), focus=None)
+        scores = image_scores(rng.uniform(-1.0, 1.0, (14, 1)) * line, rng)
         found = scores.best_split()
         assert found is not None and found[1] > 0.5
-        first, other = scores._lenses(found[0])
-        assert replace(scores, focus=other - first).chance_of_split(*found) == 1.0
+        assert scores.chance_of_split(*found, by_focus=scores.gain_of(found[0])) == 1.0
 
 
 def test_too_few_images_are_not_parted(rng: np.random.Generator) -> None:
