@@ -66,9 +66,8 @@ def left_out(calibration: Calibration) -> list[str]:
     """Return one line for each reason, which no verdict states, why images, or parts of used images, are left out."""
     used = {view.image for view in calibration.views}
     images: dict[tuple[str, str], list[str]] = {}
-    stated = tuple(finding.message for finding in calibration.verdicts)
-    unsaid = (entry for entry in calibration.dropped if not any(words.endswith(f": {entry[1]}") for words in stated))
-    for image, reason in unsaid:
+    stated = {finding.reason for finding in calibration.verdicts}
+    for image, reason in (entry for entry in calibration.dropped if entry[1] not in stated):
         images.setdefault(("left out of" if image in used else "dropped", reason), []).append(image)
     return [
         f"{how} {_first_names(some)}: {reason}" for (how, reason), some in sorted(images.items(), key=lambda i: i[0][0])

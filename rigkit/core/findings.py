@@ -1,4 +1,4 @@
-"""Findings about a result: severity, message, image, and remedy."""
+"""Findings about a result: severity, message, image, remedy, and the reason for leaving images out."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ class Finding:
     message : what is wrong and what shows it, without a full stop.
     image : the image concerned, if it is a single one.
     remedy : what to do, if anything.
+    reason : why images are left out, as in `Calibration.dropped`, if that is what the finding says.
 
     >>> str(Finding.look("5 images only", "take at least 8"))
     'look: 5 images only; take at least 8'
@@ -34,6 +35,7 @@ class Finding:
     message: str
     image: str | None = None
     remedy: str | None = None
+    reason: str | None = None
 
     @classmethod
     def good(cls, message: str) -> Finding:
@@ -42,6 +44,11 @@ class Finding:
     @classmethod
     def look(cls, message: str, remedy: str | None = None, image: str | None = None) -> Finding:
         return cls(severity=Severity.LOOK, message=message, image=image, remedy=remedy)
+
+    @classmethod
+    def left_out(cls, what: str, reason: str, image: str | None = None) -> Finding:
+        """Return a finding LOOK: `what` says which images are left out, `reason` why."""
+        return cls(severity=Severity.LOOK, message=f"{what}: {reason}", image=image, reason=reason)
 
     @classmethod
     def bad(cls, message: str, remedy: str | None = None) -> Finding:

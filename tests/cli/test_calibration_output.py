@@ -9,6 +9,7 @@ from helpers.calibration_scenes import SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.cli.calibration_output import frames_left_out, left_out
+from rigkit.core.findings import Finding
 
 
 def test_a_reason_is_said_once_with_its_first_images() -> None:
@@ -31,3 +32,13 @@ def test_frames_left_out_for_one_reason_are_one_line() -> None:
         "of the first)",
         "frame 000009, board 'floor' left out: its boards disagree",
     ]
+
+
+def test_reasons_that_verdicts_state_are_not_said_again() -> None:
+    """A message that only ends like one states none."""
+    views = random_views(lens("reg"), 6, np.random.default_rng(1), reach_deg=30.0)[0]
+    calibration = calibrate(views, SIZE, model="brown", board="flat", folds=0)
+    no_board = Finding.left_out("held-out RMS 0.1 px, but image 'a.png' is left out", "no board found", "a.png")
+    stated = (no_board, Finding.look("the lens: is damaged"))
+    dropped = (("a.png", "no board found"), ("b.png", "is damaged"))
+    assert left_out(replace(calibration, dropped=dropped, verdicts=stated)) == ["dropped b.png: is damaged"]

@@ -233,19 +233,19 @@ def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -
     dropped = [(image, reason) for image, reason in dropped if image not in contradicted]
     used = {view.image for view in views}
     parts = [(image, reason) for image, reason in dropped if image in used and reason != OTHER_GRIDS]
-    found = [Finding.look(f"image '{image}' is partly left out: {reason}", image=image) for image, reason in parts]
+    found = [Finding.left_out(f"image '{image}' is partly left out", reason, image) for image, reason in parts]
     return [*_images_left_out([(image, reason) for image, reason in dropped if image not in used]), *found[:NAMED]]
 
 
 def _images_left_out(dropped: Sequence[tuple[str, str]]) -> list[Finding]:
     if len(dropped) <= NAMED:
-        return [Finding.look(f"image '{image}' is left out: {reason}", image=image) for image, reason in dropped]
+        return [Finding.left_out(f"image '{image}' is left out", reason, image) for image, reason in dropped]
     reasons = Counter(reason for _, reason in dropped)
     first = {reason: image for image, reason in reversed(dropped)}
     return [
-        Finding.look(f"{count} images are left out, the first of them '{first[reason]}': {reason}")
+        Finding.left_out(f"{count} images are left out, the first of them '{first[reason]}'", reason)
         if count > 1
-        else Finding.look(f"image '{first[reason]}' is left out: {reason}", image=first[reason])
+        else Finding.left_out(f"image '{first[reason]}' is left out", reason, first[reason])
         for reason, count in reasons.most_common(NAMED)
     ]
 

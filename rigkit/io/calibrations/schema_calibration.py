@@ -47,6 +47,7 @@ _FINDING: Schema = {
                 "message": described(TEXT, "what was found, with the evidence"),
                 "image?": described(TEXT, "which image it is about"),
                 "remedy?": described(TEXT, "what to do"),
+                "reason?": described(TEXT, "why images are left out, where the message says it"),
             }
         ),
         described(TEXT, "the same in files of earlier versions"),
