@@ -38,12 +38,17 @@ def run(args: argparse.Namespace) -> int:
 
     from rigkit.cli.console import note, note_written, print_json
     from rigkit.core.errors import InputError
-    from rigkit.workflows.checks.history import add_to_history, show_history
+    from rigkit.io.disk.reading import read_text
 
     if (args.add is None) != (args.to is None):
         raise InputError("history: --add NEW.json needs --to CALIBRATION.json, the calibration to compare it with")
     if args.temperature is not None and args.add is None:
         raise InputError("history: --temperature belongs to --add and --to; give these, too")
+    if args.add is None:
+        # A register that cannot be read is refused before everything else is imported.
+        read_text(args.register, "register")
+    from rigkit.workflows.checks.history import add_to_history, show_history
+
     if args.add is not None:
         add_to_history(args.register, args.add, args.to, temperature_c=args.temperature)
         note(f"1 entry appended to {args.register}")

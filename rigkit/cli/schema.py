@@ -22,8 +22,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from rigkit.io.schema_names import require_schema
+
+    if args.name is not None:
+        require_schema(args.name)
     from rigkit.io.disk.writing import write_atomic
-    from rigkit.io.schema import SCHEMAS, key_rows, schema_named, schema_text
+    from rigkit.io.schema import SCHEMAS, key_rows, schema_text
 
     if args.name is None:
         for name, schema in SCHEMAS.items():
@@ -33,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
         write_atomic(args.output, schema_text(args.name), force=args.force)
         print(args.output)
     elif args.keys:
-        for key, kind, words in key_rows(schema_named(args.name)):
+        for key, kind, words in key_rows(SCHEMAS[args.name]):
             print(f"{key + '  ':40}{kind + '  ':30}{words}")
     else:
         print(schema_text(args.name), end="")

@@ -23,6 +23,7 @@ from rigkit.io.manifests.rig_session import is_rig_session, load_rig_session
 from rigkit.io.manifests.session import load_session
 from rigkit.io.manifests.study_file import load_study
 from rigkit.io.schema import SCHEMAS, key_rows
+from rigkit.io.schema_names import SCHEMA_NAMES
 from rigkit.report.tables import tables_to_json
 from rigkit.validation.checks import validate
 from rigkit.validation.crosscheck import crosscheck
@@ -173,6 +174,7 @@ def test_results_are_of_their_schemas() -> None:
 
 def test_every_key_is_said_and_every_schema_is_one(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["schema"]) == 0
+    assert tuple(SCHEMAS) == SCHEMA_NAMES
     listed = capsys.readouterr().out
     for name, schema in SCHEMAS.items():
         jsonschema.Draft202012Validator.check_schema(schema)
