@@ -38,30 +38,29 @@ class CurvatureRules(Struct):
     """The constants of `detection.subpixel.edge_curvature`."""
 
 
-def fit_corners(
-    image: GreyImage,
-    pixels: FloatArray,
-    sides: FloatArray,
-    curvature: FloatArray,
-    curvature_sigma: FloatArray,
-    gaps: FloatArray,
-    tilts: FloatArray,
-    reach: FloatArray,
-    paper: FloatArray,
-    single: FloatArray,
-    ends: BoolArray,
-    sign: FloatArray,
-    blur: FloatArray,
-    window_blur: FloatArray,
-    contrast: FloatArray,
-    rules: Rules,
-) -> FloatArray:
-    """Return the OUTCOMES (api.h) of N corners, (N, 35). Arguments as for `detection.subpixel.edge_fit.fit_edges`."""
-    out = kernels().fit_edges(
-        *(image, pixels, sides, curvature, curvature_sigma, gaps, tilts, reach, paper),
-        *(single, sign, blur, window_blur, contrast, ends, rules),
-    )
-    return np.asarray(out)
+class CornerWindows(NamedTuple):
+    """Windows of N corners and the expected state of their edge model, in the order of the kernel `fit_edges`: see
+    `detection.subpixel.edge_model.Geometry` and `detection.subpixel.edge_fit.fit_edges`."""
+
+    pixels: FloatArray
+    sides: FloatArray
+    curvature: FloatArray
+    curvature_sigma: FloatArray
+    gaps: FloatArray
+    tilts: FloatArray
+    reach: FloatArray
+    paper: FloatArray
+    single: FloatArray
+    sign: FloatArray
+    blur: FloatArray
+    window_blur: FloatArray
+    contrast: FloatArray
+    ends: BoolArray
+
+
+def fit_corners(image: GreyImage, windows: CornerWindows, rules: Rules) -> FloatArray:
+    """Return the OUTCOMES (api.h) of N corners, (N, 35)."""
+    return np.asarray(kernels().fit_edges(image, *windows, rules))
 
 
 class NoiseOfCorners(NamedTuple):

@@ -26,7 +26,7 @@ from rigkit.detection.subpixel.edge_model import (
     WINDOW_REACH,
     Geometry,
 )
-from rigkit.kernels.edges import LAGS, Rules, fit_corners
+from rigkit.kernels.edges import LAGS, CornerWindows, Rules, fit_corners
 
 BLUR_RANGE = (0.28, 5.0)
 """Bounds of s: it is 0.29 in a perfectly sharp image, due to the pixels; above 5 px there are hardly any edges."""
@@ -169,27 +169,25 @@ def fit_edges(
     curvature_sigma : (N, 2) standard deviations of the geometry's curvatures, 1/px; None or 0: curvatures are fixed.
     contrast : (N,) expected contrast; None or NaN: it is estimated from the window.
     """
-    expected = np.full(len(pixels), np.nan) if contrast is None else contrast
-    loose = np.zeros((len(pixels), 2)) if curvature_sigma is None else curvature_sigma
-    fitted = fit_corners(
-        image,
-        pixels,
-        geometry.sides,
-        geometry.curvature,
-        loose,
-        geometry.gaps,
-        np.zeros(geometry.gaps.shape) if geometry.tilts is None else geometry.tilts,
-        np.full(geometry.gaps.shape, np.nan) if geometry.reach is None else geometry.reach,
-        np.full(geometry.gaps.shape, np.nan) if geometry.paper is None else geometry.paper,
-        np.zeros((len(pixels), 2)) if geometry.single is None else geometry.single,
-        geometry.ends,
-        sign,
-        blur,
-        blur if geometry.window_blur is None else geometry.window_blur,
-        expected,
-        edge_rules(radius_px, iterations, converged_px, mirrored, image.dtype == np.uint8),
+    unknown = np.full(geometry.gaps.shape, np.nan)
+    windows = CornerWindows(
+        pixels=pixels,
+        sides=geometry.sides,
+        curvature=geometry.curvature,
+        curvature_sigma=np.zeros((len(pixels), 2)) if curvature_sigma is None else curvature_sigma,
+        gaps=geometry.gaps,
+        tilts=np.zeros(geometry.gaps.shape) if geometry.tilts is None else geometry.tilts,
+        reach=unknown if geometry.reach is None else geometry.reach,
+        paper=unknown if geometry.paper is None else geometry.paper,
+        single=np.zeros((len(pixels), 2)) if geometry.single is None else geometry.single,
+        sign=sign,
+        blur=blur,
+        window_blur=blur if geometry.window_blur is None else geometry.window_blur,
+        contrast=np.full(len(pixels), np.nan) if contrast is None else contrast,
+        ends=geometry.ends,
     )
-    return EdgeFit(fitted)
+    rules = edge_rules(radius_px, iterations, converged_px, mirrored, image.dtype == np.uint8)
+    return EdgeFit(fit_corners(image, windows, rules))
 
 
 @functools.cache

@@ -48,7 +48,7 @@ from rigkit.detection.subpixel.edge_fit import (
 )
 from rigkit.detection.subpixel.edge_model import NEAR_PX, TAIL_SIGMAS, WINDOW_REACH, Geometry
 from rigkit.detection.tags.corners import NOTHING_NEAR_PX
-from rigkit.kernels.edges import LAGS, CurvatureRules, Rules, TagWindow
+from rigkit.kernels.edges import LAGS, CornerWindows, CurvatureRules, Rules, TagWindow
 from rigkit.kernels.surface import TagSurface
 
 MIN_DETERMINED_PIXELS = K1
@@ -61,34 +61,17 @@ COEFFICIENTS = 6
 """Of the lines of a lattice, of order 0 to 5."""
 
 
-def fit_corners(
-    image: GreyImage,
-    pixels: FloatArray,
-    sides: FloatArray,
-    curvature: FloatArray,
-    curvature_sigma: FloatArray,
-    gaps: FloatArray,
-    tilts: FloatArray,
-    reach: FloatArray,
-    paper: FloatArray,
-    single: FloatArray,
-    ends: BoolArray,
-    sign: FloatArray,
-    blur: FloatArray,
-    window_blur: FloatArray,
-    contrast: FloatArray,
-    rules: Rules,
-) -> FloatArray:
-    geometry, loose = (
-        Geometry(sides, curvature, gaps, ends, reach=reach, paper=paper, tilts=tilts, single=single),
-        curvature_sigma,
+def fit_corners(image: GreyImage, windows: CornerWindows, rules: Rules) -> FloatArray:
+    w, pixels, loose = windows, windows.pixels, windows.curvature_sigma
+    geometry = Geometry(
+        w.sides, w.curvature, w.gaps, w.ends, reach=w.reach, paper=w.paper, tilts=w.tilts, single=w.single
     )
-    window = collect(image, pixels, geometry, window_blur, rules.radius_px)
-    prior_mean, prior = _prior(geometry, loose, blur, window.size)
+    window = collect(image, pixels, geometry, w.window_blur, rules.radius_px)
+    prior_mean, prior = _prior(geometry, loose, w.blur, window.size)
     kept = np.count_nonzero(loose > 0.0, axis=1) < 2
     values = prior_mean.copy()
     values[:, [X, Y]] = pixels - window.centre
-    _brightness(values, window, geometry, sign, contrast)
+    _brightness(values, window, geometry, w.sign, w.contrast)
     used = window.weight.sum(axis=1, dtype=np.float64)
     free = np.maximum(used - MIN_DETERMINED_PIXELS, 1.0)
     variance = np.full(len(pixels), np.inf)
@@ -118,7 +101,7 @@ def fit_corners(
         change[:, 2] /= BLUR_LAG * values[active, S]
         settled = change.max(axis=1) <= rules.converged_px
         # What was left before a first step that found the brightness is no residual.
-        settled &= (turn > 0) | np.isnan(contrast[active])
+        settled &= (turn > 0) | np.isnan(w.contrast[active])
         active[np.flatnonzero(active)[settled]] = False
         if not active.any():
             break
@@ -128,7 +111,7 @@ def fit_corners(
         noise, lags = _noise(values, variance, window, rest)
         lags[:, noise <= rules.min_variance] = 0.0
         noise = np.maximum(noise, rules.min_variance)
-    return _result(values, variance, noise, lags, normal, window, pixels, geometry, sign)
+    return _result(values, variance, noise, lags, normal, window, pixels, geometry, w.sign)
 
 
 def line_curvatures(
@@ -344,11 +327,12 @@ def fit_tag_corners(
     narrow = (window.border * shape.heights.min(axis=1) - MARKER_BLURS * blur - NEAR_PX) / TAIL_SIGMAS
     gaps = np.where(single[:, :1, None] == 0.0, own * shape.heights[:, :, None], NOTHING_NEAR_PX)
     none = np.zeros(gaps.shape)
-    return fit_corners(
-        *(image, pixels, shape.sides, shape.curvature, np.zeros((len(pixels), 2)), gaps, none),
-        *(np.minimum(0.5 * own, WINDOW_REACH), np.full(gaps.shape, np.nan), single, none > 0.0, signs[cells], expected),
-        *(np.minimum(np.maximum(narrow, BLUR_RANGE[0]), expected), contrast, rules),
+    windows = CornerWindows(
+        *(pixels, shape.sides, shape.curvature, np.zeros((len(pixels), 2)), gaps, none),
+        *(np.minimum(0.5 * own, WINDOW_REACH), np.full(gaps.shape, np.nan), single, signs[cells], expected),
+        *(np.minimum(np.maximum(narrow, BLUR_RANGE[0]), expected), contrast, none > 0.0),
     )
+    return fit_corners(image, windows, rules)
 
 
 def blur_of_tags(
