@@ -28,7 +28,7 @@ from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.choosing.one_model import ModelOutcome, on_same_images
 from rigkit.calibration.judging.moved import moved_lens, two_groups
 from rigkit.calibration.judging.pupil import may_move, pupil_is_significant, solved_again
-from rigkit.calibration.judging.verdicts import judge
+from rigkit.calibration.judging.verdicts import diagnose
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.views.observations import Observations
@@ -157,13 +157,13 @@ class _Solution:
     def with_verdicts(self, result: Calibration, far: FarProjection) -> Calibration:
         """Return what `assembled` returned, with its verdicts if the request asks for them."""
         request, outcome = self.fits.request, self.outcome
-        if not request.judged:
+        if not request.diagnosed:
             return result
         automatic = (("model", request.model), ("board_shape", request.board))
         in_force = [name for name, value in automatic if value == "auto"]
         observations, fit = outcome.observations, outcome.chosen.fit
         moved = _moved(observations, fit, self.tried, in_halves=request.folds > 0)
-        verdicts = judge(
+        verdicts = diagnose(
             result,
             [*moved, *_largest_size_chosen(outcome.beyond, result, in_force)],
             far=far,

@@ -14,7 +14,7 @@ from rigkit.calibration.calibrate import FOLDS
 from rigkit.calibration.choosing.choice import FittedModel, heldout_squares
 from rigkit.calibration.choosing.models_tried import Request, enough_agree
 from rigkit.calibration.choosing.one_model import with_board_shape
-from rigkit.calibration.judging.verdicts import judge
+from rigkit.calibration.judging.verdicts import diagnose
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.solving.fit import Fit, fit_kept, posed
 from rigkit.calibration.solving.linearise import normal_equations
@@ -59,7 +59,7 @@ def posed_calibration(
     if covariance is not None:
         frame[:p, :p] = covariance
     result = with_covariance(observations, fit, heldout_px, dropped, candidates, frame)
-    return replace(result, verdicts=judge(result, _large_residual(result), in_force=("model", "board_shape")))
+    return replace(result, verdicts=diagnose(result, _large_residual(result), in_force=("model", "board_shape")))
 
 
 def _on_flat_boards(

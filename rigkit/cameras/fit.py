@@ -39,10 +39,10 @@ class _Projection(LinearisedProblem, Generic[C]):
     def step(self, damping: float) -> DenseStep | None:
         projected, _, _, d_pixels_d_parameters = self.camera.project_with_jacobians(self.points)
         # Long rows in memory: two large products, not thousands of small ones.
-        by_parameter = np.moveaxis(d_pixels_d_parameters, (-2, -1), (0, 1))
+        by_axis = np.moveaxis(d_pixels_d_parameters, (-2, -1), (0, 1))
         jacobian = np.empty((self.free.shape[1], 2, len(self.points)))
         for axis in (0, 1):
-            np.multiply(self.free.T @ by_parameter[axis], self.weight, out=jacobian[:, axis])
+            np.multiply(self.free.T @ by_axis[axis], self.weight, out=jacobian[:, axis])
         residuals = self.weight * (projected - self.pixels).T
         return damped_step(jacobian.reshape(len(jacobian), -1).T, residuals.reshape(-1), damping)
 

@@ -54,6 +54,6 @@ def _design(
         in_cam = cam_from_rig.apply(points)
         seen &= in_cam[:, 2] >= np.cos(np.radians(0.5 * field_deg)) * np.linalg.norm(in_cam, axis=-1)
     # x = R (exp(W) X + T) + t.
-    by_world = found.by_point[seen]
+    by_world = found.d_pixels_d_point[seen]
     motion = np.concatenate([-by_world @ skew(points[seen]), by_world], axis=-1)
-    return np.concatenate([found.by_globals[seen], motion], axis=-1).reshape(-1, layout.count + 6)
+    return np.concatenate([found.d_pixels_d_globals[seen], motion], axis=-1).reshape(-1, layout.count + 6)

@@ -49,7 +49,7 @@ class ValidationReport:
     baseline_mm, baseline_sigma_mm, sampson_rms_px, count : of the reconstruction.
     notes : the reconstruction's notes, and boards with outliers.
     planes : which kind of planes the checks of angles, normals and baseline use.
-    judged_normals : normals of the boards, unless they are those of planes through the points.
+    checked_normals : normals of the boards, unless they are those of planes through the points.
     coplanar_normal_errors, lattice_normal_errors : errors of the estimated normals against the planes that were fitted
         to both images, by board.
     """
@@ -67,7 +67,7 @@ class ValidationReport:
     count: int
     notes: tuple[str, ...] = ()
     planes: Planes = "free"
-    judged_normals: Mapping[str, FloatArray] = field(default_factory=dict)
+    checked_normals: Mapping[str, FloatArray] = field(default_factory=dict)
     coplanar_normal_errors: Mapping[str, NormalErrors] = field(default_factory=dict)
     lattice_normal_errors: Mapping[str, NormalErrors] = field(default_factory=dict)
 
@@ -211,7 +211,7 @@ def _report(
     held, undeclared = declaration_checks(reconstruction)
     checks += [*of_boards, *held, *contradicted_boards(measured.boards, layout or {})]
     unchecked += undeclared
-    against = normal_errors_against(reconstruction, fitted.judge)
+    against = normal_errors_against(reconstruction, fitted.constrained)
     stated = {frozenset((angle.a, angle.b)): angle.value_deg for angle in truth.angles}
     return ValidationReport(
         pair_id=reconstruction.pair_id,
@@ -230,7 +230,7 @@ def _report(
         count=len(cloud),
         notes=(*reconstruction.notes, *_outlier_notes(measured.boards.values())),
         planes=fitted.planes,
-        judged_normals=fitted.judged_normals(),
+        checked_normals=fitted.checked_normals(),
         coplanar_normal_errors=normal_errors_against(reconstruction, fitted.coplanar),
         lattice_normal_errors=normal_errors_against(reconstruction, fitted.lattice),
     )
@@ -251,11 +251,11 @@ def _checks_of_boards(
         if measured.absent(*both):
             unchecked.append(f"{angle.name}: {measured.absent(*both)}")
             continue
-        judged = fitted.judged_angle(*both, angles[frozenset(both)])
-        if judged is None:
+        checked = fitted.checked_angle(*both, angles[frozenset(both)])
+        if checked is None:
             unchecked.append(f"{angle.name}: too few corners in both images for {fitted.planes} planes")
             continue
-        checks.append(compare_angle(angle, judged, coverage, measured.count(*both)))
+        checks.append(compare_angle(angle, checked, coverage, measured.count(*both)))
     for distance in truth.distances:
         ends = (distance.a.board_id, distance.b.board_id)
         if measured.absent(*ends):
@@ -269,8 +269,8 @@ def _baseline(
     reconstruction: Reconstruction, shifts: CalibrationShifts | None, fitted: FittedPlanes
 ) -> tuple[float, float]:
     """Return the baseline to check and its sigma, including the calibrations' uncertainty, mm."""
-    if fitted.judge is not None:
-        return fitted.judge.baseline_mm()
+    if fitted.constrained is not None:
+        return fitted.constrained.baseline_mm()
     sigma = reconstruction.baseline_sigma_mm
     share = 0.0 if shifts is None else shifts.variance(lambda r: r.baseline_mm)
     return reconstruction.baseline_mm, float(np.hypot(sigma, np.sqrt(share)))

@@ -61,11 +61,11 @@ class FittedPlanes:
     planes: Planes = "free"
 
     def __post_init__(self) -> None:
-        if self.planes != "free" and self.judge is None:
-            raise InputError(f"validate: {self.planes} planes were not fitted and can judge nothing")
+        if self.planes != "free" and self.constrained is None:
+            raise InputError(f"validate: {self.planes} planes were not fitted and cannot be used for checks")
 
     @property
-    def judge(self) -> BoardPlanes | None:
+    def constrained(self) -> BoardPlanes | None:
         """The planes that the checks of angles, normals and baseline use; None: those through the points."""
         return {"free": None, "coplanar": self.coplanar, "lattice": self.lattice}[self.planes]
 
@@ -84,13 +84,14 @@ class FittedPlanes:
             lattice_sigma_deg=lattice[1],
         )
 
-    def judged_angle(self, a: str, b: str, free: tuple[float, float]) -> tuple[float, float] | None:
+    def checked_angle(self, a: str, b: str, free: tuple[float, float]) -> tuple[float, float] | None:
         """Return the angle to check and its sigma; None if one of the boards has no such plane."""
-        return free if self.judge is None else _angle(self.judge, a, b)
+        return free if self.constrained is None else _angle(self.constrained, a, b)
 
-    def judged_normals(self) -> dict[str, FloatArray]:
+    def checked_normals(self) -> dict[str, FloatArray]:
         """Return the boards' normals to check against, by id; empty for planes through the points."""
-        return {} if self.judge is None else {name: self.judge.normal(name) for name in self.judge.board_ids}
+        planes = self.constrained
+        return {} if planes is None else {name: planes.normal(name) for name in planes.board_ids}
 
 
 def _angle(planes: BoardPlanes | None, a: str, b: str) -> tuple[float, float] | None:

@@ -111,11 +111,11 @@ def choose(options: Sequence[FittedModel], min_sigmas: float | None = None) -> F
     """
     if len(options) == 1:
         return options[0]
-    judged = [o for o in converged_ones(options) if o.heldout is not None]
-    if not judged:
+    compared = [o for o in converged_ones(options) if o.heldout is not None]
+    if not compared:
         return min(options, key=_bic)
-    good = _as_good_as_best(np.array([o.heldout for o in judged]), min_sigmas)
-    return min((o for o, fine in zip(judged, good, strict=True) if fine), key=lambda o: o.count)
+    good = _as_good_as_best(np.array([o.heldout for o in compared]), min_sigmas)
+    return min((o for o, fine in zip(compared, good, strict=True) if fine), key=lambda o: o.count)
 
 
 def _as_good_as_best(heldout: FloatArray, min_sigmas: float | None) -> BoolArray:

@@ -85,13 +85,13 @@ def lenses_on_boards(
             done[option.name] = replace(option, name=f"{option.name}, boards as found", fit=fit, heldout=None)
     # An option with a training error above another's held-out error cannot be the best.
     order = sorted((o.name for o in tried if o.name in names), key=lambda name: done[name].fit.rms_px)
-    judged: list[FittedModel] = []
+    fitted: list[FittedModel] = []
     for name in order:
-        if all(done[name].fit.rms_px <= (o.heldout_px or np.inf) for o in judged):
+        if all(done[name].fit.rms_px <= (o.heldout_px or np.inf) for o in fitted):
             if done[name].heldout is None:
                 done[name] = replace(done[name], heldout=heldout_squares(observations, done[name].fit, request.folds))
-            judged.append(done[name])
-    return list(converged_ones(judged))
+            fitted.append(done[name])
+    return list(converged_ones(fitted))
 
 
 def choose_lenses(cameras: Sequence[Sequence[FittedModel]]) -> list[ModelChoice]:

@@ -51,7 +51,7 @@ class Request:
     progress: Progress = silent
     pupil: str = "central"
     """Or "auto", "moving": see `calibrate`."""
-    judged: bool = True
+    diagnosed: bool = True
     """Whether the result has verdicts, which take a third of the time of a fit without cross-validation."""
 
 

@@ -173,13 +173,13 @@ def boards_never_rotated(c: Calibration) -> Iterator[Finding]:
 def stretched_images(c: Calibration, *, upright: bool) -> Iterator[Finding]:
     """Yield a finding where pixels are not square; `upright`: no board was rotated about its normal."""
     step = 1e-3 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    pixels, valid, _, by_parameters = c.camera.project_with_jacobians(np.column_stack([step, np.ones(4)]))
+    pixels, valid, _, d_pixels_d_parameters = c.camera.project_with_jacobians(np.column_stack([step, np.ones(4)]))
     along_x, along_y = pixels[0, 0] - pixels[1, 0], pixels[2, 1] - pixels[3, 1]
     if not valid.all() or min(along_x, along_y) <= 0.0:
         return
     stretch = float(np.log(along_x / along_y))
-    gradient = (by_parameters[0, 0] - by_parameters[1, 0]) / along_x
-    gradient = gradient - (by_parameters[2, 1] - by_parameters[3, 1]) / along_y
+    gradient = (d_pixels_d_parameters[0, 0] - d_pixels_d_parameters[1, 0]) / along_x
+    gradient = gradient - (d_pixels_d_parameters[2, 1] - d_pixels_d_parameters[3, 1]) / along_y
     sigma = c.widening * float(np.sqrt(max(gradient @ c.covariance @ gradient, 0.0)))
     if abs(stretch) <= max(SQUARE_WITHIN, STRETCH_SIGMAS * sigma):
         return
@@ -194,9 +194,9 @@ def stretched_images(c: Calibration, *, upright: bool) -> Iterator[Finding]:
 
 def cropped_images(c: Calibration) -> Iterator[Finding]:
     """Yield a finding where the optical axis is far from the middle of the images."""
-    axis, valid, _, by_parameters = c.camera.project_with_jacobians(np.array([0.0, 0.0, 1.0]))
+    axis, valid, _, d_pixels_d_parameters = c.camera.project_with_jacobians(np.array([0.0, 0.0, 1.0]))
     off, size = axis - image_center(c.camera.size_px), max(c.camera.size_px)
-    sigma = c.widening * float(np.sqrt(np.trace(by_parameters @ c.covariance @ by_parameters.T)))
+    sigma = c.widening * float(np.sqrt(np.trace(d_pixels_d_parameters @ c.covariance @ d_pixels_d_parameters.T)))
     far = float(np.linalg.norm(off))
     if not valid or not far > max(MAX_AXIS_OFF * size, STRETCH_SIGMAS * sigma):
         return

@@ -321,8 +321,8 @@ def _longer_focus(camera: Camera) -> FloatArray:
     lens = far_camera(camera)
     pixels = grid_pixels(lens.size_px, FOCUS_GRID)
     rays, valid = lens.unproject(pixels)
-    pixels, inside, _, by_parameters = lens.project_with_jacobians(rays[valid])
-    rows = np.swapaxes(by_parameters[inside], 0, 1).reshape(-1, by_parameters.shape[-1])
+    pixels, inside, _, d_pixels_d_parameters = lens.project_with_jacobians(rays[valid])
+    rows = np.swapaxes(d_pixels_d_parameters[inside], 0, 1).reshape(-1, d_pixels_d_parameters.shape[-1])
     length = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
     step = np.linalg.lstsq(rows / length, (pixels[inside] - lens.axis_px).T.ravel(), rcond=MIN_OWN_INFORMATION)[0]
     return np.append(step / length, np.zeros(camera.parameters.size - len(step)))

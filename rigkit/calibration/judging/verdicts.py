@@ -70,7 +70,7 @@ NAMES_U = ("left", "centre left", "centre right", "right")
 NAMES_V = ("top", "middle", "bottom")
 
 
-class Judged(Protocol):
+class Diagnosed(Protocol):
     """A result with a training error and, if there were enough images, a held-out error."""
 
     @property
@@ -80,7 +80,7 @@ class Judged(Protocol):
     def heldout_rms_px(self) -> float | None: ...
 
 
-def judge(
+def diagnose(
     calibration: Calibration,
     also: Sequence[Finding] = (),
     *,
@@ -176,7 +176,7 @@ def diagnose_session(
 
 
 def with_headline(
-    result: Judged, causes: Sequence[Finding], effects: Sequence[Finding], where: str = ""
+    result: Diagnosed, causes: Sequence[Finding], effects: Sequence[Finding], where: str = ""
 ) -> list[Finding]:
     """Return the headline, and the `causes` and `effects` that it does not contain.
 

@@ -20,19 +20,19 @@ class RigProjection:
 
     valid: BoolArray
     seen: BoolArray
-    by_point: FloatArray
-    by_globals: FloatArray
+    d_pixels_d_point: FloatArray
+    d_pixels_d_globals: FloatArray
 
     @classmethod
     def of(cls, camera: Camera, cam_from_rig: Rigid3, points: Points, layout: Layout, k: int) -> RigProjection:
         """Return that of `points` (..., 3) mm in the rig's frame into its camera `k`."""
         in_cam = cam_from_rig.apply(points)
-        pixels, valid, d_pixels_d_point, d_pixels_d_parameters = camera.project_with_jacobians(in_cam)
-        by_globals = np.zeros((*points.shape[:-1], 2, layout.count))
-        by_globals[..., layout.cameras[k]] = d_pixels_d_parameters
+        pixels, valid, d_pixels_d_x, d_pixels_d_parameters = camera.project_with_jacobians(in_cam)
+        d_pixels_d_globals = np.zeros((*points.shape[:-1], 2, layout.count))
+        d_pixels_d_globals[..., layout.cameras[k]] = d_pixels_d_parameters
         if (mount := layout.mounts[k]) is not None:
             # x = exp(w) R X + t + v.
-            by_turn = d_pixels_d_point @ -skew(in_cam - cam_from_rig.translation_mm)
-            by_globals[..., mount] = np.concatenate([by_turn, d_pixels_d_point], axis=-1)
-        by_point = d_pixels_d_point @ cam_from_rig.rotation
-        return cls(valid, valid & camera.on_image(pixels), by_point, by_globals)
+            by_turn = d_pixels_d_x @ -skew(in_cam - cam_from_rig.translation_mm)
+            d_pixels_d_globals[..., mount] = np.concatenate([by_turn, d_pixels_d_x], axis=-1)
+        d_pixels_d_point = d_pixels_d_x @ cam_from_rig.rotation
+        return cls(valid, valid & camera.on_image(pixels), d_pixels_d_point, d_pixels_d_globals)

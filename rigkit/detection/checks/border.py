@@ -282,8 +282,8 @@ class _Squares:
         places = self.at(np.repeat(up, len(WITHIN)), np.tile(WITHIN, len(up)))
         return np.asarray(np.median(sample(image, places), axis=1), dtype=np.float64)
 
-    def end_on_one_line(self, image: GreyImage, outer: FloatArray, beyond: FloatArray, judged: BoolArray) -> BoolArray:
-        """Return which squares (M,) change from brightness `outer` to `beyond` once, on the line of those `judged`."""
+    def end_on_one_line(self, image: GreyImage, outer: FloatArray, beyond: FloatArray, tested: BoolArray) -> BoolArray:
+        """Return which squares (M,) change from brightness `outer` to `beyond` once, on the line of those `tested`."""
         places = self.at(np.repeat(PROFILE, len(WITHIN)), np.tile(WITHIN, len(PROFILE)))
         values = sample(image, places).reshape(len(outer), len(PROFILE), len(WITHIN)).mean(axis=2)
         step = beyond - outer
@@ -295,5 +295,5 @@ class _Squares:
         count = len(self.bright) + 1
         height = np.linalg.norm(self.shape.along_row[:count], axis=1)
         within = np.maximum(STRAIGHT, STRAIGHT_PX / np.maximum(np.minimum(height[:-1], height[1:]), 1.0))
-        line = float(np.median(end[judged])) if judged.any() else 1.0
+        line = float(np.median(end[tested])) if tested.any() else 1.0
         return np.asarray(clean & (np.abs(end - line) < within) & (abs(line - 1.0) < ENDS_WITHIN))

@@ -88,12 +88,12 @@ def _without_displaced(item: RefinedLattice) -> RefinedLattice:
     relative[known] = item.residual[known] / item.lattice.contrast[known]
     typical = upper_median(relative[known])
     suspect = relative > SUSPECT_FACTOR * typical
-    judges = known & ~suspect
-    if not suspect.any() or np.count_nonzero(judges) < MIN_PREDICTORS:
+    predictors = known & ~suspect
+    if not suspect.any() or np.count_nonzero(predictors) < MIN_PREDICTORS:
         return item
     pixels = item.lattice.without(suspect).pixels
-    predicted_fit = fit_cells(pixels, judges, leave_out=True)
-    expected = upper_median(np.hypot(*(predicted_fit.pixels - pixels[judges]).T) / predicted_fit.cell_px())
+    predicted_fit = fit_cells(pixels, predictors, leave_out=True)
+    expected = upper_median(np.hypot(*(predicted_fit.pixels - pixels[predictors]).T) / predicted_fit.cell_px())
     outlying, in_place = _tested(item, suspect, expected)
     # At the edge of a shadow whole rows are suspect: inliers among them serve to predict the rows beyond.
     while outlying.any() and in_place.any():
@@ -117,9 +117,9 @@ def _tested(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[
         shape = fit_cells(pixels, suspect, **how._asdict())
         off = np.hypot(*(shape.pixels - item.lattice.pixels[suspect]).T)
         good = expected * np.hypot(1.0, shape.gain) * shape.cell_px()
-        judged = shape.support >= MIN_PREDICTORS
-        outlying[suspect] &= judged & (off > OUTLIER_SIGMAS * np.maximum(good, item.sigma_px[suspect]))
-        in_place[suspect] |= judged & (off < OUTLIER_SIGMAS * good)
+        tested = shape.support >= MIN_PREDICTORS
+        outlying[suspect] &= tested & (off > OUTLIER_SIGMAS * np.maximum(good, item.sigma_px[suspect]))
+        in_place[suspect] |= tested & (off < OUTLIER_SIGMAS * good)
     return outlying, in_place
 
 

@@ -324,8 +324,8 @@ def _larger(grey: GreyImage, draft: _Draft, *, beside: bool, brief: bool) -> _Dr
         fit=joined(fit, rows_of(tried, near)),
         around=joined(draft.around, rows_of(around, near)),
     )
-    judged = _tested(grown)
-    return judged if len(judged.label) > len(draft.label) else None
+    tested = _tested(grown)
+    return tested if len(tested.label) > len(draft.label) else None
 
 
 def _tried(

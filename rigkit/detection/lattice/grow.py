@@ -108,19 +108,19 @@ def _grown(
 
     Large lattices are tested early; one that is not plausible may not be fully grown.
     """
-    rings, judged = MAX_RINGS, False
+    rings, tested = MAX_RINGS, False
     while rings > 0:
-        if not judged and lattice.count >= MANY:
+        if not tested and lattice.count >= MANY:
             if not plausible(lattice):
                 return lattice, False
-            judged = True
+            tested = True
         # The kernel changes these arrays until it reaches their border or adds no more (rings -1).
         wide = lattice.padded((ROOM, ROOM), (ROOM, ROOM))
         sheet = (wide.pixels, wide.contrast, 1.0 if wide.rising else -1.0)
         rings = grown(*sheet, level.smooth, level.scale, level.offset, saddles, _rules(), rings)
         if wide.count > lattice.count:
             lattice = wide.trimmed()
-    return lattice, judged or plausible(lattice)
+    return lattice, tested or plausible(lattice)
 
 
 @cache

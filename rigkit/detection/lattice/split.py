@@ -175,10 +175,10 @@ def _sharpest_turn(rows: int, uneven: SpacingChange) -> int | None:
     None."""
     least = max(MIN_TURNED_ROWS, 0.4 * rows)
     steps = enumerate(zip(uneven.typical, uneven.seen, strict=True), start=1)
-    judged = [(bend, -column) for column, (bend, count) in steps if count >= least]
-    if len(judged) < MIN_FOR_TYPICAL - 2:
+    measured = [(bend, -column) for column, (bend, count) in steps if count >= least]
+    if len(measured) < MIN_FOR_TYPICAL - 2:
         return None
-    *others, (sharpest, column) = sorted(judged)
+    *others, (sharpest, column) = sorted(measured)
     middle = 0.5 * (others[(len(others) - 1) // 2][0] + others[len(others) // 2][0])
     return -column if sharpest > max(MIN_TURN, TURN_FACTOR * middle) else None
 

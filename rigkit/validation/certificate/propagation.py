@@ -132,7 +132,10 @@ def gradients(
     seen = np.all([own.seen for own in each], axis=(0, 2))
     J, D = (
         np.where(seen[:, None, None, None], np.concatenate(part, axis=2), 0.0)
-        for part in ([own.by_point @ rig_from_first.rotation for own in each], [own.by_globals for own in each])
+        for part in (
+            [own.d_pixels_d_point @ rig_from_first.rotation for own in each],
+            [own.d_pixels_d_globals for own in each],
+        )
     )
     if len(cameras) > 1:
         normal = np.swapaxes(J, -1, -2) @ J

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.coverage import outline_of_corners
-from rigkit.calibration.judging.verdicts import diagnose_session, judge
+from rigkit.calibration.judging.verdicts import diagnose, diagnose_session
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_ties import suggest_rigid_boards
 from rigkit.calibration.rig.calibrate import calibrate_rig
@@ -309,7 +309,7 @@ def with_new_verdicts(calibration: Calibration, session: Session) -> Calibration
     Choices that the `session` leaves automatic are not proposed as remedies.
     """
     chosen = [name for name in ("model", "board_shape") if getattr(session, name) == "auto"]
-    return replace(calibration, verdicts=judge(calibration, in_force=chosen))
+    return replace(calibration, verdicts=diagnose(calibration, in_force=chosen))
 
 
 def rig_from(

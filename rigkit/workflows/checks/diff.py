@@ -29,19 +29,18 @@ class CameraPair:
     Attributes
     ----------
     difference : over the image of the first.
-    judged : the difference compared with both covariances; None where a file has no covariance, such as those of other
-        tools.
+    compared : the same with both covariances; None where a file has none, such as those of other tools.
     """
 
     difference: CameraDifference
-    judged: CalibrationComparison | None
+    compared: CalibrationComparison | None
 
     __repr__ = brief
 
     @property
     def same(self) -> bool | None:
         """Whether both are the same camera; None where that cannot be decided."""
-        return None if self.judged is None else self.judged.same
+        return None if self.compared is None else self.compared.same
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -139,8 +138,8 @@ def _cameras(a: Path, b: Path) -> CameraPair:
             "boards' distance only, and distant points are compared here",
             *((b, a) if first.pupil is None else (a, b)),
         )
-    judged = compare_calibrations(first, second)
-    return CameraPair(judged.difference, judged)
+    compared = compare_calibrations(first, second)
+    return CameraPair(compared.difference, compared)
 
 
 def _rigs(a: Path, b: Path) -> RigPair:

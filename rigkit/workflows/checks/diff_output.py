@@ -110,16 +110,16 @@ def _chance(value: float | None) -> str:
 
 def _camera_figures(pair: CameraPair) -> dict[str, Any]:
     """Return the figures for machine-readable output; `same` is None where a file has no covariance."""
-    judged, difference = pair.judged, pair.difference
+    compared, difference = pair.compared, pair.difference
     of_both = {
-        "predicted_px": judged and judged.predicted_px,
-        "usual_px": judged and list(judged.interval_px),
-        "ratio": judged and judged.ratio,
-        "chance": judged and judged.chance,
-        "verdict": judged and str(judged.verdict),
+        "predicted_px": compared and compared.predicted_px,
+        "usual_px": compared and list(compared.interval_px),
+        "ratio": compared and compared.ratio,
+        "chance": compared and compared.chance,
+        "verdict": compared and str(compared.verdict),
     }
     own = {name: getattr(difference, name) for name in ("rms_px", "max_px", "rotation_deg", "coverage")}
-    return own | of_both | {"same": pair.same, "same_model": judged and judged.same_model}
+    return own | of_both | {"same": pair.same, "same_model": compared and compared.same_model}
 
 
 def _camera_in_words(figures: dict[str, Any]) -> str:

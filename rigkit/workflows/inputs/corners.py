@@ -254,7 +254,7 @@ def first_calibration(session: Session, found: Mapping[str, FoundCorners]) -> Ca
         views, size_px, _ = session_views(session, corners)
         # Scaramuzza's model fits any lens roughly; where it fits badly, another may fit better.
         model = "scaramuzza" if session.model == "auto" else session.model
-        request = Request(size_px=size_px, model=model, degree=session.degree, board="flat", folds=0, judged=False)
+        request = Request(size_px=size_px, model=model, degree=session.degree, board="flat", folds=0, diagnosed=False)
         (first,) = calibrate_together([("", views, request)])
         if session.model == "auto" and first.sigma_px > LOOSE * median(s for v in views for s in v.sigma_px.tolist()):
             (first,) = calibrate_together([("", views, replace(request, model="auto", degree=None))])

@@ -156,8 +156,8 @@ def _tables(reports: Sequence[ValidationReport], printed: PaperTables, images: s
 def paper_page(name: str, images: str | None, tables: Sequence[Table], provenance: Mapping[str, str]) -> str:
     """Return the page of a data set; `images` is "real", "rendered", or None if undeclared."""
     claims = next(table for table in tables if table.key == "claims")
-    judged = [row[1] for row in claims.rows if row[1].value != NOTHING_TO_COMPARE]
-    held = sum(not cell.failed for cell in judged)
+    tested = [row[1] for row in claims.rows if row[1].value != NOTHING_TO_COMPARE]
+    held = sum(not cell.failed for cell in tested)
     sentences = (
         "The paper's own pipeline: chords to neighbouring corners, equal weights, its linear solvers with the formulas "
         "corrected, no refinement, planes by principal components.",
@@ -165,7 +165,7 @@ def paper_page(name: str, images: str | None, tables: Sequence[Table], provenanc
         f"What the paper claims passes or fails no check of ours, and {NOT_CHECKED}.",
     )
     facts = PageFacts(
-        headline=f"{held} of {len(judged)} statements of the paper that this data set can test are confirmed",
+        headline=f"{held} of {len(tested)} statements of the paper that this data set can test are confirmed",
         sentences=sentences,
         tables=(claims, *(table for table in tables if table.key != "claims")),
     )

@@ -171,8 +171,8 @@ def _validated(
         for method, r in reconstructions.items()
     }
     shown = reconstructions[best.affine_method]
-    if fitted.judge is not None:
-        files[f"{pair.pair_id}/{fitted.planes}.ply"] = ply_bytes(on_planes(shown, fitted.judge).cloud)
+    if fitted.constrained is not None:
+        files[f"{pair.pair_id}/{fitted.planes}.ply"] = ply_bytes(on_planes(shown, fitted.constrained).cloud)
     compared = None
     if job.options.crosscheck:
         other = reconstruct_other_chain(matched, pair)

@@ -120,7 +120,7 @@ def _validate_one(named: tuple[str, Path], *, options: ValidateOptions) -> SetOu
     except RigkitError as error:
         return SetOutcome(name=name, code=error.exit_code, error=str(error))
     best = [pair.best for pair in done.pairs]
-    judged = [*(report.checks for report in best), *(other.checks for other in done.crosschecks)]
+    checked = [*(report.checks for report in best), *(other.checks for other in done.crosschecks)]
     angles = [a.error_deg for report in best for a in report.angles if a.error_deg is not None]
     baselines = [c.k for report in best for c in report.checks if c.kind == "baseline"]
     why = [*map(str, done.failures), *(cause.text for cause in done.causes)]
@@ -131,7 +131,7 @@ def _validate_one(named: tuple[str, Path], *, options: ValidateOptions) -> SetOu
         code=ExitCode.WELL if done.passed else failed,
         error="".join([*why[:1], more]),
         pairs=len(done.pairs),
-        checks_failed=sum(not c.passed for checks in judged for c in checks),
+        checks_failed=sum(not c.passed for checks in checked for c in checks),
         worst_angle_deg=max(angles, default=None),
         mean_normal_deg=mean_normal_error(best),
         worst_baseline_sigmas=max(map(float, np.abs(baselines)), default=None),

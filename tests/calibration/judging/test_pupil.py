@@ -14,7 +14,7 @@ from rigkit.calibration.certainty.uncertainty import FarProjection, projection_u
 from rigkit.calibration.compare import compare_calibrations
 from rigkit.calibration.judging.changing import changing
 from rigkit.calibration.judging.pupil import BY_CHANCE, MovingPupil, pupil_is_significant, solved_again
-from rigkit.calibration.judging.verdicts import judge
+from rigkit.calibration.judging.verdicts import diagnose
 from rigkit.calibration.judging.view_evidence import neighbour_correlation, view_evidence
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
@@ -86,7 +86,7 @@ def test_a_pupil_that_moves_is_found_and_what_it_does_far_away(shape: str) -> No
     found = session(NEAR, MM_PER_RAD2, 0, shape)
     assert found.verdicts[0].message.startswith("training RMS") and MESSAGE in found.verdicts[0].message
     # The images all say the same: that something differs between them would be another cause.
-    printed = judge(found, in_force=("model", "board_shape"))
+    printed = diagnose(found, in_force=("model", "board_shape"))
     assert not any("something changes between images" in one.message for one in printed)
     pupil, true = pupil_of(found), off_far_away(found)
     assert 0.4 * MM_PER_RAD2 < pupil.mm_per_rad2 < 1.1 * MM_PER_RAD2

@@ -13,7 +13,7 @@ from helpers.session_scenes import NOISE_PX, poses, seen
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging.changing import CHANGES, MIN_NEIGHBOUR_CORRELATION, changing
-from rigkit.calibration.judging.verdicts import judge
+from rigkit.calibration.judging.verdicts import diagnose
 from rigkit.calibration.judging.view_evidence import neighbour_correlation, view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
@@ -308,7 +308,7 @@ def test_images_that_contradict_each_other_come_before_what_that_does_to_the_len
         bent = view.pixels + 1.5 * np.sin(view.pixels / 120.0 + rng.uniform(0.0, 6.0, 2))
         views.append(replace(view, pixels=np.clip(bent, -0.5, np.array(SIZE) - 0.5)))
     result = calibrate(views, SIZE, model="brown", board="flat")
-    headline, *others = judge(result, in_force=("model", "board_shape"))
+    headline, *others = diagnose(result, in_force=("model", "board_shape"))
     assert headline.severity is Severity.BAD
     assert "so something changes between images" in headline.message
     assert any("the projection uncertainty" in finding.message for finding in others)

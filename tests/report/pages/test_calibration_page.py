@@ -14,7 +14,7 @@ from helpers.calibration_scenes import BOARD, lens, random_views, with_outliers
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.departures import Departures
 from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty
-from rigkit.calibration.judging.verdicts import judge
+from rigkit.calibration.judging.verdicts import diagnose
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.with_pupil import CENTRAL, MOVING, kept_central
 from rigkit.cameras.eucm import EUCM
@@ -221,7 +221,7 @@ def test_the_headline_and_the_finding_have_one_figure(calibration: Calibration) 
     unsure = replace(
         calibration, covariance=25.0 * calibration.covariance / FarProjection.of(calibration).worst_px ** 2
     )
-    judged = replace(unsure, verdicts=judge(unsure))
+    judged = replace(unsure, verdicts=diagnose(unsure))
     text = page(judged)
     headline = re.search(r"where boards were seen \(at worst ±([\d.]+) px", text)
     finding = re.search(r"uncertainty reaches ([\d.]+) px \(one standard deviation\) where boards were seen", text)

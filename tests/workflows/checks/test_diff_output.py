@@ -19,8 +19,8 @@ def test_another_camera_that_differs_by_no_more_than_usual(typical_times: tuple[
     camera = lens("reg")
     difference = compare_cameras(camera, camera.with_parameters(camera.parameters * [1.002, 1.0, *[1.0] * 7]))
     low, high = (times * difference.rms_px for times in typical_times)
-    judged = CalibrationComparison(difference, 0.5 * (low + high), (low, high), 0.001, True)
-    words = words_of(CameraPair(difference, judged))[-1]
+    compared = CalibrationComparison(difference, 0.5 * (low + high), (low, high), 0.001, True)
+    words = words_of(CameraPair(difference, compared))[-1]
     assert "another camera or a moved lens" in words
     assert ("but where both are more certain (p = 0.001)" in words) == surer
 

@@ -67,10 +67,10 @@ def transfer_covariance(rig: RigCalibration, a: str, b: str, points: Points) -> 
         RigProjection.of(cameras[k], mount, in_rig, layout, k) for k, mount in zip((i, j), mounts, strict=True)
     )
     # The third row keeps the given distance.
-    system = np.concatenate([first.by_point, rays[:, None] @ mounts[0].rotation], axis=1)
-    held = np.concatenate([-first.by_globals, np.zeros((len(points), 1, layout.count))], axis=1)
+    system = np.concatenate([first.d_pixels_d_point, rays[:, None] @ mounts[0].rotation], axis=1)
+    held = np.concatenate([-first.d_pixels_d_globals, np.zeros((len(points), 1, layout.count))], axis=1)
     if (mount := layout.mounts[i]) is not None:
         lever = points - mounts[0].translation_mm
         held[:, 2, mount] = -np.concatenate([np.cross(lever, rays), rays], axis=-1)
-    design = second.by_globals + second.by_point @ np.linalg.solve(system, held)
+    design = second.d_pixels_d_globals + second.d_pixels_d_point @ np.linalg.solve(system, held)
     return design @ known @ np.swapaxes(design, -1, -2), first.valid & second.seen

@@ -109,9 +109,10 @@ def _readout_displacements(
     derivatives by the pose of the view (V, C, 2, 6), and residuals (V, C, 2); zero for corners that are not used."""
     own, alone = observations.cameras[c], state.of_camera(c, observations)
     points, lever = alone.points_in_cam(own)
-    pixels, valid, by_point, _ = alone.camera.project_with_jacobians(points)
+    pixels, valid, d_pixels_d_point, _ = alone.camera.project_with_jacobians(points)
     used = (valid & (observations.weights[c] > 0.0))[..., None]
-    by_pose = np.where(used[..., None], np.concatenate([by_point @ -skew(lever), by_point], axis=-1), 0.0)
+    by_pose = np.concatenate([d_pixels_d_point @ -skew(lever), d_pixels_d_point], axis=-1)
+    by_pose = np.where(used[..., None], by_pose, 0.0)
     speed = np.einsum("vcij,vj->vci", by_pose, board_velocities(observations, state, c, alone.translation_mm))
     height = alone.camera.size_px[1]
     below = (own.pixels[..., 1:] - 0.5 * (height - 1.0)) / height
