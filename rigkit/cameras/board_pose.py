@@ -11,7 +11,7 @@ from rigkit.geometry.board_pose import board_pose, moved_board_poses
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
-MAX_PUPIL_ROUNDS, SETTLED_PX = 30, 1e-6
+MAX_PUPIL_ROUNDS, SETTLED_PUPIL_PX = 30, 1e-6
 """Each round multiplies the error by the pupil's movement over the board's distance."""
 
 
@@ -46,7 +46,7 @@ def _settled(camera: NearCamera, pixels: Pixels, points_mm: Points) -> tuple[Pix
         # Refined from the last pose: estimating it from scratch in each round takes 1.8 times as long.
         rays, valid = camera.lens.unproject(out)
         pose = moved_board_poses(rays[valid][None], points_mm[valid], pose)[0].cam_from_board
-        if change <= SETTLED_PX:
+        if change <= SETTLED_PUPIL_PX:
             break
     return out, pose
 

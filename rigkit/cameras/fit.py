@@ -14,7 +14,7 @@ from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, damped_step, minimise
 
 FIT_DAMPING = Damping(start=1e-6, ceiling=1e6)
-HALVINGS = 8
+STEP_HALVINGS = 8
 """Maximal number of halvings of a step that leads to invalid parameters."""
 
 C = TypeVar("C", bound=Camera)
@@ -64,7 +64,7 @@ def nearest_camera(
 
     def moved(camera: C, step: DenseStep) -> C | None:
         change = free @ step.change
-        for _ in range(HALVINGS):
+        for _ in range(STEP_HALVINGS):
             try:
                 return camera.with_parameters(camera.parameters + change)
             except InputError:

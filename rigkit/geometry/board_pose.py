@@ -17,11 +17,11 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
 from rigkit.kernels import board_pose as kernel
 
-MIN_SPREAD = 1e-6
+MIN_EXTENT_RATIO = 1e-6
 """Second principal extent over the first, below which points are collinear."""
 MIN_HOMOGRAPHY_GAP = 1e-9
 """Second smallest singular value over the largest, below which the homography is not unique."""
-MAX_BOW = 0.05
+MAX_TARGET_BOW = 0.05
 """Third principal extent over the first, above which a target is not flat enough for a homography to start from. The
 bow of a paper board on cardboard is below 0.01; it is in the refinement."""
 POSE_STEP_TOLERANCE = 1e-12
@@ -176,9 +176,9 @@ def _flatten(points: Points) -> tuple[Rigid3, FloatArray]:
     """Return plane_from_target and the points (N, 3) in a frame centred on them with z = 0."""
     centre = points.mean(axis=0)
     _, extent, axes = np.linalg.svd(points - centre, full_matrices=False)
-    if extent[1] < MIN_SPREAD * extent[0] or extent[0] == 0.0:
+    if extent[1] < MIN_EXTENT_RATIO * extent[0] or extent[0] == 0.0:
         raise DegenerateError("board pose: the corners lie on one line; corners of at least two rows are needed")
-    if extent[2] > MAX_BOW * extent[0]:
+    if extent[2] > MAX_TARGET_BOW * extent[0]:
         raise InputError("board pose: the points do not lie in a plane; a flat target is needed")
     rotation = np.stack([axes[0], axes[1], np.cross(axes[0], axes[1])])
     flat = (points - centre) @ rotation.T

@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 COLMAP_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"), Accepted("eucm"))
 MAX_COLMAP_DIGITS = 9
-CORE = ("fx", "fy", "cx", "cy")
+SHARED = ("fx", "fy", "cx", "cy")
 BEHIND = "COLMAP projects no point at or beyond 90 degrees"
 
 # COLMAP's model -> rigkit's model, and the names of its parameters there; f is used as fx and fy.
@@ -58,7 +58,7 @@ FURTHER = {
 OWN = {"pinhole": "PINHOLE", "brown": "OPENCV", "kannala_brandt": "OPENCV_FISHEYE", "eucm": "EUCM"}
 """rigkit's model -> COLMAP's; FULL_OPENCV for more than four terms of a Brown camera."""
 
-COUNT, HEAD = struct.Struct("<Q"), struct.Struct("<iiQQ")
+COUNT_RECORD, CAMERA_RECORD = struct.Struct("<Q"), struct.Struct("<iiQQ")
 MODELS_BY_ID = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
     "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION",
@@ -129,14 +129,14 @@ def colmap_cameras_text(data: bytes) -> str | None:
     The file has a count, then for each camera id and model (int32), width and height (uint64) and the parameters, all
     little-endian. No text passes these checks.
     """
-    lines, at = [], COUNT.size
-    if len(data) < at or not 0 < COUNT.unpack_from(data)[0] <= len(data) // HEAD.size:
+    lines, at = [], COUNT_RECORD.size
+    if len(data) < at or not 0 < COUNT_RECORD.unpack_from(data)[0] <= len(data) // CAMERA_RECORD.size:
         return None
-    for _ in range(COUNT.unpack_from(data)[0]):
-        if len(data) < at + HEAD.size:
+    for _ in range(COUNT_RECORD.unpack_from(data)[0]):
+        if len(data) < at + CAMERA_RECORD.size:
             return None
-        camera_id, model, width, height = HEAD.unpack_from(data, at)
-        at += HEAD.size
+        camera_id, model, width, height = CAMERA_RECORD.unpack_from(data, at)
+        at += CAMERA_RECORD.size
         if not 0 <= model < len(MODELS_BY_ID):
             return None
         name = MODELS_BY_ID[model]
@@ -168,7 +168,7 @@ def _camera(kind: str, size_px: tuple[int, int], theirs: dict[str, float], name:
     if kind in LAYOUTS:
         model = LAYOUTS[kind][0]
         return camera_of(model, size_px, _parameters(model, theirs), name)
-    fx, fy, cx, cy, *rest = (theirs[key] for key in (*CORE, *(k for k in FURTHER[kind] if k not in (*CORE, "f"))))
+    fx, fy, cx, cy, *rest = (theirs[key] for key in (*SHARED, *(k for k in FURTHER[kind] if k not in (*SHARED, "f"))))
     core, terms = numbers([fx, fy, cx, cy], name, "params"), numbers(rest, name, "params")
     if not (core[:2] > 0.0).all():
         raise InputError(f"'{name}': focal lengths are positive; correct the line")

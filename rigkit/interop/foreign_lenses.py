@@ -7,7 +7,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Rays
 from rigkit.interop.nearest import Lens
 
-NEAR_AXIS = 1e-9
+AXIS_TANGENT = 1e-9
 """Tangent or angle below which a ray counts as the axis."""
 
 
@@ -22,7 +22,7 @@ def fov_lens(core: FloatArray, w: float) -> Lens:
         radius = np.linalg.norm(place, axis=-1, keepdims=True)
         scale = 2.0 * np.tan(0.5 * w) / w
         with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = np.where(radius > NEAR_AXIS, np.arctan(2.0 * radius * np.tan(0.5 * w)) / (w * radius), scale)
+            ratio = np.where(radius > AXIS_TANGENT, np.arctan(2.0 * radius * np.tan(0.5 * w)) / (w * radius), scale)
         return _pixels(core, ratio * place), seen
 
     return project
@@ -35,7 +35,7 @@ def unified_brown_lens(core: FloatArray, xi: float, d: FloatArray) -> Lens:
     def project(rays: Rays) -> tuple[Pixels, BoolArray]:
         depth = rays[:, 2:] + xi
         # For xi > 1 only the near side of the sphere is visible.
-        seen = depth[:, 0] > max(NEAR_AXIS, xi - 1.0 / xi if xi > 1.0 else 0.0)
+        seen = depth[:, 0] > max(AXIS_TANGENT, xi - 1.0 / xi if xi > 1.0 else 0.0)
         place = rays[:, :2] / np.where(seen[:, None], depth, 1.0)
         return _pixels(core, _brown(place, d)), seen
 
@@ -95,19 +95,19 @@ def cahvor_lens(core: FloatArray, angles: FloatArray, r: FloatArray) -> Lens:
 
     def project(rays: Rays) -> tuple[Pixels, BoolArray]:
         along = rays @ axis
-        seen = along > NEAR_AXIS
+        seen = along > AXIS_TANGENT
         along = np.where(seen, along, 1.0)
         tau = 1.0 / along**2 - 1.0
         mu = np.polynomial.polynomial.polyval(tau, r)
         moved = rays + mu[:, None] * (rays - along[:, None] * axis)
-        seen &= moved[:, 2] > NEAR_AXIS
+        seen &= moved[:, 2] > AXIS_TANGENT
         return _pixels(core, moved[:, :2] / np.where(seen, moved[:, 2], 1.0)[:, None]), seen
 
     return project
 
 
 def _perspective(rays: Rays) -> tuple[FloatArray, BoolArray]:
-    seen = rays[:, 2] > NEAR_AXIS
+    seen = rays[:, 2] > AXIS_TANGENT
     return rays[:, :2] / np.where(seen, rays[:, 2], 1.0)[:, None], seen
 
 
@@ -115,7 +115,7 @@ def _equidistant(rays: Rays) -> tuple[FloatArray, BoolArray]:
     """Return theta (x, y) / r of all rays; only COLMAP itself excludes angles of 90 degrees and more."""
     r = np.hypot(rays[:, 0], rays[:, 1])
     theta = np.arctan2(r, rays[:, 2])
-    ratio = np.where(r > NEAR_AXIS, theta / np.where(r > NEAR_AXIS, r, 1.0), 1.0)
+    ratio = np.where(r > AXIS_TANGENT, theta / np.where(r > AXIS_TANGENT, r, 1.0), 1.0)
     return rays[:, :2] * ratio[:, None], np.ones(len(rays), dtype=bool)
 
 

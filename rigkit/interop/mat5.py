@@ -17,7 +17,7 @@ from rigkit.core.errors import InputError
 
 HEADER_BYTES = 128
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-MATRIX, COMPRESSED = 14, 15
+MATRIX_TYPE, COMPRESSED = 14, 15
 CELL, STRUCT, OBJECT, NUMERIC, OPAQUE = 1, 2, 3, range(6, 16), 17
 MAX_NUMBERS = 100
 """Size of an array: those of cameras are smaller; corners and covariances are skipped."""
@@ -57,8 +57,10 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
 def _variable(kind: int, body: bytes, order: str) -> list[str]:
     if kind == COMPRESSED:
         inflated = zlib.decompressobj().decompress(body, MAX_INFLATED)
-        return [line for k, inner in _elements(inflated, order) if k == MATRIX for line in _matrix(inner, order, "", 0)]
-    return _matrix(body, order, "", 0) if kind == MATRIX else []
+        return [
+            line for k, inner in _elements(inflated, order) if k == MATRIX_TYPE for line in _matrix(inner, order, "", 0)
+        ]
+    return _matrix(body, order, "", 0) if kind == MATRIX_TYPE else []
 
 
 def _matrix(body: bytes, order: str, of: str, depth: int) -> list[str]:

@@ -30,7 +30,7 @@ EXACT_PX = 0.01
 """A camera with a smaller error is accepted at once: corners are no more accurate."""
 MIN_SEEN = 0.99
 """Fraction of the lens's rays that a camera must see."""
-DIRECTIONS, ANGLES = 144, 120
+AZIMUTHS, ANGLES = 144, 120
 """Rays at which a camera is fitted: number of azimuths and of angles from the axis."""
 CHECKED = (251, 211)
 """Other rays, at which its error is measured."""
@@ -49,7 +49,7 @@ def nearest_camera_of(
     `reach_rad` is an upper bound of the lens's angles. Raises InputError, with the file `name`, for a lens that sees
     almost nothing, and if no model has an error below `worst_px`.
     """
-    rays, pixels = rays_of_image(lens, size_px, reach_rad, (DIRECTIONS, ANGLES))
+    rays, pixels = rays_of_image(lens, size_px, reach_rad, (AZIMUTHS, ANGLES))
     if len(rays) < MIN_RAYS:
         raise InputError(f"'{name}': the lens has hardly any valid rays in the image; is the file complete?")
     checked_rays, checked = rays_of_image(lens, size_px, reach_rad, CHECKED)

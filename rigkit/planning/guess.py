@@ -10,7 +10,7 @@ from rigkit.core.errors import InputError
 
 PERSPECTIVE_DEG = 100.0
 """Lenses with a smaller horizontal field of view are mostly rectilinear; wider ones are fisheyes."""
-SAMPLES = 64
+CURVE_RADII = 64
 CURVE_END = 1.05
 """End of the radial curve, relative to the corner of the image."""
 MAX_THETA_RAD = 3.0
@@ -34,11 +34,11 @@ def guessed_camera(hfov_deg: float, size_px: tuple[int, int], model: str | None 
     corner_px = CURVE_END * 0.5 * float(np.hypot(*size_px))
     if straight:
         focal = half_px / np.tan(half_rad)
-        theta = np.linspace(0.0, np.arctan(corner_px / focal), SAMPLES)
+        theta = np.linspace(0.0, np.arctan(corner_px / focal), CURVE_RADII)
         radius = focal * np.tan(theta)
     else:
         focal = half_px / half_rad
-        theta = np.linspace(0.0, min(corner_px / focal, MAX_THETA_RAD), SAMPLES)
+        theta = np.linspace(0.0, min(corner_px / focal, MAX_THETA_RAD), CURVE_RADII)
         radius = focal * theta
     kind = camera_model(model or ("brown" if straight else "kannala_brandt"))
     return kind.from_radial_curve(size_px, RadialCurve(image_center(size_px), theta, radius))

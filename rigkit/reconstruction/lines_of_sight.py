@@ -18,7 +18,7 @@ STEEP = 3.0
 """Least d log(distance) / d angle of a depth edge: a surface there would be seen at 18 degrees or less."""
 OPEN_RISE = 0.5
 """Least share of the rise that neither point's plane explains: else both are on one slanted surface."""
-MAX_STEPS = 5.0
+MAX_STEP_RATIO = 5.0
 """Largest angle between neighbours, over their median angle: beyond, the place of the edge is unknown."""
 SPACING = 2.0
 """Spacing of added points, over the distance between neighbours on the near surface."""
@@ -79,7 +79,7 @@ def _edges_of_depth(points: Points, normals: Normals) -> tuple[IntArray, IntArra
     far = a + b - near
     angle = angle_between(rays[near], rays[far])
     rise = np.log(distance[far] / distance[near])
-    edge = (rise > STEEP * angle) & (angle < MAX_STEPS * np.median(angle))
+    edge = (rise > STEEP * angle) & (angle < MAX_STEP_RATIO * np.median(angle))
     for one, other in ((near, far), (far, near)):
         edge &= _distance_to_plane(points[one], normals[one], rays[other], distance[other]) > OPEN_RISE * rise
     return near[edge], far[edge]

@@ -20,7 +20,7 @@ from rigkit.optim.robust_scale import MEDIAN_OF_CHI_SQUARE_3
 MIN_CORNERS_FOR_SCALE = 4
 OUTLIER_SQUARE = 14.2
 """Squared Mahalanobis distance (three components) from which a corner is downweighted: one in 400 Gaussian ones."""
-ITERATIONS = 15
+SCALE_ITERATIONS = 15
 
 
 def metric_scale(
@@ -115,7 +115,7 @@ def _similarity_scale(
         whiten = np.linalg.inv(np.linalg.cholesky(covariances + floor))
     noise, gram = 1.0, np.eye(7)
     # The weights, and so the cost, change at every step; `rigkit.optim` needs a fixed cost.
-    for iteration in range(ITERATIONS):
+    for iteration in range(SCALE_ITERATIONS):
         turned = centred @ R.T
         residual = np.einsum("nij,nj->ni", whiten, points - k * turned - c)
         square = np.sum(residual**2, axis=1)

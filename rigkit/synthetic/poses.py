@@ -24,7 +24,7 @@ ROLL_DEG = 30.0
 AIM_JITTER_DEG = 8.0
 MARGIN_SQUARES = 0.5
 """White margin around the squares of a board."""
-DRAWS = 4000
+CANDIDATES_A_DRAW = 4000
 """Candidates of each draw of rejection sampling."""
 MAX_DRAWS = 200
 
@@ -177,9 +177,9 @@ def _corner_boards(board: Board) -> tuple[Points, Normals]:
 
 def _octant_eyes(corners: Points, facing: Normals, board: Board, rng: np.random.Generator) -> Points:
     """Return random camera centres (M, 3) in the room with sufficient incidence at every corner."""
-    direction = unit(-np.abs(rng.standard_normal((DRAWS, 3))))
-    eyes = direction * rng.uniform(*CAMERA_RANGE_MM, (DRAWS, 1))
-    good = np.ones(DRAWS, dtype=bool)
+    direction = unit(-np.abs(rng.standard_normal((CANDIDATES_A_DRAW, 3))))
+    eyes = direction * rng.uniform(*CAMERA_RANGE_MM, (CANDIDATES_A_DRAW, 1))
+    good = np.ones(CANDIDATES_A_DRAW, dtype=bool)
     outer = np.array([0, board.columns - 1, board.corner_count - board.columns, board.corner_count - 1])
     for k, normal in enumerate(facing):
         # |cosine| = height / distance is smallest at the farthest point, one of the four outer corners.

@@ -21,7 +21,7 @@ from rigkit.geometry.rotation import angle_between
 from rigkit.interop.open3d import mean_and_covariance, plane_inliers
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
-MIN_POINTS = 4
+MIN_PLANE_POINTS = 4
 """Three points are always in a plane and do not determine its flatness."""
 MIN_WIDTH = 1e-3
 """Least ratio of the second to the first principal extent; below, the points are on a line."""
@@ -138,7 +138,7 @@ def fit_plane(
         return _plane(points[used], np.full(int(used.sum()), 1.0 / max(used.sum(), 1)), None, used)
     covariance = np.asarray(covariance_mm2, dtype=np.float64)
     gross = 0
-    if used.sum() > 2 * MIN_POINTS:
+    if used.sum() > 2 * MIN_PLANE_POINTS:
         near, telling = _inliers_and_certain(points[used], covariance[used], common[:, used])
         gross = int((~near).sum())
         used[used] = near & telling
@@ -162,8 +162,8 @@ def _principal(points: Points, weights: FloatArray | None = None) -> tuple[Float
     `weights` (N,) sum to one; without them weights are equal, and the points must be one set (N, 3).
     """
     n = points.shape[-2]
-    if n < MIN_POINTS:
-        raise DegenerateError(f"plane: {n} points; at least {MIN_POINTS} are needed to fit one and judge it")
+    if n < MIN_PLANE_POINTS:
+        raise DegenerateError(f"plane: {n} points; at least {MIN_PLANE_POINTS} are needed to fit one and judge it")
     if weights is None:
         centroid, scatter = mean_and_covariance(points)
     else:

@@ -287,14 +287,24 @@ def test_a_class_name_means_one_thing() -> None:
     assert not several, several
 
 
+def assigned(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """Yield (name, value as written) of what a module assigns, also several at once: A, B = 1, 2."""
+    for node in tree.body:
+        if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                pairs = [(target, node.value)]
+                if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                    pairs = list(zip(target.elts, node.value.elts, strict=True))
+                yield from ((name.id, ast.unparse(value)) for name, value in pairs if isinstance(name, ast.Name))
+
+
 def test_a_constant_has_one_value() -> None:
+    assert dict(assigned(ast.parse("A, B = 1, 2\nC: int = 3"))) == {"A": "1", "B": "2", "C": "3"}
     values: dict[str, dict[str, str]] = {}
     for path in MODULES:
-        for node in tree_of(path).body:
-            if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
-                for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
-                    if isinstance(target, ast.Name) and target.id.isupper() and not target.id.startswith("_"):
-                        values.setdefault(target.id, {})[place_of(path, target.id)] = ast.unparse(node.value)
+        for name, value in assigned(tree_of(path)):
+            if name.isupper() and not name.startswith("_"):
+                values.setdefault(name, {})[place_of(path, name)] = value
     several = {n: known for n, known in values.items() if len(set(known.values())) > 1}
     assert not several, several
 

@@ -54,9 +54,9 @@ SIZES_TRIED = np.geomspace(SMALLEST_PX, LARGEST_PX, 17)[1::2]
 """Values of tau for the integration: the midpoints of eight equal intervals of its logarithm."""
 ENOUGH_CORNERS, CORNERS_OF_VIEW = 4096, 16
 """Every second (third ...) corner is used if so many are left in all, and in each view."""
-RIDGE = 1e-12
+INFORMATION_RIDGE = 1e-12
 """Added to the information of the parameters, as a part of its mean: unused parameters absorb nothing."""
-NOISE_ROUNDS, SETTLED = 12, 1e-3
+NOISE_ROUNDS, SETTLED_NOISE = 12, 1e-3
 """Rounds of amounts and noise, and the relative change of the noise at which they end. SIMULATED (departures of 0 to 1
 px, 12 images, 2026-11-30): 2 to 7 rounds, with the same result from a noise several times too large or too small."""
 
@@ -106,7 +106,7 @@ class Departures:
         for _ in range(NOISE_ROUNDS):
             last, share = share, np.minimum(mean_products.without(second, mean) / before, 1.0)
             second, mean = _averaged(left / (share[1] * before[1]))
-            if abs(share[1] - last[1]) <= SETTLED * last[1]:
+            if abs(share[1] - last[1]) <= SETTLED_NOISE * last[1]:
                 break
         moved = sigmas[:, None] * changes[:, :-1]
         own = calibration.camera.parameters.size
@@ -246,7 +246,7 @@ def _without_parameters(
     """Return the regression (p, K - p) of the other rows on the first p of `products` (K, K), the parameters, the
     products (K - p, K - p) of the others without those, and the variance of the residuals, the last row, between
     images."""
-    of_parameters = products[:p, :p] + RIDGE * max(np.trace(products[:p, :p]), 1.0) / p * np.eye(p)
+    of_parameters = products[:p, :p] + INFORMATION_RIDGE * max(np.trace(products[:p, :p]), 1.0) / p * np.eye(p)
     changes = np.linalg.solve(of_parameters, products[:p, p:])
     left = products[p:, p:] - products[p:, :p] @ changes
     variance = max(float(left[-1, -1]) / max(freedom - p, 1), SMALLEST_PX**2) * calibration.overdispersion**2

@@ -42,8 +42,8 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.findings import Finding
 from rigkit.kernels.departures import displacements
 
-BOWS = CHANGE_COLUMNS["bend"]
-BY_CHANCE = 1e-3
+BOW_COLUMNS = CHANGE_COLUMNS["bend"]
+PUPIL_SIGNIFICANCE = 1e-3
 """Significance level of the finding."""
 MIN_IMAGES = 3
 """Two images have no scatter besides what they have in common."""
@@ -122,7 +122,7 @@ class MovingPupil:
         # Images of high leverage count for several.
         freedom = max(1.0 / float((share**2).sum()) - 1.0, 1.0)
         # The calibration itself could adapt its parameters and board shapes, but no displacements.
-        alone = _regression(gram, np.append(common[:p], common[-BOWS:]), pupil)[:p] * scale[pupil] / scale[:p]
+        alone = _regression(gram, np.append(common[:p], common[-BOW_COLUMNS:]), pupil)[:p] * scale[pupil] / scale[:p]
         square = max(float(gram[-1, -1] - fitted @ gram[:-1, -1]), 0.0) * scale[-1] ** 2
         left_px = float(np.sqrt(square / max(residuals - len(fitted), 1)))
         return cls(amount, float(np.sqrt(variance)), freedom, -amount * alone, left_px)
@@ -174,9 +174,9 @@ def pupil_is_significant(calibration: Calibration, central: Calibration) -> bool
     it. Both are linearised with any displacement of a central lens free, and the one that is nearer to the joint
     minimum leaves less: a pupil solved for instead of a displacement has moved lens and boards far away from it."""
     again, before = solved_again(calibration), MovingPupil.of(central)
-    if again is None or (before is not None and before.left_px < again.left_px and before.chance > BY_CHANCE):
+    if again is None or (before is not None and before.left_px < again.left_px and before.chance > PUPIL_SIGNIFICANCE):
         return False
-    return again.chance <= BY_CHANCE
+    return again.chance <= PUPIL_SIGNIFICANCE
 
 
 def _products(calibration: Calibration) -> tuple[FloatArray, IntArray, int, int] | None:
@@ -222,7 +222,7 @@ def moving_pupil(calibration: Calibration, correlation: float, far: FarProjectio
     `neighbour_correlation` of the residuals."""
     asked = calibration.pupil is None and correlation > MIN_NEIGHBOUR_CORRELATION
     pupil = MovingPupil.of(calibration) if asked else None
-    if pupil is None or pupil.chance > BY_CHANCE:
+    if pupil is None or pupil.chance > PUPIL_SIGNIFICANCE:
         return
     off = pupil.far_px(far)
     if off <= max(far.typical_px, SMALL_PX):

@@ -13,7 +13,7 @@ from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 OUTLIER_SIGMAS = 5.0
 """A corner is an outlier when its weighted 2-D residual exceeds this many robust standard deviations per coordinate,
 sigma = median |r| / 1.177: 4 in a million do by chance."""
-MAX_RINGS, RING_CORNERS = 8, 50
+MAX_SCATTER_RINGS, RING_CORNERS = 8, 50
 """The scatter increases towards the rim of the image, where squares are small and blurred. So it is estimated in up to
 8 rings about the image centre with equally many corners, at least 50 each."""
 RING_FACTOR = 4.0
@@ -49,7 +49,7 @@ def inliers(
     middle = image_center(size_px)
     order = np.argsort(((observations.pixels[present] - middle) ** 2).sum(axis=-1))
     limit = np.empty(len(own))
-    for ring in np.array_split(order, min(max(len(own) // RING_CORNERS, 1), MAX_RINGS)):
+    for ring in np.array_split(order, min(max(len(own) // RING_CORNERS, 1), MAX_SCATTER_RINGS)):
         scatter = sigma_of(own, ring)
         limit[ring] = OUTLIER_SIGMAS * min(max(scatter, sigma_px), RING_FACTOR * sigma_px)
     kept[present] = own <= limit

@@ -28,7 +28,7 @@ TRACE_SHIFT = 1e-13
 """Of the trace, keeps the normal matrix of exact corners invertible."""
 TURN_SIGMAS = 2.5
 """Residual, in robust standard deviations, with half the weight."""
-MIN_SCATTER_PX = 1e-6
+EXACT_SCATTER_PX = 1e-6
 """Smallest scatter, that of exact corners: weights are its inverse."""
 MIN_RADIUS_SHARE = 1e-3
 """Smallest radius as a part of a view's largest: closer to the axis the direction is undefined and weights diverge."""
@@ -155,7 +155,7 @@ def _sigma(residual: FloatArray, used: np.ndarray) -> FloatArray:
     middle = np.maximum(used.sum(axis=1) - 1, 0) // 2
     ordered = np.partition(np.where(used, residual, np.inf), np.unique(middle), axis=1)
     median = ordered[np.arange(len(used)), middle]
-    return np.maximum(SIGMA_OF_MEDIAN * np.where(np.isfinite(median), median, 0.0), MIN_SCATTER_PX)
+    return np.maximum(SIGMA_OF_MEDIAN * np.where(np.isfinite(median), median, 0.0), EXACT_SCATTER_PX)
 
 
 def _best_subset(offset: FloatArray, local: FloatArray, used: np.ndarray) -> FloatArray:

@@ -35,7 +35,7 @@ MIN_TIMES_LARGER = 2.0
 """Length of the board in the image over that of a picture of one in the background; below it both may be boards."""
 OTHER_GRIDS = "grids beside the whole board, which may be parts of another or something else"
 """Reason why a grid in a used image gives no view."""
-MIN_SPREAD = 1e-6
+MIN_SCATTER_RATIO = 1e-6
 """Determinant of the corners' scatter over its squared trace from which they are not collinear: less is rounding (of a
 row of the board) or noise (of a board seen edge-on, a thousandth as high as wide)."""
 
@@ -88,7 +88,7 @@ def _on_a_line(points: FloatArray, count: IntArray) -> list[bool]:
     mean = [np.bincount(owner, axis, len(count)) / np.maximum(count, 1) for axis in points.T]
     x, y = points[:, 0] - mean[0][owner], points[:, 1] - mean[1][owner]
     xx, xy, yy = (np.bincount(owner, product, len(count)) for product in (x * x, x * y, y * y))
-    line: list[bool] = (xx * yy - xy * xy <= MIN_SPREAD * (xx + yy) ** 2).tolist()
+    line: list[bool] = (xx * yy - xy * xy <= MIN_SCATTER_RATIO * (xx + yy) ** 2).tolist()
     return line
 
 

@@ -9,7 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.checks.evidence import Evidence
-from rigkit.detection.lattice.lattice import MANY, MIN_ROWS, Lattice
+from rigkit.detection.lattice.lattice import MANY_CORNERS, MIN_ROWS, Lattice
 from rigkit.detection.lattice.local_fit import MIN_PREDICTING, STIFF, fit_cells
 from rigkit.detection.saddles.response import Level
 from rigkit.detection.saddles.saddle import SAME_CORNER_PX
@@ -143,7 +143,7 @@ def sample_of(lattice: Lattice) -> Lattice | None:
     It serves to reject quickly lattices such as those of pages of dots, with thousands of corners and many gaps.
     """
     known = lattice.known
-    many = lattice.count >= MANY
+    many = lattice.count >= MANY_CORNERS
     side = LARGE_SAMPLE if many else SAMPLE
     if min(known.shape) < side or (not many and not side**2 <= lattice.count < RAGGED * known.size):
         return None

@@ -21,7 +21,7 @@ from rigkit.kernels import circles as kernel
 PLAIN_ITERATIONS, ITERATIONS = 5, 30
 """Fits of edges that follow the model converge in five steps; those of others (sharpened, moved) take up to thirty, the
 later ones relaxed. They end when steps are below 0.001 px, or a twentieth of the sigma of the centre."""
-NEAR_SIGMAS, NEAR_PX = 4.0, 3.0
+NEAR_SIGMAS, WINDOW_MARGIN_PX = 4.0, 3.0
 """Distance from its edge, in sigmas of the blur and in px, up to which a circle has pixels."""
 RIM_SIGMAS = 4.0
 """Distance from its edge, in sigmas of the blur, up to which a circle without a neighbour on some side has pixels: with
@@ -95,7 +95,7 @@ class CircleFit:
 def _rules(iterations: int, *, brief: bool) -> kernel.CircleRules:
     return kernel.CircleRules.of(
         near_sigmas=NEAR_SIGMAS,
-        near_px=NEAR_PX,
+        near_px=WINDOW_MARGIN_PX,
         min_blur=0.25,
         max_blur=12.0,
         max_move_px=1.0,
@@ -153,7 +153,7 @@ def fit_circles(
     rules = _rules(iterations, brief=brief)
     extent = np.sqrt((maps**2).sum(axis=2)).max(axis=1, initial=1.0)
     margin = np.abs(curvatures).sum(axis=(1, 2)) + 1.0
-    own = np.minimum(reach * extent, extent + NEAR_SIGMAS * blur_px + NEAR_PX) + margin
+    own = np.minimum(reach * extent, extent + NEAR_SIGMAS * blur_px + WINDOW_MARGIN_PX) + margin
     finite = own[np.isfinite(own)]
     capacity = int((2.0 * float(finite.max(initial=1.0)) + 2.0) ** 2)
     capacity = min(capacity, grey.size)

@@ -31,7 +31,7 @@ from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
-from rigkit.detection.subpixel.scatter import UNEXPLAINED
+from rigkit.detection.subpixel.scatter import UNEXPLAINED_SCATTER
 from rigkit.detection.subpixel.subpixel import FIRST_BLUR
 from rigkit.detection.subpixel.uncertain_corners import IN_PLACE_CELLS, UNCERTAIN_FACTOR, uncertain_outliers
 from rigkit.detection.subpixel.whole_board import placed_together
@@ -209,7 +209,7 @@ def _scatter_factor(guide: Guide, state: BoardState) -> float:
         return 1.0
     off = np.linalg.norm(state.pixels[cells] - shape.pixels, axis=1)
     ratio = float(np.median((off / (state.sigma_px[cells] * shape.gain))[seen])) / MEDIAN_OF_RAYLEIGH
-    return ratio if ratio > UNEXPLAINED else 1.0
+    return ratio if ratio > UNEXPLAINED_SCATTER else 1.0
 
 
 def _fit_of_detected(image: GreyImage, found: BoardDetection, board: Board) -> BoardState | None:

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 from rigkit.core.arrays import FloatArray
-from rigkit.detection.lattice.lattice import MANY, Lattice
+from rigkit.detection.lattice.lattice import MANY_CORNERS, Lattice
 from rigkit.detection.lattice.links import (
     CONTRAST_RATIO,
     EDGE_PLACES,
@@ -110,7 +110,7 @@ def _grown(
     """
     rings, tested = MAX_RINGS, False
     while rings > 0:
-        if not tested and lattice.count >= MANY:
+        if not tested and lattice.count >= MANY_CORNERS:
             if not plausible(lattice):
                 return lattice, False
             tested = True

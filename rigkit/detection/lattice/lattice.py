@@ -23,7 +23,7 @@ from rigkit.kernels.growth import components_of
 MIN_ROWS = 3
 """Rows and columns of the smallest board: smaller lattices are often something else."""
 
-MANY = 200
+MANY_CORNERS = 200
 """Lattices with so many corners are first tested by a sample."""
 
 BLOCKS = ((3, 3, 1), (2, 4, 0), (4, 2, 0))

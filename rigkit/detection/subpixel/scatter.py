@@ -17,7 +17,7 @@ DIFFERENCES = (5, 6)
 MIN_SCATTER_CORNERS, MIN_DIFFERENCES = 12, 16
 """Orders of the differences along rows and columns, and the smallest numbers of corners and differences."""
 
-UNEXPLAINED = 1.25
+UNEXPLAINED_SCATTER = 1.25
 """Smallest significant ratio of the scatter to the expected one: fifty corners give smaller ratios by chance."""
 
 STRONG_CURVATURE = 0.25
@@ -58,7 +58,7 @@ def scatter_factors(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tu
     Differences along rows do not remove the curvature of strong lenses; the smallest of all ratios is returned.
     """
     factors = excess_scatter(pixels, sigma_px, parts)
-    for k in np.flatnonzero(factors > UNEXPLAINED).tolist():
+    for k in np.flatnonzero(factors > UNEXPLAINED_SCATTER).tolist():
         part = parts[k]
         if any(change.every > STRONG_CURVATURE for change in spacing_changes(pixels[part])):
             calmest = np.fmin.reduce([_mixed_roughness(pixels[part], sigma_px[part], *orders) for orders in MIXED])
@@ -73,7 +73,7 @@ def small_scatter(pixels: FloatArray, sigma_px: FloatArray) -> float:
     ones are much smaller, due to a strong lens, the factor is 1.
     """
     cubic, quartic = native.surface_scatter(pixels, sigma_px, _rules())
-    if not (cubic < AS_ROUGH * quartic and quartic > UNEXPLAINED):
+    if not (cubic < AS_ROUGH * quartic and quartic > UNEXPLAINED_SCATTER):
         return 1.0
     return 1.0 if any(change.every > EVEN_STEPS for change in spacing_changes(pixels)) else quartic
 
@@ -93,7 +93,7 @@ def _mixed_roughness(pixels: FloatArray, sigma_px: FloatArray, down: int, along:
 @functools.cache
 def _rules() -> native.ScatterRules:
     return native.ScatterRules(
-        unexplained=UNEXPLAINED,
+        unexplained=UNEXPLAINED_SCATTER,
         median_of_normal=MEDIAN_OF_NORMAL,
         min_corners=MIN_SCATTER_CORNERS,
         min_differences=MIN_DIFFERENCES,

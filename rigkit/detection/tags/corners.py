@@ -33,7 +33,7 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.consistent import DISPLACED_CELLS, MOVED_CELLS
 from rigkit.detection.subpixel.correlation import factor_rules
 from rigkit.detection.subpixel.edge_fit import edge_rules
-from rigkit.detection.subpixel.scatter import UNEXPLAINED
+from rigkit.detection.subpixel.scatter import UNEXPLAINED_SCATTER
 from rigkit.detection.subpixel.subpixel import FIRST_BLUR, FIRST_PASS, LAST_PASS
 from rigkit.detection.tags.codes import MIN_CODE_CONTRAST, MIN_PREDICTED_LIKENESS
 from rigkit.detection.tags.placing import TagBoard
@@ -220,5 +220,5 @@ class _Fitter:
         if self.count >= MIN_GUIDE_CORNERS:
             self.guide()
             scatter = self.fit.scatter(factor) / MEDIAN_OF_RAYLEIGH
-            factor *= scatter if scatter > UNEXPLAINED else 1.0
+            factor *= scatter if scatter > UNEXPLAINED_SCATTER else 1.0
         return state, factor

@@ -43,14 +43,14 @@ from rigkit.kernels.surface import maps_of_quads
 
 SAME_CELLS = 0.2
 """Largest distance of a marker's corner from the same corner of a lattice, in sides of a cell."""
-MASKING_ROUNDS, MAX_MASKING_ROUNDS, SETTLED, MAX_FURTHER = 2, 8, 0.15, 1.5
+MASKING_ROUNDS, MAX_MASKING_ROUNDS, SETTLED_MASK, MAX_FURTHER = 2, 8, 0.15, 1.5
 """Rounds of removing markers and fitting corners: the second starts from corners that their ink does not affect; more
 follow until corners would move by less than this part of their sigmas. Out of focus each leaves 0.7 of the errors
 (RENDERED, blur 3 px, squares of 20 to 30 px): after two rounds they are twice those after eight. Each begins at most
 this many times the last movement further on: more is only measured where rounds hardly converge, and there corners are
 carried away (RENDERED, markers of 0.9 of their squares: by 2 px)."""
 
-MOVED_PX, MIN_MOVED, MIN_DRAWN = 0.05, 12, -0.75
+MOVED_LINE_PX, MIN_MOVED, MIN_DRAWN = 0.05, 12, -0.75
 """Random shift, per coordinate, of the corners around which markers are removed, to measure its effect on the fit;
 smallest number of coordinates for this; and lower limit of the effect, which makes sigmas four times as large (measured
 out of focus: -0.5 to -0.6)."""
@@ -300,7 +300,7 @@ def _with_markers_masked(
         # By how much all further rounds would move corners; with a positive effect there is hardly anything left.
         more = min(max(-drawn, 0.0) / (1.0 + drawn), MAX_FURTHER)
         further = more * np.nan_to_num(narrow.lattice.pixels - given.lattice.pixels)
-        if turn >= enough and np.mean(further**2) < (SETTLED * known_median(narrow.sigma_px) / (1.0 + drawn)) ** 2:
+        if turn >= enough and np.mean(further**2) < (SETTLED_MASK * known_median(narrow.sigma_px) / (1.0 + drawn)) ** 2:
             break
         given = narrow.of(replace(narrow.lattice, pixels=narrow.lattice.pixels + further))
         # Later rounds use the loss of light measured around corners that ink does not affect.
@@ -332,7 +332,7 @@ def _drawn_by_markers(
 
     given, found : the corners around which markers were removed, and as they were then fitted.
     """
-    off = MOVED_PX * np.random.default_rng(0).choice([-1.0, 1.0], found.lattice.pixels.shape)
+    off = MOVED_LINE_PX * np.random.default_rng(0).choice([-1.0, 1.0], found.lattice.pixels.shape)
     lateral = replace(given, lattice=replace(given.lattice, pixels=given.lattice.pixels + off))
     masked = without_markers(image, lateral, board, blur, light)
     if masked is None:

@@ -27,7 +27,7 @@ TO_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 TO_DEG = {"deg": 1.0}
 PLAIN = ("pair", "quantity", "a", "b", "how")
 QUANTITIES = ("baseline", "angle", "distance")
-HEAD = re.compile(r"^(value|sigma)\s*\[\s*([^\]\s]+)\s*\]$")
+COLUMN_WITH_UNIT = re.compile(r"^(value|sigma)\s*\[\s*([^\]\s]+)\s*\]$")
 EXAMPLE = "pair,quantity,a,b,value [mm],sigma [mm],value [deg],sigma [deg],how"
 
 Row = dict[str, str]
@@ -97,7 +97,7 @@ def _units(source: Path, head: Sequence[str]) -> Units:
     for name in head:
         if name in PLAIN:
             continue
-        match = HEAD.match(name)
+        match = COLUMN_WITH_UNIT.match(name)
         if match is None:
             fault = "has no unit" if name in ("value", "sigma") else "is unknown"
             raise InputError(f"{source}: column '{name}' {fault}; write {EXAMPLE}")

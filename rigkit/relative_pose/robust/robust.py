@@ -56,7 +56,7 @@ SAME_QUALITY = 1e-3
 """Optima whose qualities (in matches) differ by less count as one, given the precision of the local optimisation."""
 MIN_NOISE = 1.5
 """Final noise level over the estimated noise of the inliers, and its lower bound in sigmas."""
-NOISE_ROUNDS = 3
+NOISE_ITERATIONS = 3
 """Iterations of the noise estimate, each over the inliers at the noise level of the one before."""
 GOOD_AFFINE = 0.1
 """Share of outlier-free samples with an affinity that lead to the optimum (measured: a third for sigma_A = 0.05)."""
@@ -151,7 +151,7 @@ def _estimated_noise(rows: SampsonRows, finalists: Mat3, max_noise: float) -> fl
     At this level, lower than that of the search, the qualities of different local optima differ clearly.
     """
     noise = max_noise
-    for _ in range(NOISE_ROUNDS):
+    for _ in range(NOISE_ITERATIONS):
         fitting = np.abs(rows.residuals(finalists[:1])[0])
         fitting = fitting[fitting < QUANTILE * noise]
         shown = float(np.median(fitting)) / MEDIAN_OF_NORMAL if fitting.size else max_noise

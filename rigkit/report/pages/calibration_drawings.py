@@ -26,7 +26,7 @@ RMS_LENGTH = 0.02
 CELLS_ACROSS = 16
 MIN_IN_CELL = 4
 """Minimum number of corners of a mean."""
-CHANCE = 0.01
+CELL_CHANCE = 0.01
 """Significance level of a cell's mean."""
 MAP_GRID = (40, 30)
 MAP_PX = (0.003, 10.0)
@@ -78,7 +78,7 @@ def pattern_svg(calibration: Calibration) -> str:
     # Corners near the border scatter more: each cell is tested by its own scatter about its mean.
     freedom = 2.0 * (count[enough] - 1.0)
     own = np.sqrt((squared[enough] - count[enough] * (mean**2).sum(axis=1)).clip(0.0) / freedom)
-    reach = np.sqrt(freedom * (CHANCE ** (-2.0 / freedom) - 1.0))
+    reach = np.sqrt(freedom * (CELL_CHANCE ** (-2.0 / freedom) - 1.0))
     beyond = np.linalg.norm(mean, axis=1) > own / np.sqrt(count[enough]) * reach
     row, column = np.divmod(np.flatnonzero(enough), CELLS_ACROSS)
     places = (np.stack([column, row], axis=-1) + 0.5) * size
@@ -92,7 +92,7 @@ def pattern_svg(calibration: Calibration) -> str:
         start, by = zoom * places[chosen], zoom * times * mean[chosen]
         path = strokes(start, by) + _arrow_heads(start, by)
         out.append(f'<path d="{path}" stroke="{colour}" stroke-width="1.6" fill="none"/>')
-    expected = f"{int(beyond.sum())} of {len(beyond)} significant (coloured; {CHANCE * len(beyond):.1f} by chance)"
+    expected = f"{int(beyond.sum())} of {len(beyond)} significant (coloured; {CELL_CHANCE * len(beyond):.1f} by chance)"
     return "".join([*out, _scale(calibration, times), _ending(calibration, words, expected)])
 
 

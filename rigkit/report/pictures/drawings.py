@@ -32,7 +32,7 @@ def normal_errors_svg(reconstructions: Mapping[str, Reconstruction], reports: Se
         boxes = []
         for board in report.boards:
             on = cloud.on_board(board.board.board_id)
-            normal = report.judged_normals.get(board.board.board_id, board.plane.normal)
+            normal = report.checked_normals.get(board.board.board_id, board.plane.normal)
             errors = np.rad2deg(angle_between(cloud.normals[on], normal))
             boxes.append((board.board.board_id, errors))
         groups.append((report.affine_method, boxes))

@@ -46,7 +46,7 @@ AS_MUCH = 0.9
 """As a part of the gain of the best hypothesis, linearised where nothing changed. For large changes such gains are
 wrong by a few per cent (a board with squares of 20 mm for 25: 0.7), so a simpler hypothesis with at least this part is
 compared by its residuals after its own change."""
-DRAWS, FEW_DRAWS = 4000, 8
+TESTS_DRAWN, FEW_DRAWS = 4000, 8
 """Simulated tests of unchanged cameras; fewer exceedances than FEW_DRAWS give no reliable p-value."""
 
 
@@ -249,20 +249,20 @@ def _family_wise_p_value(whitened: Whitened, known: Sequence[Change]) -> float:
     else Bonferroni's bound."""
     best = min(c.chance for c in known)
     bound = min(1.0, len(known) * best)
-    if bound < FEW_DRAWS / DRAWS:
+    if bound < FEW_DRAWS / TESTS_DRAWN:
         return bound
     rng = np.random.default_rng(0)
     spread, axes = np.linalg.eigh(whitened.covariance)
     root = axes / np.sqrt(spread)
-    drawn = rng.standard_normal((len(spread), DRAWS))
-    scale = rng.chisquare(whitened.freedom, DRAWS) / whitened.freedom if whitened.freedom < LARGE_FREEDOM else 1.0
-    least = np.ones(DRAWS)
+    drawn = rng.standard_normal((len(spread), TESTS_DRAWN))
+    scale = rng.chisquare(whitened.freedom, TESTS_DRAWN) / whitened.freedom if whitened.freedom < LARGE_FREEDOM else 1.0
+    least = np.ones(TESTS_DRAWN)
     for change in known:
         basis = np.linalg.qr(root.T @ whitened.by_theta @ change.hypothesis.directions)[0]
         m = basis.shape[1]
         gain = ((basis.T @ drawn) ** 2).sum(axis=0) / scale
         least = np.minimum(least, fdtrc(m, whitened.freedom, gain / m))
-    return float(min(bound, (1.0 + np.count_nonzero(least <= best)) / (DRAWS + 1.0)))
+    return float(min(bound, (1.0 + np.count_nonzero(least <= best)) / (TESTS_DRAWN + 1.0)))
 
 
 def _log_odds(change: Change, penalty: float) -> float:

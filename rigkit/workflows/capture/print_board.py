@@ -14,7 +14,7 @@ from rigkit.io.disk.writing import write_atomic, write_together
 from rigkit.report.pictures.board_sheet import board_sheet, pdf_bytes, svg_text
 from rigkit.workflows.options.cameras import PrintOptions
 
-MAX_UNEVEN = 1.05
+MAX_SCALE_RATIO = 1.05
 """Maximum ratio of the scales along and across a sheet: printers differ by a per cent, misread rulers by more."""
 MAX_STRETCH = 2.0
 """Maximum scale of a print, and its inverse: larger ones are misread rulers."""
@@ -77,7 +77,7 @@ def store_measured_print(path: str | Path, measured: MeasuredPrint) -> Board:
         f"rulers of {sheet.ruler_x_mm:g} and {sheet.ruler_y_mm:g} mm {{}} {measured.ruler_x_mm:g} and "
         f"{measured.ruler_y_mm:g}"
     )
-    if not 1.0 / MAX_UNEVEN < stretch_x / stretch_y < MAX_UNEVEN:
+    if not 1.0 / MAX_SCALE_RATIO < stretch_x / stretch_y < MAX_SCALE_RATIO:
         raise InputError(
             f"board: {words.format('that read')}: no printer stretches its two directions so differently; check the "
             "readings"

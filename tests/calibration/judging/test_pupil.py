@@ -13,7 +13,7 @@ from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty
 from rigkit.calibration.compare import compare_calibrations
 from rigkit.calibration.judging.changing import changing
-from rigkit.calibration.judging.pupil import BY_CHANCE, MovingPupil, pupil_is_significant, solved_again
+from rigkit.calibration.judging.pupil import PUPIL_SIGNIFICANCE, MovingPupil, pupil_is_significant, solved_again
 from rigkit.calibration.judging.verdicts import diagnose
 from rigkit.calibration.judging.view_evidence import neighbour_correlation, view_evidence
 from rigkit.calibration.pupil import SolvedPupil
@@ -100,7 +100,7 @@ def test_a_central_lens_has_no_finding_about_its_pupil() -> None:
         assert found.pupil is None
         assert MESSAGE not in str(found.verdicts)
         pupil = pupil_of(found)
-        assert pupil.chance > BY_CHANCE
+        assert pupil.chance > PUPIL_SIGNIFICANCE
         assert abs(pupil.mm_per_rad2) < 0.1
 
 
@@ -215,7 +215,7 @@ def test_a_lens_that_departs_from_its_model_is_central() -> None:
         for pupil in ("moving", "auto")
     )
     again = solved_again(moving)
-    assert again is not None and again.chance < BY_CHANCE
+    assert again is not None and again.chance < PUPIL_SIGNIFICANCE
     assert found.pupil is None and pupil_of(found).left_px < again.left_px
 
 

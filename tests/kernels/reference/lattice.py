@@ -19,7 +19,7 @@ from rigkit.detection.subpixel.scatter import (
     MIN_SCATTER_CORNERS,
     MIN_TERM,
     SURFACES,
-    UNEXPLAINED,
+    UNEXPLAINED_SCATTER,
 )
 from rigkit.kernels.lattice import ScatterRules
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
@@ -33,7 +33,7 @@ def uneven_steps(pixels: FloatArray) -> tuple[list[float], list[int], tuple[floa
 def excess_scatter(
     pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tuple[slice, slice]], rules: ScatterRules
 ) -> FloatArray:
-    assert rules.unexplained == UNEXPLAINED
+    assert rules.unexplained == UNEXPLAINED_SCATTER
     return np.array([_excess(pixels[part], sigma_px[part]) for part in parts])
 
 
@@ -130,7 +130,7 @@ def _excess(pixels: FloatArray, sigma_px: FloatArray) -> float:
         values = pixels - _best_plane(pixels) if flatten else pixels
         for order in DIFFERENCES:
             calmest = float(np.fmin(calmest, _roughness(values, sigma_px, order)))
-            if calmest <= UNEXPLAINED:
+            if calmest <= UNEXPLAINED_SCATTER:
                 return 1.0
     return calmest if np.isfinite(calmest) else 1.0
 

@@ -26,7 +26,7 @@ from rigkit.detection.subpixel.consistent import DISPLACED_CELLS, MOVED_CELLS
 from rigkit.detection.subpixel.correlation import board_factors
 from rigkit.detection.subpixel.edge_fit import EdgeFit, edge_rules
 from rigkit.detection.subpixel.edge_model import WINDOW_REACH
-from rigkit.detection.subpixel.scatter import UNEXPLAINED
+from rigkit.detection.subpixel.scatter import UNEXPLAINED_SCATTER
 from rigkit.detection.subpixel.subpixel import FIRST_BLUR, FIRST_PASS, LAST_PASS
 from rigkit.detection.tags.codes import MIN_PREDICTED_LIKENESS, read_tags
 from rigkit.detection.tags.corners import (
@@ -326,7 +326,7 @@ class _Fitter:
             off, gain = self.map_of(state).left_out()
             expected = factor * state.sigma_px[cells] * np.hypot(1.0, gain)
             scatter = known_median(off / expected) / MEDIAN_OF_RAYLEIGH
-            factor *= scatter if scatter > UNEXPLAINED else 1.0
+            factor *= scatter if scatter > UNEXPLAINED_SCATTER else 1.0
         return state, factor
 
 

@@ -38,20 +38,20 @@ Timing = Literal["trigger", "lags", "readouts"]
 TIMINGS: tuple[Timing, ...] = ("trigger", "lags", "readouts")
 """What is estimated of the times at which images were taken: nothing, lags and times of images, and also the readout
 times of rolling shutters."""
-CHANCE = 0.01
+LAG_SIGNIFICANCE = 0.01
 """Significance level: the part of triggered rigs that get lags by mistake, which are then consistent with zero."""
-MAX_ROUNDS, SETTLED = 8, 0.01
+MAX_ROUNDS, SETTLED_COST = 8, 0.01
 """Trajectories and times of images are recomputed until the cost changes by less than this part."""
-MAX_READOUT_ROUNDS, SETTLED_SIGMAS, MAX_RELAXATION = 16, 0.1, 10.0
+MAX_READOUT_ROUNDS, SETTLED_READOUT_SIGMAS, MAX_RELAXATION = 16, 0.1, 10.0
 """A step of readouts holds the rig, which follows: a part of the error is left, or the step goes too far. Steps are
 lengthened or shortened, up to so many times, by Aitken's relaxation (U. Kuettler, W. A. Wall, Comput. Mech. 43, 2008)
 until they are this small a part of their sigmas."""
-FIRST_SPREAD, MIN_SPREAD, SPREAD_ROUNDS = 0.1, 1e-4, 50
+FIRST_SPREAD, MIN_LAG_SPREAD, SPREAD_ROUNDS = 0.1, 1e-4, 50
 """Standard deviation of the lags of a camera's images, in the time between frames: the initial value, the least one
 that is distinguishable from zero, and the number of iterations."""
 ORDERS_DRAWN = 199
 """Random permutations of the trajectories in the test of scatter."""
-RIDGE, HELD = 1e-9, 1e12
+POSE_RIDGE, HELD = 1e-9, 1e12
 """As parts of the largest information: regularises poses with few corners, and fixes the time that defines a frame."""
 
 
@@ -99,11 +99,11 @@ def with_lags(
         for _ in range(MAX_ROUNDS):
             before = lagging.normal.cost
             lagging = _solved_again(observations, lagging, sigma_px, times, own_times=own_times)
-            if abs(before - lagging.normal.cost) < SETTLED * before:
+            if abs(before - lagging.normal.cost) < SETTLED_COST * before:
                 break
-        if not own_times and _p_value_of_lags(observations, lagging, sigma_px, frames) > CHANCE:
+        if not own_times and _p_value_of_lags(observations, lagging, sigma_px, frames) > LAG_SIGNIFICANCE:
             sigma = residual_sigma(observations, solution, sigma_px)
-            if _p_value_of_scatter(solution.state, observations, start, sigma) > CHANCE:
+            if _p_value_of_scatter(solution.state, observations, start, sigma) > LAG_SIGNIFICANCE:
                 return observations, solution
     if timing == "lags":
         return observations, lagging
@@ -136,7 +136,7 @@ def _with_readouts(
     each = np.maximum(2.0 * stdtr(np.maximum(freedom, 1.0), -size), np.finfo(float).tiny)
     # All cameras of a rig may have rolling shutters (Fisher's combination of their p-values), or one of them.
     together, one = float(chdtrc(2 * len(each), -2.0 * np.log(each).sum())), float(each.min()) * len(each)
-    if 2.0 * min(together, one) > CHANCE:
+    if 2.0 * min(together, one) > LAG_SIGNIFICANCE:
         return observations, lagging
     relaxation = 1.0
     for _ in range(MAX_READOUT_ROUNDS):
@@ -150,7 +150,7 @@ def _with_readouts(
         change = before - step
         relaxation *= float(before @ change) / max(float(change @ change), np.finfo(float).tiny)
         relaxation = min(max(relaxation, 1.0 / MAX_RELAXATION), MAX_RELAXATION)
-        if (np.abs(max(relaxation, 1.0) * step) <= SETTLED_SIGMAS * sigma).all():
+        if (np.abs(max(relaxation, 1.0) * step) <= SETTLED_READOUT_SIGMAS * sigma).all():
             break
     return observations, lagging
 
@@ -211,7 +211,7 @@ def _with_own_times(
     products = _products_with_times(by_target, exposures.all_speeds())
     spread, own = np.where(free.any(axis=0), FIRST_SPREAD, 0.0), exposures.own.T
     for _ in range(SPREAD_ROUNDS):
-        system, information = _with_time_prior(products, free, (sigma_px / np.maximum(spread, MIN_SPREAD)) ** 2)
+        system, information = _with_time_prior(products, free, (sigma_px / np.maximum(spread, MIN_LAG_SPREAD)) ** 2)
         right = products[..., -1].copy()
         right[:, 6:] -= information * own
         inverse = np.linalg.inv(system)
@@ -276,7 +276,7 @@ def _with_time_prior(products: FloatArray, free: BoolArray, known: FloatArray | 
     diagonal = np.einsum("fii->fi", system)
     largest = np.maximum(diagonal.max(axis=1, keepdims=True), 1.0)
     information = np.where(free, known, HELD * largest)
-    diagonal[:, :6] += RIDGE * largest
+    diagonal[:, :6] += POSE_RIDGE * largest
     diagonal[:, 6:] += information
     return system, information
 

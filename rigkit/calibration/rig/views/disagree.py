@@ -29,7 +29,7 @@ which it is not chance. Sharing a pose removes six parameters for every view but
 average."""
 MIN_PX = 0.02
 """Smallest standard deviation of a corner: without noise residuals are rounding."""
-FEW = 12
+FEW_TARGETS = 12
 """With no more targets than this an outlier may be masked: it shifts the mounts, and all look bad."""
 
 
@@ -92,7 +92,7 @@ def outlier_targets(cost: Mapping[Key, float], typical: float) -> list[Key]:
 def outlier_may_be_hidden(cost: Mapping[Key, float], sigma_px: float) -> bool:
     """Return whether one of few targets may be an outlier although none stands out."""
     worst = max(cost.values(), default=0.0)
-    return 2 < len(cost) <= FEW and worst > DISAGREES**2 * max(sigma_px, MIN_PX) ** 2
+    return 2 < len(cost) <= FEW_TARGETS and worst > DISAGREES**2 * max(sigma_px, MIN_PX) ** 2
 
 
 def separate_distant_views(

@@ -38,13 +38,13 @@ from rigkit.geometry.rigid3 import Rigid3
 SAME_IMAGE_PX = 0.1
 """RMS difference of corners up to which two images are copies, perhaps compressed again: two cameras have at least
 different noise."""
-MOVED_PX = 1.0
+MOVED_BOARD_PX = 1.0
 """RMS difference of corners from which a board was elsewhere."""
 MAX_LEFT_OF_DISTANCE = 0.1
 """Distance between views after correcting a mix-up, over that before, up to which it explains the disagreement. Before,
 it is the movement of the boards between frames, a hundred pixels and more; after, the error of lenses calibrated from
 mixed images: 2 to 8 px for exchanged images of bouguet-stereo (REAL)."""
-STEPS = (1, -1, 2, -2)
+FRAME_STEPS = (1, -1, 2, -2)
 """Numbers of frames that a camera may be off by."""
 MIN_FRAMES_CORRECTED = 3
 """Fewest frames that must agree after renumbering: the six parameters of a mount fit one frame exactly."""
@@ -102,7 +102,7 @@ def _repeated_images(
             if one[1] != again[1] or not _same_image(own[one], own[again]):
                 continue
             both = [other for other in others if one in other and again in other]
-            if any(not _same_image(other[one], other[again], MOVED_PX) for other in both):
+            if any(not _same_image(other[one], other[again], MOVED_BOARD_PX) for other in both):
                 yield Finding.bad(
                     f"the images of '{name}' in frames '{one[0]}' and '{again[0]}' are copies of one image, while the "
                     "board moved for another camera",
@@ -145,7 +145,7 @@ def _offset_of_frames(views: RigViews, mounts: Sequence[Rigid3], now: Mapping[st
     agree = {frame for frame, _ in shared_keys(seen)} - now.keys()
     typical = dict.fromkeys(_frames_of(seen), float(np.median(list(now.values()))))
     for k in range(1, len(seen)):
-        for step in STEPS:
+        for step in FRAME_STEPS:
             trial = [_of_frames(own, typical.keys() - agree) for own in seen]
             trial[k] = _of_frames(_with_offset(seen, k, step), typical.keys() - agree)
             right = _frames_corrected(typical, _by_frame(_distances_px(views.with_seen(trial), mounts)))
@@ -167,7 +167,7 @@ def mixup_of_all_frames(views: RigViews) -> Finding | None:
     names, seen = views.names, views.seen
     limit = MAX_LEFT_OF_DISTANCE * typical_px(views)
     for k, camera in enumerate(views.cameras):
-        for step in STEPS if k else ():
+        for step in FRAME_STEPS if k else ():
             if typical_px(views.with_camera(k, _with_offset(seen, k, step))) <= limit:
                 return Finding.bad(
                     f"the images of '{names[k]}' belong to {_offset_in_words(step)} in all frames: with that shift the "
