@@ -19,7 +19,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.geometry.rotation import angle_between
 from rigkit.interop.open3d import mean_and_covariance, plane_inliers
-from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+from rigkit.optim.robust_scale import robust_sigma
 
 MIN_PLANE_POINTS = 4
 """Three points are always in a plane and do not determine its flatness."""
@@ -270,15 +270,14 @@ def _inliers_and_certain(points: Points, covariance: FloatArray, common: FloatAr
     centroid, axes = _principal(points)
     floor = ROUNDING * float(np.linalg.norm(centroid))
     for _ in range(RANSAC_ROUNDS):
-        off = np.abs((points - centroid) @ axes[:, 0])
-        near = 2.0 * SIGMA_OF_MEDIAN * float(np.median(off)) + floor
+        near = 2.0 * robust_sigma((points - centroid) @ axes[:, 0]) + floor
         shared = plane_inliers(points, near, iterations=RANSAC_ITERATIONS)
         weights = np.zeros(len(points))
         weights[shared], _ = _weights(points[shared], covariance[shared], common[:, shared])
         centroid, axes = _principal(points, weights)
     seen = _NormalResiduals.of(points, covariance, common, centroid, axes)
     off = np.abs(seen.residuals)
-    scatter = SIGMA_OF_MEDIAN * float(np.median(off / np.sqrt(seen.variance)))
+    scatter = robust_sigma(off / np.sqrt(seen.variance))
     expected = np.sqrt(scatter**2 * seen.variance + np.sum(seen.bending(weights) ** 2, axis=1))
     return np.asarray(off <= GROSS * expected + floor), np.asarray(expected <= MAX_SIGMA_RATIO * np.median(expected))
 

@@ -24,7 +24,7 @@ from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
 from rigkit.geometry.sampson import sampson_of_matches
-from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+from rigkit.optim.robust_scale import robust_sigma
 from rigkit.reconstruction.growing.fill import at_best_depth, fill_holes
 from rigkit.reconstruction.growing.grow import (
     EpipolarConstraint,
@@ -42,7 +42,7 @@ from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, NO_DISTANCE, SceneRecon
 from rigkit.reconstruction.scene_pose import GATE, KnownPose, fit_scene_pose, known_scene_pose
 from rigkit.relative_pose.refinement.residuals import point_terms
 from rigkit.relative_pose.solvers.pose import essential_from_pose, pose_directions, translation_basis
-from rigkit.relative_pose.solvers.weights import affinity_residuals
+from rigkit.relative_pose.solvers.weights import estimate_sigma_A
 
 POSE_STEP = 8
 """Node spacing, px, of the pairs for the pose: evenly spread, unlike features."""
@@ -257,9 +257,8 @@ def _distances(matches: Matches, pose: Rigid3) -> FloatArray:
 def _epipolar_constraint(matches: Matches, pose: Rigid3) -> EpipolarConstraint:
     """Return the epipolar constraint of the pose, with sigmas from the residuals of its pairs."""
     # Sampson's distance moves both pixels; growing moves only that in image 2.
-    sigma = np.sqrt(2.0) * SIGMA_OF_MEDIAN * float(np.median(np.abs(_distances(matches, pose))))
-    sigma_A = SIGMA_OF_MEDIAN * float(np.nanmedian(np.abs(affinity_residuals(matches, essential_from_pose(pose)))))
-    return EpipolarConstraint(essential_from_pose(pose), max(MAX_DISTANCE_PX, GATE * sigma), sigma, sigma_A)
+    sigma, E21 = np.sqrt(2.0) * robust_sigma(_distances(matches, pose)), essential_from_pose(pose)
+    return EpipolarConstraint(E21, max(MAX_DISTANCE_PX, GATE * sigma), sigma, estimate_sigma_A(matches, E21))
 
 
 def _planes_by_pose(rays: PairRays, pose: Rigid3, covariance: FloatArray) -> FloatArray:

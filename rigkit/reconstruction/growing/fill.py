@@ -16,7 +16,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.sweep import LevelPlanes, fitted_level_planes
-from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+from rigkit.optim.robust_scale import robust_sigma
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches
 from rigkit.reconstruction.growing.surface import GrownSurface
 from rigkit.reconstruction.growing.sweep import ALIKE_LEVELS, RIVAL_RADIUS, Sweep, directions_in_cam2, replace_pairs
@@ -148,7 +148,7 @@ def _noise_over_scatter(planes: _SweptPlanes, of_patches: FloatArray) -> float:
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", planes.rays, planes.covariance, planes.rays))
     off = np.abs(np.sum((planes.plane - of_patches) * planes.rays, axis=1))
     known = (sigma > 0.0) & np.isfinite(off)
-    return max(SIGMA_OF_MEDIAN * float(np.median(off[known] / sigma[known])), 1.0) if known.any() else 1.0
+    return max(robust_sigma(off[known] / sigma[known]), 1.0) if known.any() else 1.0
 
 
 class _Choice(NamedTuple):

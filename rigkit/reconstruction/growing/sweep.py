@@ -20,7 +20,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.sweep import CENSUS_BITS, swept_costs, swept_rivals, swept_surfaces
-from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+from rigkit.optim.robust_scale import robust_sigma
 from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrowingView, GrownPatches
 from rigkit.reconstruction.growing.surface import NodeMeasurements
 
@@ -182,8 +182,7 @@ def fill_by_sweep(
     of_grown = np.full(level.shape, np.nan)
     of_grown[::SAMPLES_A_NODE, ::SAMPLES_A_NODE] = at_nodes
     good = _reliable(sweep, good, of_grown)
-    off = np.abs(level - of_grown)[good & np.isfinite(of_grown)]
-    residual = SIGMA_OF_MEDIAN * float(np.median(off)) if off.size else np.inf
+    residual = robust_sigma((level - of_grown)[good & np.isfinite(of_grown)])
     if not residual < MAX_RESIDUAL_LEVELS:
         return grown, None
     at = sweep.nearest(grown.pixels1)

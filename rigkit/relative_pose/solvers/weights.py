@@ -20,7 +20,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, Mat3
 from rigkit.core.errors import InputError
 from rigkit.core.matches import Matches
 from rigkit.geometry.sampson import epipolar_normals
-from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+from rigkit.optim.robust_scale import robust_sigma
 
 WeightRule = Literal["noise", "auto", "equal", "points"]
 """noise: from the sigmas of the matches (affinities without a sigma_A are ignored); auto: sigma_A estimated from the
@@ -137,8 +137,7 @@ def estimate_sigma_A(matches: Matches, E21: Mat3) -> float:
     Meaningless for affinities computed from the epipolar geometry (F2UDIR, F3UDIR): they satisfy it by construction.
     """
     residual = affinity_residuals(matches, E21)
-    residual = residual[np.isfinite(residual)]
-    return float(SIGMA_OF_MEDIAN * np.median(np.abs(residual))) if residual.size else float("nan")
+    return robust_sigma(residual[np.isfinite(residual)])
 
 
 def _weights(

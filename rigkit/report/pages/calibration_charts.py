@@ -13,7 +13,7 @@ import numpy as np
 from rigkit.calibration.certainty.uncertainty import projection_uncertainty
 from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import FloatArray, sampling_step
-from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+from rigkit.optim.robust_scale import robust_sigma
 from rigkit.report import svg
 from rigkit.report.svg import DRAWN_WIDTH, INK, SOFT, round_down, round_up
 
@@ -161,7 +161,7 @@ def histogram_svg(calibration: Calibration) -> str:
     """Draw the histogram of residuals (u and v), with the normal distribution of their robust sigma."""
     _, residuals = calibration.corners.used
     values = residuals.reshape(-1)
-    sigma = float(SIGMA_OF_MEDIAN * np.median(np.abs(values)))
+    sigma = robust_sigma(values)
     reach = round_up(max(4.0 * sigma, 1e-6), HALF_STEPS)
     counts, edges = np.histogram(values, BINS, (-reach, reach))
     step = edges[1] - edges[0]

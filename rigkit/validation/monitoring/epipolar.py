@@ -32,7 +32,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.geometry.triangulation import triangulate_rays
-from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+from rigkit.optim.robust_scale import robust_sigma
 from rigkit.planning.goal import Goal
 from rigkit.planning.information import MIN_SIGMA_PX
 from rigkit.validation.monitoring.evidence import FreshEvidence, Monitored
@@ -224,7 +224,7 @@ def _replaced(items: Sequence[Item], at: int, item: Item) -> list[Item]:
 def _robust_residuals(residual: FloatArray, jacobian: FloatArray, mount: slice) -> tuple[FloatArray, FloatArray, float]:
     """Return the residuals (M,) after the best change of theta, the weights of the matches, robust to outliers, and
     their standard deviation."""
-    left, sigma = residual, float(np.median(np.abs(residual))) * SIGMA_OF_MEDIAN
+    left, sigma = residual, robust_sigma(residual)
     # A gross outlier pulls the fit towards itself. A match that is an outlier before the fit, or after a fit of the
     # mount alone, which follows outliers little, therefore keeps its low weight.
     weight = _weights(residual, sigma)
@@ -250,7 +250,7 @@ def _fit_columns(
         step = axes[:rank].T @ (basis[:, :rank].T @ (residual * root) / values[:rank])
         left = residual - design @ step
         freedom = max(len(residual) - rank, 1) / len(residual)
-        sigma = float(np.median(np.abs(left))) * SIGMA_OF_MEDIAN / np.sqrt(freedom)
+        sigma = robust_sigma(left) / np.sqrt(freedom)
         # A match with high leverage, alone in its part of the image, has a small residual, inlier or outlier.
         free = np.sqrt(np.maximum(1.0 - (basis[:, :rank] ** 2).sum(axis=1), MIN_FREE_VARIANCE))
         weight = np.minimum(before, _weights(left / free, sigma))
