@@ -38,6 +38,7 @@ class build_kernels(build_ext):
             # Visual C++ lacks the vector extensions; this compiler comes with pip (pyproject.toml).
             zig = [sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-windows-gnu", "-fno-sanitize=undefined"]
             self.spawn([*zig, *BUILDING["FLAGS"], "-s", "-shared", *ext.sources, "-o", str(library)])
+            BUILDING["remove_import_library"](library)
             compiler = "ziglang"
         else:
             ext.extra_objects, ext.sources = self._objects(ext), []

@@ -39,6 +39,7 @@ def cross_compile(target: str, folder: Path) -> Path:
     subprocess.run(
         [*zig, *building["FLAGS"], *strip, "-fPIC", "-shared", *sources, "-lm", "-o", str(library)], check=True
     )
+    building["remove_import_library"](library)
     building["write_record"](library, KERNELS, f"ziglang {triple}")
     return library
 

@@ -41,6 +41,12 @@ def source_hash(folder: Path) -> str:
     return digest.hexdigest()[:16]
 
 
+def remove_import_library(library: Path) -> None:
+    """Remove what the linker for Windows leaves beside `library`: it is loaded by name, and never linked."""
+    for path in library.parent.glob("*.lib"):
+        path.unlink()
+
+
 def write_record(library: Path, folder: Path, compiler: str) -> Path:
     """Write the hashes of `library` and of its sources in `folder` to a file with its name; return the path."""
     record = {"sources": source_hash(folder), "library": _hash_of(library), "compiler": compiler}
