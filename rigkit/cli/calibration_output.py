@@ -9,7 +9,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from rigkit.core.findings import most_severe_first
-from rigkit.core.printing import length_words
+from rigkit.core.printing import counted, length_words
 
 if TYPE_CHECKING:
     from rigkit.calibration.result import Calibration, Candidate
@@ -79,11 +79,13 @@ def frames_left_out(targets: Sequence[tuple[str, str, str]]) -> list[str]:
     groups: dict[tuple[str, str], list[tuple[str, str]]] = {}
     for frame, board, reason in targets:
         groups.setdefault((board, re.sub(r"[\d.]+", "", reason)), []).append((frame, reason))
-    return [
-        f"frame{'s' if len(some) > 1 else ''} {_first_names([frame for frame, _ in some])}, board '{board}' left out: "
-        f"{some[0][1]}{' (figures of the first)' if len(some) > 1 else ''}"
-        for (board, _), some in groups.items()
-    ]
+    words = {True: ("frames", " (figures of the first)"), False: ("frame", "")}
+    lines = []
+    for (board, _), some in groups.items():
+        what, note = words[len(some) > 1]
+        names = _first_names([frame for frame, _ in some])
+        lines.append(f"{what} {names}, board '{board}' left out: {some[0][1]}{note}")
+    return lines
 
 
 def _first_names(images: Sequence[str]) -> str:
@@ -161,7 +163,7 @@ def describe_rig(rig: RigCalibration, checks: Sequence[Check]) -> str:
     held = "held-out RMS not available" if rig.heldout_rms_px is None else f"held-out RMS {rig.heldout_rms_px:.4f} px"
     count = len(rig.cameras)
     lines = [
-        f"{count} camera{'s' if count > 1 else ''}, {rig.shared_count} poses shared by several views: {held}, training "
+        f"{counted(count, 'camera')}, {rig.shared_count} poses shared by several views: {held}, training "
         f"RMS {rig.rms_px:.4f} px; overdispersion of frames {rig.overdispersion:.2f}"
     ]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):

@@ -82,12 +82,6 @@ class ViewEvidence:
     total: float
     freedom: int
 
-    def common_covariance(self) -> FloatArray:
-        """Return the pseudo-inverse (C, C) of the products of the common rows."""
-        values, vectors = np.linalg.eigh(self.gram)
-        root = vectors * np.where(values > MIN_COMMON_PART, values, np.inf) ** -0.5 / self.scale[:, None]
-        return np.asarray(root @ root.T)
-
     def explained(self, rows: slice) -> tuple[float, int, FloatArray]:
         """Return the sum of squares that a kind of change explains jointly with the common rows, its degrees of
         freedom, and its amounts (V, n)."""

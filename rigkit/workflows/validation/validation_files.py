@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from rigkit.calibration.result import Calibration
-from rigkit.core.printing import brief
+from rigkit.core.printing import brief, counted
 from rigkit.io.manifests.manifest import Dataset
 from rigkit.report.pages.page_facts import PageFacts
 from rigkit.report.pages.validation_page import (
@@ -85,7 +85,7 @@ def validation_files(
         files |= pair.files
     sections = [pair.section for pair in pairs if pair.section is not None]
     verdict = verdict_of([pair.best for pair in pairs], reports, compared, causes, complete=not failures)
-    lead = f"{len(pairs)} {'pair' if len(pairs) == 1 else 'pairs'}, each by {len(pairs[0].reports)} estimators of "
+    lead = f"{counted(len(pairs), 'pair')}, each by {len(pairs[0].reports)} estimators of "
     lead += f"affine transformations, {seconds:.0f} s"
     lead += "".join(f"; not validated: {failure}" for failure in failures)
     # The sections of the pairs have these tables.
