@@ -65,7 +65,7 @@ from rigkit.synthetic.scene import PlacedBoard
 from rigkit.validation.monitoring.change_aim import informative_views
 from rigkit.validation.monitoring.epipolar import check_matches, matches_of_scenes
 from rigkit.validation.monitoring.evidence import FreshView, Monitored, evidence_of
-from rigkit.validation.monitoring.judge import ALARM_CHANCE, CalibrationCheck, check_views
+from rigkit.validation.monitoring.verdict import ALARM_CHANCE, CalibrationCheck, check_views
 from rigkit.validation.monitoring.watch import monitored_camera, monitored_rig
 from rigkit.validation.monitoring.whitened import Whitened
 

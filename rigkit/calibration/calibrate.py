@@ -26,9 +26,9 @@ from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut,
 from rigkit.calibration.choosing.lens_choice import ModelChoice, best_sizes, choose_lenses, like_cameras
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.choosing.one_model import ModelOutcome, on_same_images
-from rigkit.calibration.judging.moved import moved_lens, two_groups
-from rigkit.calibration.judging.pupil import may_move, pupil_is_significant, solved_again
-from rigkit.calibration.judging.verdicts import diagnose
+from rigkit.calibration.diagnosis.moved import moved_lens, two_groups
+from rigkit.calibration.diagnosis.pupil import may_move, pupil_is_significant, solved_again
+from rigkit.calibration.diagnosis.verdicts import diagnose
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.views.observations import Observations

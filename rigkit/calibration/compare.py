@@ -16,7 +16,7 @@ import numpy as np
 from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.certainty.uncertainty import projection_design
 from rigkit.calibration.choosing.between_models import same_model
-from rigkit.calibration.judging.pupil import changes_with
+from rigkit.calibration.diagnosis.pupil import changes_with
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.clustered import NULL_DRAWS, drawn_errors
 from rigkit.cameras.base import Camera, image_center

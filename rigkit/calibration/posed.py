@@ -14,7 +14,7 @@ from rigkit.calibration.calibrate import FOLDS
 from rigkit.calibration.choosing.choice import FittedModel, heldout_squares
 from rigkit.calibration.choosing.models_tried import Request, enough_agree
 from rigkit.calibration.choosing.one_model import with_board_shape
-from rigkit.calibration.judging.verdicts import diagnose
+from rigkit.calibration.diagnosis.verdicts import diagnose
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.solving.fit import Fit, fit_kept, posed
 from rigkit.calibration.solving.linearise import normal_equations

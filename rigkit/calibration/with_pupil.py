@@ -1,8 +1,8 @@
 """Calibration with a moving entrance pupil: two more unknowns, where the images support them.
 
-The central camera is calibrated first. Where its residuals indicate a moving pupil (`judging.pupil`), all sizes of the
-same model and all board shapes are fitted again with a pupil, and chosen as before. The pupil is kept if it lowers the
-held-out error as two more parameters must, and if it is significant against the scatter between images with any
+The central camera is calibrated first. Where its residuals indicate a moving pupil (`diagnosis.pupil`), all sizes of
+the same model and all board shapes are fitted again with a pupil, and chosen as before. The pupil is kept if it lowers
+the held-out error as two more parameters must, and if it is significant against the scatter between images with any
 displacement of a central lens free. One that is neither confirmed nor contradicted is a rival of the central lens.
 """
 

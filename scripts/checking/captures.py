@@ -15,7 +15,7 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.planning.goal import projection_goal
 from rigkit.validation.monitoring.hypotheses import hypotheses_of
-from rigkit.validation.monitoring.judge import ALARM_CHANCE, ALARM_PX, CalibrationCheck
+from rigkit.validation.monitoring.verdict import ALARM_CHANCE, ALARM_PX, CalibrationCheck
 from rigkit.validation.monitoring.watch import monitored_camera
 
 

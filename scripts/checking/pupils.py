@@ -11,7 +11,7 @@ from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.goal import projection_goal
-from rigkit.validation.monitoring.judge import CalibrationCheck
+from rigkit.validation.monitoring.verdict import CalibrationCheck
 
 PUPIL, REACH_DEG = (3.0, -0.3), 80.0
 

@@ -24,7 +24,7 @@ from rigkit.planning.plan import covariance_of, plan_views
 from rigkit.validation.monitoring.baseline import check_since
 from rigkit.validation.monitoring.epipolar import PairMatches, check_matches, evidence_of_matches, scene_matches
 from rigkit.validation.monitoring.evidence import FreshView, Monitored, evidence_of
-from rigkit.validation.monitoring.judge import CalibrationCheck
+from rigkit.validation.monitoring.verdict import CalibrationCheck
 
 BOARD = Board("b", 9, 6, 25.0, 25.0)
 BASELINE_MM = 100.0

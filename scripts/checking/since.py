@@ -21,7 +21,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.validation.monitoring.baseline import check_since
 from rigkit.validation.monitoring.evidence import FreshView, Monitored, evidence_of
 from rigkit.validation.monitoring.flipped import consistently_numbered
-from rigkit.validation.monitoring.judge import CalibrationCheck
+from rigkit.validation.monitoring.verdict import CalibrationCheck
 from rigkit.validation.monitoring.watch import monitored_camera, monitored_rig
 
 RIGS = ("bouguet", "bumblebee", "charuco-stereo")

@@ -13,7 +13,7 @@ from rigkit.core.errors import RigkitError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.validation.monitoring.evidence import FreshView
-from rigkit.validation.monitoring.judge import CalibrationCheck, check_views
+from rigkit.validation.monitoring.verdict import CalibrationCheck, check_views
 from rigkit.validation.monitoring.watch import monitored_camera
 
 CHANGED_PX, SCENE_TURNED_DEG = 0.15, 0.05

@@ -14,7 +14,7 @@ import numpy as np
 from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.compare import CameraVerdict, compare_calibrations
-from rigkit.calibration.judging.captured import ASKED_DEG
+from rigkit.calibration.diagnosis.captured import ASKED_DEG
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.core.detections import BoardView

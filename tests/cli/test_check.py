@@ -35,8 +35,8 @@ from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
 from rigkit.validation.monitoring.hypotheses import hypotheses_of
-from rigkit.validation.monitoring.judge import CalibrationCheck, Change
 from rigkit.validation.monitoring.power import Power
+from rigkit.validation.monitoring.verdict import CalibrationCheck, Change
 from rigkit.workflows.checks.check import OWN_IMAGE, _replaced_by_known, _require_right_order, check_pictures
 from rigkit.workflows.options.check import CheckOptions
 from rigkit.workflows.outputs.provenance import SHORT_HASH

@@ -19,7 +19,7 @@ from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
 from rigkit.validation.monitoring.evidence import FreshView, Monitored
-from rigkit.validation.monitoring.judge import CalibrationCheck, check_views
+from rigkit.validation.monitoring.verdict import CalibrationCheck, check_views
 from rigkit.validation.monitoring.watch import monitored_camera
 
 NOISE_PX = 0.03

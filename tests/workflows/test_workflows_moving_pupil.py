@@ -25,7 +25,7 @@ from rigkit.core.measurement_task import Quantity, Task
 from rigkit.io.calibrations.calibration_file import calibration_text, load_calibration, load_camera, save_calibration
 from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.monitoring.evidence import FreshView
-from rigkit.validation.monitoring.judge import check_views
+from rigkit.validation.monitoring.verdict import check_views
 from rigkit.workflows.checks.certify import certify_file
 from rigkit.workflows.checks.check import fixed_text, load_monitored
 from rigkit.workflows.checks.diff import CameraPair, diff

@@ -25,7 +25,7 @@ from rigkit.io.calibrations.rig_file import load_saved_rig, rig_text
 from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.monitoring.change_aim import informative_views
 from rigkit.validation.monitoring.evidence import FreshView
-from rigkit.validation.monitoring.judge import check_views
+from rigkit.validation.monitoring.verdict import check_views
 from rigkit.validation.monitoring.watch import monitored_rig
 from rigkit.workflows.calibration.next_pictures import next_frames
 from rigkit.workflows.checks.certify import certify_file

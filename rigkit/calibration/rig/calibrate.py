@@ -16,8 +16,8 @@ from functools import partial
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
 from rigkit.calibration.choosing.candidate_fits import CandidateFits, camera_named_in_errors
 from rigkit.calibration.choosing.models_tried import Request
-from rigkit.calibration.judging.pupil import pupil_is_significant
-from rigkit.calibration.judging.two_kinds import contradicting_images
+from rigkit.calibration.diagnosis.pupil import pupil_is_significant
+from rigkit.calibration.diagnosis.two_kinds import contradicting_images
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig

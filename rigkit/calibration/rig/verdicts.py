@@ -1,4 +1,4 @@
-"""Findings about a rig, in sentences: `rigkit.calibration.judging.verdicts` for several cameras."""
+"""Findings about a rig, in sentences: `rigkit.calibration.diagnosis.verdicts` for several cameras."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from itertools import combinations
 import numpy as np
 
 from rigkit.calibration.certainty.uncertainty import FarProjection
-from rigkit.calibration.judging.pupil import modelled_pupil
-from rigkit.calibration.judging.verdicts import UNCERTAIN_PX, with_headline
+from rigkit.calibration.diagnosis.pupil import modelled_pupil
+from rigkit.calibration.diagnosis.verdicts import UNCERTAIN_PX, with_headline
 from rigkit.calibration.rig.certainty.uncertainty import transfer_uncertainty
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.findings import Finding

@@ -17,7 +17,7 @@ from rigkit.core.printing import brief
 from rigkit.io.disk.json_reader import integer, parse_json, real
 from rigkit.io.disk.reading import MAX_NUMBER, read_text
 from rigkit.io.disk.writing import ensure_writable
-from rigkit.validation.monitoring.judge import CalibrationCheck
+from rigkit.validation.monitoring.verdict import CalibrationCheck
 
 HISTORY_SCHEMA = "rigkit.history/1"
 ABSOLUTE_ZERO_C = -273.15

@@ -17,8 +17,8 @@ from rigkit.planning.goal import px_words
 from rigkit.report import svg
 from rigkit.report.pages.page_facts import PageFacts, build_facts_page
 from rigkit.report.svg import DRAWN_WIDTH, INK
-from rigkit.validation.monitoring.judge import ALARM_CHANCE, ALARM_PX, Baseline, CalibrationCheck, Change
 from rigkit.validation.monitoring.power import FOUND, TIMES, Power
+from rigkit.validation.monitoring.verdict import ALARM_CHANCE, ALARM_PX, Baseline, CalibrationCheck, Change
 
 ARROWS = (21, 16)
 ARROW_LENGTH = 0.05

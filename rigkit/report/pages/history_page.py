@@ -14,7 +14,7 @@ from rigkit.report import svg
 from rigkit.report.pages.page_facts import PageFacts, build_facts_page
 from rigkit.report.svg import DRAWN_WIDTH, INK, SOFT, WRONG
 from rigkit.validation.monitoring.drift import HeatDrift, heat_drift
-from rigkit.validation.monitoring.judge import ALARM_CHANCE
+from rigkit.validation.monitoring.verdict import ALARM_CHANCE
 
 DRIFT_HEIGHT, LEFT_MARGIN = 190.0, 56.0
 ZERO_HEIGHT = 0.5 * (DRIFT_HEIGHT - 24.0)

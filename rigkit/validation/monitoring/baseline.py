@@ -22,7 +22,7 @@ from scipy.special import fdtrc
 from rigkit.core.errors import InputError
 from rigkit.planning.goal import Goal
 from rigkit.validation.monitoring.evidence import FreshEvidence, Monitored
-from rigkit.validation.monitoring.judge import (
+from rigkit.validation.monitoring.verdict import (
     Baseline,
     CalibrationCheck,
     Look,

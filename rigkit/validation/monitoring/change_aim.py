@@ -24,8 +24,8 @@ from rigkit.planning.plan import Plan, choose_views, covariance_of
 from rigkit.validation.monitoring.evidence import FreshEvidence, Monitored
 from rigkit.validation.monitoring.frames import Frames
 from rigkit.validation.monitoring.hypotheses import Hypothesis, hypotheses_of, lens_goals, turn_weight
-from rigkit.validation.monitoring.judge import ALARM_CHANCE
 from rigkit.validation.monitoring.power import LENS_KINDS, Power, powers_of
+from rigkit.validation.monitoring.verdict import ALARM_CHANCE
 from rigkit.validation.monitoring.whitened import NULL_RANK
 
 

@@ -36,7 +36,7 @@ from rigkit.optim.robust_scale import robust_sigma
 from rigkit.planning.goal import Goal
 from rigkit.planning.information import MIN_SIGMA_PX
 from rigkit.validation.monitoring.evidence import FreshEvidence, Monitored
-from rigkit.validation.monitoring.judge import CalibrationCheck, evaluate_evidence
+from rigkit.validation.monitoring.verdict import CalibrationCheck, evaluate_evidence
 from rigkit.validation.monitoring.whitened import MIN_FREE_VARIANCE, disagreement
 
 FEATURES = 2500

@@ -17,7 +17,7 @@ from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.detections import BoardView, grid_turned
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.validation.monitoring.evidence import FreshView, Monitored, evidence_of
-from rigkit.validation.monitoring.judge import check_views, exceeds_expected, unchanged_px
+from rigkit.validation.monitoring.verdict import check_views, exceeds_expected, unchanged_px
 
 MIN_SHARE_FLIPPED = 0.01
 """Smallest displacement of the principal point by a flip, of the longer side: a knock could cause a smaller one. REAL

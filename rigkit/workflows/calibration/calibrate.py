@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.coverage import outline_of_corners
-from rigkit.calibration.judging.verdicts import diagnose, diagnose_session
+from rigkit.calibration.diagnosis.verdicts import diagnose, diagnose_session
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_ties import suggest_rigid_boards
 from rigkit.calibration.rig.calibrate import calibrate_rig

@@ -45,7 +45,7 @@ from rigkit.validation.monitoring.baseline import check_since
 from rigkit.validation.monitoring.epipolar import evidence_of_matches, matches_of_scenes
 from rigkit.validation.monitoring.evidence import SAME_BOARD, FreshView, Monitored, evidence_of
 from rigkit.validation.monitoring.flipped import consistently_numbered, flipped_pictures
-from rigkit.validation.monitoring.judge import CalibrationCheck, Look, check_views, evaluate_evidence
+from rigkit.validation.monitoring.verdict import CalibrationCheck, Look, check_views, evaluate_evidence
 from rigkit.validation.monitoring.watch import monitored_camera, monitored_rig
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad

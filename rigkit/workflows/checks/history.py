@@ -28,7 +28,7 @@ from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.planning.information import MIN_SIGMA_PX
 from rigkit.report.pages.history_page import history_page, overwritten
 from rigkit.validation.monitoring.evidence import FreshEvidence, Monitored
-from rigkit.validation.monitoring.judge import evaluate_evidence
+from rigkit.validation.monitoring.verdict import evaluate_evidence
 from rigkit.validation.monitoring.watch import monitored_camera
 from rigkit.workflows.inputs.camera_files import warn_if_bad
 from rigkit.workflows.outputs.provenance import digest_line, digest_of, software_facts

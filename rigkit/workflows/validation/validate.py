@@ -188,15 +188,15 @@ def _validated(
 
 def _fitted_planes(geometry: PairGeometry, job: PairJob[ValidateOptions]) -> FittedPlanes:
     """Return the boards' planes fitted to both images; only the planes that are checked must exist."""
-    judging = job.options.planes or job.pair.planes
+    chosen = job.options.planes or job.pair.planes
     found: dict[Planes, BoardPlanes] = {}
     for planes in PLANE_CHOICES[1:]:
         try:
             found[planes] = planes_of(geometry, planes, *job.cameras.of(job.pair))
         except DegenerateError:
-            if planes == judging:
+            if planes == chosen:
                 raise
-    return FittedPlanes(found.get("coplanar"), found.get("lattice"), judging)
+    return FittedPlanes(found.get("coplanar"), found.get("lattice"), chosen)
 
 
 def _shifts(

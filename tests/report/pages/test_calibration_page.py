@@ -14,7 +14,7 @@ from helpers.calibration_scenes import BOARD, lens, random_views, with_outliers
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.departures import Departures
 from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty
-from rigkit.calibration.judging.verdicts import diagnose
+from rigkit.calibration.diagnosis.verdicts import diagnose
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.with_pupil import CENTRAL, MOVING, kept_central
 from rigkit.cameras.eucm import EUCM

@@ -18,7 +18,7 @@ from rigkit.report.pages.check_page import check_facts
 from rigkit.validation.monitoring.baseline import check_since
 from rigkit.validation.monitoring.epipolar import PairMatches, evidence_of_matches
 from rigkit.validation.monitoring.evidence import FreshEvidence, FreshView, Monitored, evidence_of
-from rigkit.validation.monitoring.judge import ALARM_CHANCE, Look, evaluate_evidence
+from rigkit.validation.monitoring.verdict import ALARM_CHANCE, Look, evaluate_evidence
 
 MOUNT = Rigid3(exp_so3(np.array([0.01, -0.08, 0.02])), [-120.0, 2.0, 3.0])
 MATCH_NOISE_PX = 0.1

@@ -28,8 +28,8 @@ from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.planning.goal import projection_goal
 from rigkit.report.pages.check_page import change_svg, check_facts, check_page
 from rigkit.validation.monitoring.evidence import FreshView, evidence_of
-from rigkit.validation.monitoring.judge import ALARM_CHANCE, check_views
 from rigkit.validation.monitoring.power import FOUND
+from rigkit.validation.monitoring.verdict import ALARM_CHANCE, check_views
 from rigkit.validation.monitoring.watch import monitored_camera
 from rigkit.validation.monitoring.whitened import Whitened
 from rigkit.workflows.checks.check import fixed_text

@@ -30,7 +30,7 @@ from rigkit.validation.monitoring.epipolar import (
     without_alignment_bias,
 )
 from rigkit.validation.monitoring.evidence import FreshEvidence, FreshView, Monitored
-from rigkit.validation.monitoring.judge import ALARM_PX, CalibrationCheck, check_views, evaluate_evidence
+from rigkit.validation.monitoring.verdict import ALARM_PX, CalibrationCheck, check_views, evaluate_evidence
 from rigkit.workflows.calibration.next_pictures import TASK_CELLS, length_goal, length_goals
 
 MATCH_NOISE_PX, FINE_MATCH_NOISE_PX = 0.3, 0.07

@@ -25,8 +25,8 @@ from rigkit.report.pages.plan_page import plan_words
 from rigkit.validation.monitoring.change_aim import informative_views
 from rigkit.validation.monitoring.evidence import FreshEvidence, FreshView, Monitored, board_information
 from rigkit.validation.monitoring.hypotheses import hypotheses_of
-from rigkit.validation.monitoring.judge import ALARM_CHANCE, CalibrationCheck, check_views
 from rigkit.validation.monitoring.power import Power, powers_of
+from rigkit.validation.monitoring.verdict import ALARM_CHANCE, CalibrationCheck, check_views
 from rigkit.validation.monitoring.watch import monitored_camera
 
 NOISE_PX = 0.05

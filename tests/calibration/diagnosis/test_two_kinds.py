@@ -10,7 +10,7 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.judging.two_kinds import CHANCE_OF_GROUPS, MIN_PREDICTED, MIN_SHARE_OF_TWO, ImageScores
+from rigkit.calibration.diagnosis.two_kinds import CHANCE_OF_GROUPS, MIN_PREDICTED, MIN_SHARE_OF_TWO, ImageScores
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board

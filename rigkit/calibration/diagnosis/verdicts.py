@@ -14,8 +14,8 @@ import numpy as np
 
 from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.choosing.models_tried import DISAGREES_WITH_VIEWS
-from rigkit.calibration.judging.boards import diagnose_boards
-from rigkit.calibration.judging.captured import (
+from rigkit.calibration.diagnosis.boards import diagnose_boards
+from rigkit.calibration.diagnosis.captured import (
     ASKED_DEG,
     SMALL_PX,
     Extent,
@@ -26,13 +26,13 @@ from rigkit.calibration.judging.captured import (
     few_repeated,
     hardly_tilted,
 )
-from rigkit.calibration.judging.changing import CHANGES, changing
-from rigkit.calibration.judging.mixed import two_cameras
-from rigkit.calibration.judging.moved import moment
-from rigkit.calibration.judging.pupil import modelled_pupil, moving_pupil
-from rigkit.calibration.judging.two_kinds import KINDS_REMEDY, listed, min_of_a_kind
-from rigkit.calibration.judging.undistorted import undistorted
-from rigkit.calibration.judging.view_evidence import neighbour_correlation
+from rigkit.calibration.diagnosis.changing import CHANGES, changing
+from rigkit.calibration.diagnosis.mixed import two_cameras
+from rigkit.calibration.diagnosis.moved import moment
+from rigkit.calibration.diagnosis.pupil import modelled_pupil, moving_pupil
+from rigkit.calibration.diagnosis.two_kinds import KINDS_REMEDY, listed, min_of_a_kind
+from rigkit.calibration.diagnosis.undistorted import undistorted
+from rigkit.calibration.diagnosis.view_evidence import neighbour_correlation
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.views.observations import Observations

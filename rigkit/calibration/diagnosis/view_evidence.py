@@ -18,7 +18,7 @@ MIN_INFORMATIVE_CORNERS = 20
 """A view with fewer corners has too few degrees of freedom after its pose."""
 MIN_INFORMATIVE_VIEWS = 6
 CORNERS_AT_ONCE = 20_000
-"""Corners whose rows are in memory at a time: 1.6 kB each, in `judging.pupil` twice as much."""
+"""Corners whose rows are in memory at a time: 1.6 kB each, in `diagnosis.pupil` twice as much."""
 MIN_OWN_PART = 1e-6
 """Part of a kind of change (its length) that pose and earlier kinds must not absorb."""
 MIN_COMMON_PART = 1e-6

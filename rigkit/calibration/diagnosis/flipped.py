@@ -18,8 +18,8 @@ import numpy as np
 
 from rigkit.calibration.assemble import with_solution
 from rigkit.calibration.choosing.board_orientation import with_boards_renumbered
-from rigkit.calibration.judging.two_kinds import SIGMAS_DO_NOT_HOLD, ImageScores
-from rigkit.calibration.judging.view_evidence import ViewEvidence, columns_of, view_evidence
+from rigkit.calibration.diagnosis.two_kinds import SIGMAS_DO_NOT_HOLD, ImageScores
+from rigkit.calibration.diagnosis.view_evidence import ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.poses import START_TOLERANCE, refine_poses

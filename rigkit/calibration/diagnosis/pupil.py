@@ -23,9 +23,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.certainty.uncertainty import FarProjection
-from rigkit.calibration.judging.captured import SMALL_PX
-from rigkit.calibration.judging.changing import MIN_NEIGHBOUR_CORRELATION
-from rigkit.calibration.judging.view_evidence import (
+from rigkit.calibration.diagnosis.captured import SMALL_PX
+from rigkit.calibration.diagnosis.changing import MIN_NEIGHBOUR_CORRELATION
+from rigkit.calibration.diagnosis.view_evidence import (
     CHANGE_COLUMNS,
     MIN_INFORMATIVE_CORNERS,
     columns_of,

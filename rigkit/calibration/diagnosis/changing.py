@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.assemble import with_solution
-from rigkit.calibration.judging.drift import drifting
-from rigkit.calibration.judging.flipped import flipped_images
-from rigkit.calibration.judging.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
+from rigkit.calibration.diagnosis.drift import drifting
+from rigkit.calibration.diagnosis.flipped import flipped_images
+from rigkit.calibration.diagnosis.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.solver import solve

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigkit.calibration.judging.two_kinds import listed
+from rigkit.calibration.diagnosis.two_kinds import listed
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.views.repeats import close_pairs
 from rigkit.core.arrays import FloatArray, IntArray

@@ -11,7 +11,7 @@ from helpers.session_scenes import poses, seen
 
 from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.judging.boards import _spacing, _unseen_rows
+from rigkit.calibration.diagnosis.boards import _spacing, _unseen_rows
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.core.boards import Board
 from rigkit.core.findings import Severity, worst

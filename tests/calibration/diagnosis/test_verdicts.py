@@ -11,11 +11,11 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.judging import verdicts
-from rigkit.calibration.judging.captured import stretched_images
-from rigkit.calibration.judging.changing import CHANGES
-from rigkit.calibration.judging.two_kinds import ImageScores
-from rigkit.calibration.judging.verdicts import diagnose_session
+from rigkit.calibration.diagnosis import verdicts
+from rigkit.calibration.diagnosis.captured import stretched_images
+from rigkit.calibration.diagnosis.changing import CHANGES
+from rigkit.calibration.diagnosis.two_kinds import ImageScores
+from rigkit.calibration.diagnosis.verdicts import diagnose_session
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit, fit_model, identifiable
 from rigkit.calibration.solving.linearise import normal_equations

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.judging.two_kinds import (
+from rigkit.calibration.diagnosis.two_kinds import (
     CHANCE_OF_GROUPS,
     CHANCE_OF_TIME,
     KINDS_REMEDY,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.calibration.judging.view_evidence import ViewEvidence, columns_of
+from rigkit.calibration.diagnosis.view_evidence import ViewEvidence, columns_of
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import image_center
 from rigkit.core.findings import Finding

@@ -12,10 +12,10 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty
 from rigkit.calibration.compare import compare_calibrations
-from rigkit.calibration.judging.changing import changing
-from rigkit.calibration.judging.pupil import PUPIL_SIGNIFICANCE, MovingPupil, pupil_is_significant, solved_again
-from rigkit.calibration.judging.verdicts import diagnose
-from rigkit.calibration.judging.view_evidence import neighbour_correlation, view_evidence
+from rigkit.calibration.diagnosis.changing import changing
+from rigkit.calibration.diagnosis.pupil import PUPIL_SIGNIFICANCE, MovingPupil, pupil_is_significant, solved_again
+from rigkit.calibration.diagnosis.verdicts import diagnose
+from rigkit.calibration.diagnosis.view_evidence import neighbour_correlation, view_evidence
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.with_pupil import CENTRAL, MOVING
@@ -283,7 +283,7 @@ def test_the_number_of_corners_in_a_block_of_rows_does_not_change_the_pupil(monk
 
     whole = reported()
     # Two of the views, of 54 corners each, at once.
-    monkeypatch.setattr("rigkit.calibration.judging.view_evidence.CORNERS_AT_ONCE", 120)
+    monkeypatch.setattr("rigkit.calibration.diagnosis.view_evidence.CORNERS_AT_ONCE", 120)
     np.testing.assert_array_equal(reported(), whole)
 
 

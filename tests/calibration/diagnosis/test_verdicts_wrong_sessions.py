@@ -12,9 +12,9 @@ from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 from helpers.session_scenes import NOISE_PX, poses, seen
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.judging.changing import CHANGES, MIN_NEIGHBOUR_CORRELATION, changing
-from rigkit.calibration.judging.verdicts import diagnose
-from rigkit.calibration.judging.view_evidence import neighbour_correlation, view_evidence
+from rigkit.calibration.diagnosis.changing import CHANGES, MIN_NEIGHBOUR_CORRELATION, changing
+from rigkit.calibration.diagnosis.verdicts import diagnose
+from rigkit.calibration.diagnosis.view_evidence import neighbour_correlation, view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.compare import compare_cameras
