@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, GreyImage
@@ -17,22 +19,10 @@ class TagRules(Struct):
     """The constants of the model of a tag and its fit."""
 
 
-def fit_tags(
-    image: GreyImage,
-    maps: FloatArray,
-    centres: FloatArray,
-    scales: FloatArray,
-    ink: BoolArray,
-    breaks: FloatArray,
-    reach: float,
-    blur: FloatArray,
-    contrast: FloatArray,
-    curvature_sigma: FloatArray,
-    rules: TagRules,
-) -> FloatArray:
-    """Return the outcomes of N tags, (N, 16).
+class TagsToFit(NamedTuple):
+    """N tags in an image and the state that their fit starts from, in the order of the kernel `fit_tags`.
 
-    Parameters
+    Attributes
     ----------
     maps : (N, 2, 10) polynomials of 1, u, v, uu, uv, vv, uuu, uuv, uvv, vvv, (u, v) the position from `centres` (N, 2)
         over `scales` (N,): the place in the tag, (0, 0) to (1, 1).
@@ -41,8 +31,20 @@ def fit_tags(
     blur, contrast : (N,) initial values.
     curvature_sigma : (N,) standard deviation of the middles of the sides relative to their ends, px.
     """
-    capacity = int((2.0 * (1.0 + 2.0 * reach) * float(np.max(scales, initial=1.0)) / TAG_SIDE + 2.0) ** 2)
-    out = kernels().fit_tags(
-        image, maps, centres, scales, ink, breaks, reach, blur, contrast, curvature_sigma, rules, capacity
-    )
-    return np.asarray(out)
+
+    maps: FloatArray
+    centres: FloatArray
+    scales: FloatArray
+    ink: BoolArray
+    breaks: FloatArray
+    reach: float
+    blur: FloatArray
+    contrast: FloatArray
+    curvature_sigma: FloatArray
+
+
+def fit_tags(image: GreyImage, tags: TagsToFit, rules: TagRules) -> FloatArray:
+    """Return the outcomes of N tags, (N, 16)."""
+    largest = float(np.max(tags.scales, initial=1.0))
+    capacity = int((2.0 * (1.0 + 2.0 * tags.reach) * largest / TAG_SIDE + 2.0) ** 2)
+    return np.asarray(kernels().fit_tags(image, *tags, rules, capacity))

@@ -7,7 +7,7 @@ import pytest
 from kernels.reference.tags import picture
 
 from rigkit.detection.tags.whole_tags import WHOLE_ROUNDS, WHOLE_RULES
-from rigkit.kernels.tags import fit_tags
+from rigkit.kernels.tags import TagsToFit, fit_tags
 
 SERIES_PX = 8e-3
 """Moves of 0.1 px turn and stretch edges, whose blur keeps its width; sampled pictures have steps of 0.06 px."""
@@ -32,15 +32,18 @@ def projected(name: str) -> tuple[np.ndarray, np.ndarray]:
     return maps, ink
 
 
+def start(maps: np.ndarray, ink: np.ndarray, *, blur_px: float = 0.8, contrast: float = 120.0) -> TagsToFit:
+    """Return one tag with what its fit starts from."""
+    given = maps[None], CENTRE[None], np.array([SCALE]), ink[None], BREAKS, 0.2
+    return TagsToFit(*given, np.array([blur_px]), np.array([contrast]), np.array([1e-3]))
+
+
 @pytest.mark.parametrize("blur_px", [0.5, 0.76, 1.0])
 @pytest.mark.parametrize("name", SHAPES)
 def test_a_picture_of_the_model_gives_its_numbers_back(name: str, blur_px: float) -> None:
     maps, ink = projected(name)
     image = picture((42, 40), maps, CENTRE, SCALE, MOVES, ink, BREAKS, blur_px, 190.0, 160.0).astype(np.float32)
-    found = fit_tags(
-        *(image, maps[None], CENTRE[None], np.array([SCALE]), ink[None], BREAKS, 0.2),
-        *(np.array([0.8]), np.array([120.0]), np.array([1e-3]), WHOLE_RULES),
-    )[0]
+    found = fit_tags(image, start(maps, ink), WHOLE_RULES)[0]
     assert found[15] == 1.0
     assert np.abs(found[:8].reshape(4, 2) - MOVES).max() < SERIES_PX
     assert found[12] == pytest.approx(blur_px, abs=0.02)
@@ -53,10 +56,7 @@ def test_sigmas_are_those_of_the_errors(rng: np.random.Generator) -> None:
     off = []
     for _ in range(100):
         image = (clean + rng.normal(0.0, 4.0, clean.shape)).astype(np.float32)
-        found = fit_tags(
-            *(image, maps[None], CENTRE[None], np.array([SCALE]), ink[None], BREAKS, 0.2),
-            *(np.array([0.8]), np.array([120.0]), np.array([1e-3]), WHOLE_RULES),
-        )[0]
+        found = fit_tags(image, start(maps, ink), WHOLE_RULES)[0]
         off.append((found[:8].reshape(4, 2) - MOVES) / found[8:12, None])
     # 800 numbers: 5 per cent are two standard deviations.
     assert 0.95 < np.sqrt(np.mean(np.square(off))) < 1.08
@@ -66,11 +66,8 @@ def test_what_is_left_is_noise_where_corners_were_right_from_the_start(rng: np.r
     """Then the first step moves nothing, and the light is not fitted yet."""
     maps, ink = projected("straight")
     image = picture((42, 40), maps, CENTRE, SCALE, np.zeros((4, 2)), ink, BREAKS, 0.76, 190.0, 160.0)
-    found = fit_tags(
-        (image + rng.normal(0.0, 2.0, image.shape)).astype(np.float32),
-        *(maps[None], CENTRE[None], np.array([SCALE]), ink[None], BREAKS, 0.2),
-        *(np.array([0.76]), np.array([160.0]), np.array([1e-3]), WHOLE_ROUNDS[0]),
-    )[0]
+    noisy = (image + rng.normal(0.0, 2.0, image.shape)).astype(np.float32)
+    found = fit_tags(noisy, start(maps, ink, blur_px=0.76, contrast=160.0), WHOLE_ROUNDS[0])[0]
     # 250 pixels: their rms is known to a twentieth.
     assert found[14] == pytest.approx(2.0, rel=0.15)
 
@@ -79,10 +76,9 @@ def test_a_tag_outside_the_image_is_not_valid() -> None:
     maps, ink = projected("straight")
     image = np.full((40, 42), 100.0, np.float32)
     centres = np.array([[-60.0, 10.0], [np.nan, 10.0], [20.0, 20.0]])
-    found = fit_tags(
-        *(image, np.repeat(maps[None], 3, axis=0), centres, np.full(3, SCALE), np.repeat(ink[None], 3, axis=0), BREAKS),
-        *(0.2, np.full(3, 0.8), np.full(3, 120.0), np.full(3, 0.01), WHOLE_RULES),
-    )
+    three = np.repeat(maps[None], 3, axis=0), centres, np.full(3, SCALE), np.repeat(ink[None], 3, axis=0), BREAKS, 0.2
+    tags = TagsToFit(*three, np.full(3, 0.8), np.full(3, 120.0), np.full(3, 0.01))
+    found = fit_tags(image, tags, WHOLE_RULES)
     assert not found[:2, 15].any()
     # Of even paper nothing says where corners are.
     assert found[2, 15] == 0.0 or found[2, 13] == pytest.approx(0.0, abs=1.0)

@@ -34,7 +34,7 @@ from rigkit.detection.subpixel.whole_board import PICTURE_SIGMAS
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import SmoothMap
 from rigkit.kernels.tag_board import tag_heights
-from rigkit.kernels.tags import TagRules, fit_tags
+from rigkit.kernels.tags import TagRules, TagsToFit, fit_tags
 
 NARROW_BLURS = 2.0 * MARKER_BLURS
 """Width of a border, in s, below which the windows of all its corners contain the code. On real images of a grid,
@@ -111,11 +111,18 @@ def with_whole_tags(
     maps, centres, scales = _maps(places[row, column], corners, smooth)
     ink, breaks = _ink(tags)
     step = 1.0 if tags.pattern.corner_squares else PAPER_STEP
-    found = fit_tags(
-        *(image, maps, centres, scales, ink[row // 2, column // 2], breaks, 0.5 * tags.pattern.spacing),
-        *(np.full(len(row), blur), step * np.nanmean(state.contrast[mine], axis=1)),
-        *(CURVATURE_SIGMAS * np.maximum(np.nanmedian(state.sigma_px[mine], axis=1), smooth.scatter()), rules),
+    start = TagsToFit(
+        maps=maps,
+        centres=centres,
+        scales=scales,
+        ink=ink[row // 2, column // 2],
+        breaks=breaks,
+        reach=0.5 * tags.pattern.spacing,
+        blur=np.full(len(row), blur),
+        contrast=step * np.nanmean(state.contrast[mine], axis=1),
+        curvature_sigma=CURVATURE_SIGMAS * np.maximum(np.nanmedian(state.sigma_px[mine], axis=1), smooth.scatter()),
     )
+    found = fit_tags(image, start, rules)
     moves = found[:, :8].reshape(-1, 4, 2)
     furthest = np.sqrt((moves**2).sum(axis=2)).max(axis=1)
     good = (found[:, 15] > 0.5) & (found[:, 13] > 0.0)
@@ -150,7 +157,7 @@ def _predicted(state: BoardState, predicted: FloatArray, shape: tuple[int, ...])
 
 
 def _maps(first: FloatArray, corners: FloatArray, smooth: SmoothMap) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the maps from the image to N tags, their centres and scales, as for `kernels.tags.fit_tags`.
+    """Return the maps from the image to N tags, their centres and scales, as for `kernels.tags.TagsToFit`.
 
     `first` (N, 2) are the places of the tags' first corners on the board, `corners` (N, 4, 2) the pixels of all.
     """
