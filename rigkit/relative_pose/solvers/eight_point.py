@@ -1,7 +1,8 @@
 """The normalised linear solution: eight points, three affine correspondences, or more of both.
 
 Rays are normalised by their second moment, T_i = (mean f f^T)^(-1/2). For a narrow field of view this is equivalent to
-Hartley's translation and scaling of pixels; it also works for the widest fisheye.
+translation and scaling of pixels (R. Hartley, "In defense of the eight-point algorithm", 1997); it also works for the
+widest fisheye.
 """
 
 from __future__ import annotations
