@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from rigkit.detection.circles.lattices import LabelledBlobs
 
 
-def find_grids(grey: GreyImage, min_circles: int = MIN_CIRCLES) -> list[CircleGrid]:
+def find_grids(grey: GreyImage) -> list[CircleGrid]:
     """Return the grids of circles in `grey`, the largest first."""
-    return CircleSearch(grey).grids(min_circles)
+    return CircleSearch(grey).grids()
 
 
 class CircleSearch:
