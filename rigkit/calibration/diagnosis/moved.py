@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.diagnosis.two_kinds import (
+    CHANCE,
     CHANCE_OF_GROUPS,
-    CHANCE_OF_TIME,
     KINDS_REMEDY,
     MIN_OF_A_KIND,
     MIN_PREDICTED,
@@ -86,7 +86,7 @@ def moved_lens(observations: Observations, fit: Fit, *, tests: int = 1) -> tuple
     if apart is None:
         return ()
     chance = tests * splits.scores.chance(observations.clusters(), splits.number, tests)
-    if chance > CHANCE_OF_TIME:
+    if chance > CHANCE:
         return ()
     message = (
         f"the lens (or the board) changed at image '{images[first]}' ({apart.sigmas:.0f} standard deviations, p <= "

@@ -57,7 +57,7 @@ MIN_PREDICTED = 0.75
 """Part of the images, weighted by how clearly their other halves tell, whose halves must tell the same lens, minus the
 part that tell different ones: 1 where each image is of one of two lenses, 0 where its halves agree by chance. REAL:
 -1.0, -0.4, 0.62 and 0.64 for groups in parts of sessions of one camera, 0.93 to 1.0 where all of two are named."""
-DRAWN_ORDERS, CHANCE_OF_TIME = 199, 0.02
+DRAWS, CHANCE = 199, 0.02
 """Number of random draws or orders, and the largest part of these orders that may separate the images as well as time
 does."""
 CHANCE_OF_GROUPS = 0.01
@@ -221,15 +221,15 @@ class ImageScores:
             rest, back = self.score - along * amount[:, None], self.information
             spread = np.sqrt(explained / float((along @ (other - first)).sum())) * (other - first)[None]
         rng, reached = np.random.default_rng(0), 1
-        for _ in range(DRAWN_ORDERS):
+        for _ in range(DRAWS):
             even = np.sqrt(12.0) * (rng.random((len(own), len(spread))) - 0.5) @ spread
             score = rest + (back @ even[..., None])[..., 0]
             # Of one lens that was fitted to all of them.
             drawn = replace(self, score=score - self.information @ score.sum(axis=0)).best_split()
             reached += drawn is not None and drawn[1] >= share
-            if reached > CHANCE_OF_GROUPS * (DRAWN_ORDERS + 1):
+            if reached > CHANCE_OF_GROUPS * (DRAWS + 1):
                 return 1.0
-        return reached / (DRAWN_ORDERS + 1)
+        return reached / (DRAWS + 1)
 
     def _own_amounts(self) -> tuple[FloatArray, FloatArray]:
         """Return the images' scores on combinations of unit information (N, P), whose squares are what a lens of its
@@ -264,17 +264,17 @@ class ImageScores:
 
     def chance(self, clusters: IntArray, number: IntArray, tests: int = 1) -> float:
         """Return the p-value of the permutation test: the part of random orders with a split at least as good as in the
-        true order; 1 as soon as it exceeds `CHANCE_OF_TIME` / `tests`. Near-duplicates, views (V,) of one cluster, stay
+        true order; 1 as soon as it exceeds `CHANCE` / `tests`. Near-duplicates, views (V,) of one cluster, stay
         together; `number` (V,) is the index of each view's image."""
         of_image = np.zeros(len(self.score), np.int64)
         of_image[number] = clusters
         found = self.gains(np.arange(len(of_image))).max()
         rng, reached = np.random.default_rng(0), 1
-        for _ in range(DRAWN_ORDERS):
+        for _ in range(DRAWS):
             reached += bool(self.gains(np.argsort(rng.random(of_image.max() + 1)[of_image])).max() >= found)
-            if tests * reached > CHANCE_OF_TIME * (DRAWN_ORDERS + 1):
+            if tests * reached > CHANCE * (DRAWS + 1):
                 return 1.0
-        return reached / (DRAWN_ORDERS + 1)
+        return reached / (DRAWS + 1)
 
 
 def _of_images(fit: Fit, products: FloatArray, number: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -108,8 +108,8 @@ def without_inconsistent(item: RefinedLattice, parts: Sequence[tuple[slice, slic
     off = item.lattice.pixels[known] - shape.pixels
     distance = np.hypot(off[:, 0], off[:, 1])
     # Predictions from a few corners on one side are not reliable.
-    tested = np.zeros_like(known)
-    tested[known] = (shape.support >= MIN_CHECKED) & (shape.gain < 1.5)
+    judged = np.zeros_like(known)
+    judged[known] = (shape.support >= MIN_CHECKED) & (shape.gain < 1.5)
     cells = spread(distance / shape.cell_px())
     excess = spread(distance / (item.sigma_px[known] * np.hypot(1.0, shape.gain)))
     gain = spread(shape.gain)
@@ -119,7 +119,7 @@ def without_inconsistent(item: RefinedLattice, parts: Sequence[tuple[slice, slic
     alone = known & (around == 1)
     drop = np.zeros_like(known)
     for part in parts:
-        here, sure = known[part], tested[part]
+        here, sure = known[part], judged[part]
         if here.sum() < MIN_CHECKED:
             continue
         drop[part] = alone[part] | uncertain_outliers(item.sigma_px[part], cells[part], gain[part])
