@@ -15,7 +15,7 @@ from rigkit.calibration.rig.views.frames import target_poses
 from rigkit.calibration.rig.views.observations import RigViews
 from rigkit.core.arrays import FloatArray
 from rigkit.core.findings import Finding
-from rigkit.optim.robust_scale import robust_sigma
+from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 MIN_FRAMES_OF_BOARD = 3
 """Fewest frames of a board for an estimate of the scatter."""
@@ -53,7 +53,8 @@ def board_size_conflicts(views: RigViews) -> tuple[Finding, ...]:
 
 def _error(values: FloatArray) -> float:
     """Return the standard error of the median of values (N,)."""
-    return float(np.sqrt(0.5 * np.pi / len(values))) * robust_sigma(values - np.median(values))
+    spread = SIGMA_OF_MEDIAN * float(np.median(np.abs(values - np.median(values))))
+    return float(np.sqrt(0.5 * np.pi / len(values))) * spread
 
 
 def _finding(cameras: tuple[str, str], boards: tuple[str, str], typical_mm: tuple[float, float]) -> Finding:
