@@ -134,7 +134,7 @@ class Camera(ABC):
         if array.size and np.abs(array).max() > MAX_PARAMETER:
             worst = int(np.argmax(np.abs(array)))
             raise InputError(
-                f"{self.model} camera: {names[worst]} = {array[worst]:g} is beyond +-{MAX_PARAMETER:g}, no lens's; "
+                f"{self.model} camera: {names[worst]} = {array[worst]:g} is beyond ±{MAX_PARAMETER:g}, no lens's; "
                 "check the number and its unit"
             )
         with np.errstate(all="ignore"):

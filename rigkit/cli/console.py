@@ -85,9 +85,9 @@ def _argument_of(own: Any, default: Any, places: list[str]) -> dict[str, Any]:
 
 
 def file_path(text: str) -> Path:
-    """Return the path of a file; raises InputError for a text that ends as folders do."""
+    """Return the path of a file; raises ArgumentTypeError, to which argparse adds the option, for one of a folder."""
     if text.endswith(("/", os.sep)):
-        raise InputError(f"'{text}' names a folder; give a file in it")
+        raise argparse.ArgumentTypeError(f"'{text}' names a folder; give a file in it")
     return Path(text)
 
 

@@ -55,7 +55,7 @@ def _words(found: BoardDetection) -> str:
 
     name = f"{found.board_id} " if found.board_id else ""
     sigma = float(np.median(found.sigma_px))
-    return f"{name}{found.columns}x{found.rows} {len(found.grid)} corners +-{sigma:.3f} px"
+    return f"{name}{found.columns}x{found.rows} {len(found.grid)} corners ±{sigma:.3f} px"
 
 
 def _summary(found: BoardDetection) -> dict[str, Any]:

@@ -46,7 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     is_cloud = args.source.is_dir() or args.source.suffix in (".toml", ".ply")
-    args.output = Path(args.output) if is_cloud and args.to in (None, "colmap") else file_path(args.output)
+    try:
+        args.output = Path(args.output) if is_cloud and args.to in (None, "colmap") else file_path(args.output)
+    except argparse.ArgumentTypeError as error:
+        raise InputError(f"export: -o/--output: {error}") from error
     if is_cloud:
         return _export_cloud(args)
     if args.single_precision:

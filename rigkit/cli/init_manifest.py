@@ -186,11 +186,10 @@ def _parse_baselines(declared: Sequence[str], pairs: Sequence[str]) -> dict[str,
     # Images without any pair are refused afterwards, with how to name them.
     for text in declared if pairs else ():
         name, of, value = text.rpartition("=")
-        number, _, sigma = value.partition("+-")
+        number, stated, sigma = value.partition("+-")
         if not of and len(pairs) > 1:
-            raise InputError(
-                f"init: --baseline-mm '{text}' names no pair: write PAIR=MM+-SIGMA, such as {pairs[0]}={text}"
-            )
+            example = f"{pairs[0]}={text}{'' if stated else '+-2'}"
+            raise InputError(f"init: --baseline-mm '{text}' names no pair: write PAIR=MM+-SIGMA, such as {example}")
         name = name if of else pairs[0]
         if name not in pairs:
             raise InputError(f"init: --baseline-mm names '{name}'; pairs found: {', '.join(sorted(pairs))}")

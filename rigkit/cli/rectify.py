@@ -23,12 +23,11 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("image", metavar="IMAGE|FOLDER|VIDEO", help="image as captured, a folder of images, or a video")
     parser.add_argument(
-        "image2",
-        metavar="IMAGE2|FOLDER2|VIDEO2",
-        nargs="?",
-        help="taken at the same time by another camera of the rig: rectifies a stereo pair",
+        "images",
+        nargs="+",
+        metavar="IMAGE|FOLDER|VIDEO",
+        help="images as captured, folders or videos; with --rig of two cameras, taken at the same time",
     )
     parser.add_argument("--camera", metavar="CALIB", help="the camera's calibration.json")
     add_options(parser, RectifyOptions, output="-o OUT", maps="FILE.npz", force="")
@@ -65,17 +64,19 @@ def run(args: argparse.Namespace) -> int:
         angles_deg=(args.yaw_deg, args.pitch_deg, args.roll_deg),
         size_px=None if args.size is None else size_of_words(args.size),
     )
-    if args.image2 is None and args.rig is None:
+    if args.rig is None:
         if args.camera is None:
-            raise InputError("rectify: --camera is missing; give the camera's calibration.json")
-        done = rectify_image(args.image, args.camera, options, progress=progress_on_stderr())
+            raise InputError(
+                "rectify: give --camera CALIBRATION.json, of one camera, or --rig RIG.json, of that of a stereo pair"
+            )
+        done = rectify_image(args.images, args.camera, options, progress=progress_on_stderr())
         found = [_figures(one, args.projection) for one in done.images]
-        result = {"images": found} if holds_several(args.image) else found[0]
-    elif args.rig is None or (args.image2 is None and not Path(args.image).is_dir()):
-        raise InputError("rectify: a stereo pair needs two images, or a folder of both cameras', and --rig RIG.json")
+        result = {"images": found} if holds_several(args.images) else found[0]
+    elif len(args.images) > 2 or (len(args.images) == 1 and not Path(args.images[0]).is_dir()):
+        raise InputError("rectify: --rig needs two images, folders or videos, or one folder of both cameras' images")
     else:
         names = None if args.names is None else tuple(args.names)
-        both = args.image if args.image2 is None else (args.image, args.image2)
+        both = tuple(args.images) if len(args.images) == 2 else args.images[0]
         done = rectify_stereo_images(both, args.rig, options, names, progress=progress_on_stderr())
         result = {"images": [_figures(one, args.projection) for one in done.images]}
         if done.pair is not None:

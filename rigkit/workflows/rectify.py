@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rigkit.cameras.pinhole import camera_matrix
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import known_name
-from rigkit.core.printing import brief
+from rigkit.core.printing import brief, counted
 from rigkit.core.progress import Progress, silent
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, npz_bytes, write_atomic, write_together
@@ -85,19 +85,26 @@ class RectificationResult:
 
 
 def rectify_image(
-    image: str | Path, camera: str | Path, options: RectifyOptions, *, progress: Progress = silent
+    image: str | Path | Sequence[str | Path],
+    camera: str | Path,
+    options: RectifyOptions,
+    *,
+    progress: Progress = silent,
 ) -> RectificationResult:
-    """Resample an image, or all images of a folder or video, to an ideal camera; `camera` is the calibration file.
+    """Resample an image, all images of a folder or video, or several of these, to an ideal camera; `camera` is the
+    calibration file.
 
     An image that cannot be read or has another size goes into `failures`; its error is raised if it is the only image.
     Raises InputError for a view outside the camera's field, a damaged calibration, or a file that cannot be written.
     """
-    if holds_several(image) and options.output.suffix:
-        what = "folder" if Path(image).is_dir() else "video"
-        raise InputError(f"rectify: '{image}' is a {what}, so -o must name a folder, not '{options.output.name}'")
+    given = [Path(image)] if isinstance(image, str | Path) else [Path(one) for one in image]
+    if holds_several(given) and options.output.suffix:
+        what = "are several images" if len(given) > 1 else "is a folder" if given[0].is_dir() else "is a video"
+        named = f"'{given[0]}'" + (", ..." if len(given) > 1 else "")
+        raise InputError(f"rectify: {named} {what}, so -o must name a folder, not '{options.output.name}'")
     with ExitStack() as stack:
-        sources = _sources(Path(image), stack)
-        warn_of_several_cameras([Path(image)])
+        sources = [source for one in given for source in _sources(one, stack)]
+        warn_of_several_cameras(given)
         jobs = _outputs(sources, options.output) if _is_folder(options.output) else [(sources[0], options.output)]
         _ensure_all([out for _, out in jobs], options, (*map(_file, sources), camera))
         source = import_camera(camera)
@@ -118,9 +125,9 @@ def rectify_image(
     return RectificationResult(*done)
 
 
-def holds_several(source: str | Path) -> bool:
-    """Return whether `source` is a folder or a video."""
-    return Path(source).is_dir() or is_video(source)
+def holds_several(sources: Sequence[str | Path]) -> bool:
+    """Return whether `sources` are several, or one folder or video."""
+    return len(sources) > 1 or Path(sources[0]).is_dir() or is_video(sources[0])
 
 
 def rectify_stereo_images(
@@ -288,7 +295,8 @@ def _write(
     jobs: Jobs, covered: Sequence[float], calibration: str | Path, options: RectifyOptions, progress: Progress
 ) -> tuple[tuple[RectifiedImage, ...], dict[str, InputError]]:
     """Resample and write the images of each map in turn; both images of a pair are written together or not at all."""
-    total, done, failures = len(jobs[0][0]), [], {}
+    total, failures = len(jobs[0][0]), dict[str, InputError]()
+    done: list[RectifiedImage] = []
     resamplers = [remap.resampler(options.interpolation) for _, remap in jobs]
     for i in range(total):
         files: dict[Path, str | bytes] = {}
@@ -301,7 +309,11 @@ def _write(
                     raise
                 failures[str(source)] = error
         if len(files) == len(jobs):
-            write_together(files, force=options.force)
+            try:
+                write_together(files, force=options.force)
+            except InputError as error:
+                before = f"; written before it: {counted(len(done), 'image')}" if done else ""
+                raise InputError(f"{error}{before}") from error
             done += [RectifiedImage(job[i][1], m, share) for (job, m), share in zip(jobs, covered, strict=True)]
         progress("rectify", i + 1, total)
     return tuple(done), failures

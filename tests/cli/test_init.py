@@ -144,6 +144,10 @@ def test_a_baseline_of_no_pair(tmp_path: Path, capsys: pytest.CaptureFixture[str
     shutil.copytree(IMAGES / "fisheye-general", tmp_path / "other")
     assert main([*command, "--force"]) == 2
     assert "'120+-1' names no pair: write PAIR=MM+-SIGMA, such as mine=120+-1" in capsys.readouterr().err
+    # A suggestion is one that is taken.
+    command[command.index("120+-1")] = "120"
+    assert main([*command, "--force"]) == 2
+    assert "such as mine=120+-2" in capsys.readouterr().err
 
 
 def test_a_calibration_of_another_image_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from rigkit.cli.main import main
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibrations.calibration_file import camera_to_json, save_camera
+from rigkit.io.disk import writing
 
 ROW_PX = 0.2
 """Centre of a blob of 3 px in 8-bit pixels, thresholded: the frame of the blob is distorted between the views."""
@@ -119,8 +121,15 @@ def test_a_pair_gets_the_same_rows(tmp_path: Path, capsys: pytest.CaptureFixture
     for extra, words in ((["--hfov-deg", "60"], "baseline"), (["--names", "left", "up"], "no camera 'up'")):
         assert main([*arguments, "--force", *extra]) == 2
         assert words in capsys.readouterr().err
-    assert main(["rectify", *images, "--camera", str(rig), "-o", str(tmp_path / "x.png")]) == 2
+    assert main(["rectify", *images, "-o", str(tmp_path / "x.png")]) == 2
     assert "--rig" in capsys.readouterr().err
+    # With one camera these are two images of it.
+    save_camera(tmp_path / "camera.json", CAMERA)
+    alone = ["rectify", *images, "--camera", str(tmp_path / "camera.json"), "--interpolation", "nearest", "-o"]
+    assert main([*alone, str(tmp_path / "x.png")]) == 2
+    assert "several images, so -o must name a folder" in capsys.readouterr().err
+    assert main([*alone, str(tmp_path / "x")]) == 0
+    assert sorted(p.name for p in (tmp_path / "x").iterdir()) == ["left04.png", "right04.png"]
 
 
 def test_folders_of_a_pair_are_rectified_with_their_geometry(
@@ -246,6 +255,24 @@ def test_one_bad_image_does_not_end_a_folder(
     assert main(command) == 2
     reported = capsys.readouterr().err
     assert "c.png" in reported and "e.png" in reported
+
+
+def test_a_disk_that_fills_up_says_what_is_written(
+    files: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fill, out = writing._fill, tmp_path / "out"
+
+    def until_the_second(handle: int, data: bytes) -> None:
+        if any(out.glob("*.png")):
+            os.close(handle)
+            raise OSError(28, "No space left on device")
+        fill(handle, data)
+
+    monkeypatch.setattr(writing, "_fill", until_the_second)
+    two = [str(shutil.copy(files[0], tmp_path / f"{name}.png")) for name in "ab"]
+    assert main(["rectify", *two, "--camera", files[1], "-o", str(out)]) == 2
+    words = "b.png': No space left on device; it stays as it was; written before it: 1 image"
+    assert words in capsys.readouterr().err and [p.name for p in out.iterdir()] == ["a.png"]
 
 
 def test_one_bad_image_of_a_pair_leaves_out_both(

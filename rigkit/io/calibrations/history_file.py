@@ -216,7 +216,7 @@ def add_entry(path: Path, entry: HistoryEntry) -> None:
         finally:
             os.close(handle)
     except OSError as error:
-        raise InputError(f"cannot add to '{path}': {error.strerror}; nothing was changed") from error
+        raise InputError(f"cannot add to '{path}': {error.strerror}; nothing was added") from error
 
 
 def load_history(path: str | Path) -> tuple[HistoryEntry, ...]:

@@ -110,7 +110,8 @@ def write_together(files: Mapping[Path, str | bytes], *, force: bool = False) ->
                     path.unlink()
         if not isinstance(error, OSError):
             raise
-        changed = f"{len(renamed)} of {len(files)} files were replaced" if force and renamed else "nothing was changed"
+        same = "it stays as it was" if len(files) == 1 else f"all {len(files)} files of this step stay as they were"
+        changed = f"{len(renamed)} of {len(files)} files were replaced" if force and renamed else same
         raise InputError(f"cannot write '{target}': {error.strerror}; {changed}") from error
     finally:
         for temporary in staged.values():

@@ -173,7 +173,7 @@ def check_table(check: CalibrationCheck) -> Table:
     """Return the table of possible changes, each as if it alone had happened."""
     rows = []
     for change in check.tried:
-        amounts = change.amounts_with_sigmas("±")
+        amounts = change.amounts_with_sigmas()
         named = check.change is not None and change.hypothesis is check.change.hypothesis
         rows.append(cells(change.hypothesis.words, f"{change.chance:.2g}", Cell(change.gain, best=named), amounts))
     none = cells("these images determine no change", "", None, "")

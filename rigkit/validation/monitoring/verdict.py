@@ -83,10 +83,10 @@ class Change:
             return f"{self.hypothesis.words}: by {self.size_px:.2g} px rms in all"
         return f"{self.hypothesis.words}: {self.amounts_with_sigmas()}"
 
-    def amounts_with_sigmas(self, sign: str = "+-") -> str:
+    def amounts_with_sigmas(self) -> str:
         """Return all amounts with their standard deviations and units."""
         return ", ".join(
-            f"{a:+.3g} {sign} {s:.2g} {unit}"
+            f"{a:+.3g} ± {s:.2g} {unit}"
             for a, s, unit in zip(self.amounts, self.sigmas, self.hypothesis.units, strict=True)
         )
 
