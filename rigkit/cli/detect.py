@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rigkit.cli.aim_arguments import add_board_argument
 from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr
 from rigkit.core.errors import ExitCode, printable
+from rigkit.core.printing import counted
 from rigkit.workflows.options.cameras import DetectOptions
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         shown = len(done.found) - missing
         total = len(done.found) + len(done.failures)
         left_out = f"; {len(done.failures)} cannot be used" if done.failures else ""
-        print(f"{sum(map(len, done.found.values()))} boards in {shown} of {total} images{left_out}")
+        print(f"{counted(sum(map(len, done.found.values())), 'board')} in {shown} of {total} images{left_out}")
     return ExitCode.BAD_INPUT if done.failures else ExitCode.WELL
 
 

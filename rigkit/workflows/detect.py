@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -39,6 +40,8 @@ from rigkit.workflows.inputs.camera_files import import_camera
 from rigkit.workflows.inputs.frames import frames_folder, frames_of_videos
 from rigkit.workflows.inputs.identify_board import suggestion, why_not_detected
 from rigkit.workflows.options.cameras import DetectOptions
+
+_log = logging.getLogger(__name__)
 
 WORTH_PROCESSES = 100
 """Smallest number of images searched in processes by default, whose start takes as long as 30 of 640x480 px: 28 of them
@@ -115,6 +118,10 @@ def detect_in_images(
         raise InputError(f"{next(iter(failures.values()))}{more}")
     if not any(found.values()) and not failures:
         raise CheckFailed(_nothing_found(images, boards, doubtful, progress))
+    if boards and not any(one.board_id for items in found.values() for one in items):
+        why = why_not_detected(images, boards, progress)
+        if why is not None:
+            _log.warning(f"none of the boards given is seen whole: {why}")
     if options.output is not None and any(found.values()):
         write_corners(options.output, found, force=options.force)
     return DetectionResult(found, failures, doubtful)

@@ -143,3 +143,10 @@ def test_images_of_another_board_name_that_board(tmp_path: Path, capsys: pytest.
     assert "they show --board circles:6x5" in capsys.readouterr().err
     assert main(["detect", image, "--board", "aprilgrid:6x6x88,spacing=0.3", "--jobs", "1"]) == 1
     assert "no board 'aprilgrid-6x6x88' found in 1 image; in 1 image a circles board" in capsys.readouterr().err
+
+
+def test_parts_of_a_larger_board_are_not_taken_for_the_given_one(
+    images: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["detect", str(images / "0.png"), "--board", "5x4x30", "--jobs", "1"]) == 0
+    assert "seen whole: in 1 image 9 x 6 inner corners are seen, 5 x 4 are declared" in capsys.readouterr().err
