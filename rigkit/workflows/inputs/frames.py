@@ -77,7 +77,7 @@ def frames_of_videos(
     an earlier call kept of the same videos for the same boards are used again. `timestamps` is a file that assigns
     frames to moments (`io.media.video.read_timestamps`); None: frames of the same number are of one moment.
 
-    Raises InputError: unreadable video, no frame with a board, `folder` not writable or with other files in it.
+    Raises InputError: unreadable video, no board in any frame of one, `folder` not writable or with other files in it.
     """
     asked = _request(sources, boards, timestamps, max_frames)
     if (kept := _kept_before(folder, asked)) is not None:
@@ -137,9 +137,10 @@ def _chosen_moments(
     # Moments of the timestamps that have no frame are not searched.
     progress(SEARCHING, looked_at, looked_at)
     choice.finish()
-    if not choice.kept:
-        names = ", ".join(f"'{path}'" for path in sources.values())
-        shown = None if live or not boards else why_not_detected(list(sources.values()), boards, progress)
+    seen = {name for frame in choice.kept.values() for name in frame.views}
+    if blind := [path for name, path in sources.items() if name not in seen]:
+        names = ", ".join(f"'{path}'" for path in blind)
+        shown = None if live or not boards else why_not_detected(blind, boards, progress)
         raise InputError(
             f"{names}: no board in {looked_at} frames; {shown or 'check focus, light and the size of the board'}"
         )

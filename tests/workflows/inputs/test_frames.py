@@ -140,6 +140,11 @@ def test_a_folder_of_videos_is_a_camera_each(tmp_path: Path) -> None:
             [tmp_path], FolderOptions(boards=("7x5x20",)), CalibrateOptions(), progress=lambda *step: said.append(step)
         )
     assert [step for step in said if step[0] == SEARCHING] == [(SEARCHING, k, 2) for k in range(3)]
+    # Where only one camera sees the board it is the other that is named.
+    video(tmp_path / "left.avi", [picture((0.3 * k, 0.0, 0.0), 0.0) for k in range(2)])
+    with pytest.raises(InputError, match=r"^'[^']*right\.avi': no board in 2 frames"):
+        calibrate_folders([tmp_path], FolderOptions(boards=("7x5x20",)), CalibrateOptions())
+    assert not (tmp_path / "frames").exists()
 
 
 def test_results_in_one_folder_have_frames_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
