@@ -172,7 +172,6 @@ def pair_section(
     reconstruction: Reconstruction,
     reports: Sequence[ValidationReport],
     images: Sequence[tuple[str, str, bytes]],
-    extra: Sequence[Table] = (),
 ) -> PairSection:
     """Return the page's section of one pair.
 
@@ -181,7 +180,6 @@ def pair_section(
     reconstruction : reconstruction whose cloud is shown.
     reports : reports of all estimators.
     images : (caption, MIME type, bytes).
-    extra : further tables, such as the cross-check.
     """
     shown = next(r for r in reports if r.affine_method == reconstruction.affine_method)
     lead = (
@@ -189,7 +187,7 @@ def pair_section(
         f"{shown.affine_method}; baseline {measured_words(shown.baseline_mm, shown.baseline_sigma_mm, 2)} mm; Sampson "
         f"rms {shown.sampson_rms_px:.3f} px"
     )
-    tables = (check_table([shown]), _by_estimator(reports), *extra)
+    tables = (check_table([shown]), _by_estimator(reports))
     notes = (*shown.notes, *(f"not checked: {words}" for words in shown.unchecked))
     return PairSection(shown.pair_id, lead, tables, tuple(images), scene_of(reconstruction), notes)
 

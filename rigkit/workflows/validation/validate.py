@@ -24,7 +24,7 @@ from rigkit.reconstruction.geometry import PairGeometry
 from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.reconstruction.reconstruct import Reconstruction, on_planes, reconstruct_from
 from rigkit.report.pages.page_facts import PageFacts
-from rigkit.report.pages.validation_page import PairSection, crosscheck_table, pair_section
+from rigkit.report.pages.validation_page import PairSection, pair_section
 from rigkit.report.pictures.drawings import normal_errors_svg, residuals_svg
 from rigkit.report.pictures.figures import pair_jpeg, pair_pictures
 from rigkit.validation.checks import ValidationReport, validate_each
@@ -182,7 +182,7 @@ def _validated(
     if job.options.pictures:
         drawn = pair_pictures(shown, image1, image2, pdf=job.options.pdf)
         files |= drawn
-        section = _section(reconstructions, shown, reports, compared, drawn)
+        section = _section(reconstructions, shown, reports, drawn)
     return PairValidation(reports=reports, best=best, crosscheck=compared, causes=causes, files=files, section=section)
 
 
@@ -217,7 +217,6 @@ def _section(
     reconstructions: Mapping[str, Reconstruction],
     shown: Reconstruction,
     reports: tuple[ValidationReport, ...],
-    compared: CrossCheckReport | None,
     drawn: Mapping[str, bytes],
 ) -> PairSection:
     """Return the pair's section of the page, with the pictures `drawn` as JPEG."""
@@ -229,4 +228,4 @@ def _section(
         ("What the corners leave over", "image/svg+xml", residuals_svg(shown).encode()),
         ("Normal errors of the estimators", "image/svg+xml", normal_errors_svg(reconstructions, reports).encode()),
     ]
-    return pair_section(shown, reports, pictures, [] if compared is None else [crosscheck_table([compared])])
+    return pair_section(shown, reports, pictures)
