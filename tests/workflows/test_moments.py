@@ -115,6 +115,7 @@ def test_other_names_leave_images_moment_by_moment(names: tuple[str, ...], tmp_p
         ("L{}", "R{}", ["l", "r"]),
         ("{}_L", "{}_R", ["l", "r"]),
         ("room [1]_left_{}", "room [1]_right_{}", ["left", "right"]),
+        ("left", "Right", ["left", "right"]),
         ("mon/left/{}", "tue/left/{}", []),
         ("image_07/{}", "image_08/{}", ["image_07", "image_08"]),
     ],
@@ -124,6 +125,8 @@ def test_layouts_of_well_known_datasets(first: str, second: str, cameras: list[s
     for path in (*own[0], *own[1]):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
+    # "left" and "right" alone are one moment.
+    own = [list(dict.fromkeys(paths)) for paths in own]
     # Copies in a folder farther down are none of the cameras.
     _images(tmp_path / "old" / "backup" / "left", "001")
     if not cameras:

@@ -220,6 +220,8 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
         if how and twice is not None:
             raise InputError(f'frames = "{how}": {twice} are of one frame; rename them, or use frames = "order"')
         alike = alike or twice
+    if how is None and all(len(own) == 1 for own in images.values()):
+        return frames_of_images(images, "order")
     if alike is not None:
         raise InputError(
             f"{alike} are simultaneous by their names, which is impossible; "

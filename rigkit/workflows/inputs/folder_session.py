@@ -201,9 +201,10 @@ def cameras_in(folders: Sequence[Path], count: int | None = None) -> dict[str, l
     """Return the images of every camera as (folder, pattern), by camera name; a single camera is named "".
 
     Several folders are one camera each. One folder holds several cameras if all its images are named left01, right01
-    (or cam0_01, 01_left, left_pose_1, img_L_01), or if it has no images but folders left and right (or cam0, cam1),
-    or mav0/cam0/data and mav0/cam1/data below it. With a `count`, the images are those of so many cameras: of one, all
-    images of all folders and below them; of several, by any part of their paths (`layouts_of`).
+    (or cam0_01, 01_left, left_pose_1, img_L_01; of one moment left and right), or if it has no images but folders left
+    and right (or cam0, cam1), or mav0/cam0/data and mav0/cam1/data below it. With a `count`, the images are those of so
+    many cameras: of one, all images of all folders and below them; of several, by any part of their paths
+    (`layouts_of`).
 
     Raises InputError for a folder without images, two folders of the same name, and images that are not of `count`
     cameras by their names.
@@ -330,7 +331,10 @@ def _by_folder(named: Mapping[str, Path]) -> dict[str, list[tuple[Path, str]]]:
 
 
 def _by_names(folder: Path, images: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
-    """Return the cameras by the images' names: several only if every name has a side."""
+    """Return the cameras by the images' names: several only if every name has a side, or is one (one moment)."""
+    alone = {image.stem.lower(): [(folder, image.name)] for image in images}
+    if set(alone) == {"left", "right"} and len(images) == 2:
+        return dict(sorted(alone.items()))
     sides: dict[str, dict[str, None]] = {}
     found = [next((m for form in NAMES if (m := form.fullmatch(image.stem))), None) for image in images]
     named = [name.groupdict("") for name in found if name is not None]
