@@ -235,8 +235,8 @@ def views_of_image(
         of = image if camera is None else f"{image} of {camera}"
         name = _part_name(parent.board_id, of, k + 1 if len(detections) > 1 else None)
         sides = parent.square_x_mm, parent.square_y_mm
-        # A part of a staggered circle grid keeps its pattern, as its numbering depends on it.
-        pattern = parent.pattern if isinstance(parent.pattern, Circles) else Chessboard()
+        # Where marks would say which part it is none was read: it is a chessboard.
+        pattern = Chessboard() if parent.identified else parent.pattern
         sigma_mm = parent.square_sigma_mm
         part = Board(name, turned.columns, turned.rows, *sides, square_sigma_mm=sigma_mm, pattern=pattern)
         views.append(BoardView(image, part, turned.grid, turned.pixels, turned.sigma_px))
