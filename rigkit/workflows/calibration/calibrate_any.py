@@ -40,7 +40,7 @@ from rigkit.workflows.inputs.frames import (
     timestamps_next_to,
     with_frames,
 )
-from rigkit.workflows.inputs.layout_evidence import cameras_by_name, cameras_seen
+from rigkit.workflows.inputs.layout_evidence import cameras_by_name, cameras_seen, moments_by_order
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions, FolderOptions
 from rigkit.workflows.outputs.calibration_paths import calibration_paths
 
@@ -177,11 +177,14 @@ def _session(
 ) -> tuple[dict[Path, str], list[str], Mapping[Path, FoundCorners]]:
     """Return the files of the session of folders, the names of its cameras, and the corners found to tell these."""
     cameras: ImagesByCamera | None = None
-    corners: Mapping[Path, FoundCorners] = {}
+    corners: dict[Path, FoundCorners] = {}
+    by_order = False
     if boards and folder_options.cameras is not None:
         cameras = cameras_in(places, folder_options.cameras)
     elif boards:
-        cameras, corners = cameras_seen(places, [board_of_words(words) for words in boards], path, progress)
+        known = [board_of_words(words) for words in boards]
+        cameras, corners = cameras_seen(places, known, path, progress)
+        by_order = moments_by_order(cameras, known, path, corners, progress)
     wanted = session_of_folders(
         places,
         boards,
@@ -190,6 +193,7 @@ def _session(
         output=options.output,
         known=options.known,
         cameras=cameras,
+        by_order=by_order,
         progress=progress,
     )
     return wanted, list(cameras or ()), corners

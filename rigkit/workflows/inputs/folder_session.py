@@ -64,6 +64,7 @@ def session_of_folders(
     output: Path | None = None,
     known: Known | None = None,
     cameras: ImagesByCamera | None = None,
+    by_order: bool = False,
     progress: Progress = silent,
 ) -> dict[Path, str]:
     """Return the session file `path` of one folder of images, or of one folder for each camera, and its board files.
@@ -79,6 +80,7 @@ def session_of_folders(
     output : file of the calibration; None: named after the session.
     known : known lenses and rig, of several cameras.
     cameras : the images of each camera; by default those of `cameras_in`.
+    by_order : images are of one moment by their order, not by their names.
     progress : of the search for the board that images show, to say what is missing.
     """
     if not boards:
@@ -107,16 +109,16 @@ def session_of_folders(
     if len(cameras) == 1:
         lines.append(f"images = {_patterns_toml(cameras[''], place)}")
     else:
-        lines += _cameras_in_words(cameras, place, known or Known())
+        lines += _cameras_in_words(cameras, place, known or Known(), by_order=by_order)
     return files | {path: "\n".join(lines).rstrip() + "\n"}
 
 
-def _cameras_in_words(cameras: ImagesByCamera, place: Path, known: Known) -> list[str]:
+def _cameras_in_words(cameras: ImagesByCamera, place: Path, known: Known, *, by_order: bool) -> list[str]:
     """Return the lines for several cameras of a session in folder `place`."""
-    lines = [
-        "# Those of one moment have the same name, the same number at its end, or nearly the same time as name.",
-        "",
-    ]
+    lines = ["# Those of one moment have the same name, the same number at its end, or nearly the same time as name."]
+    if by_order:
+        lines = ["# The first images of all cameras are of one moment, and so on.", 'frames = "order"']
+    lines.append("")
     if known.rig is not None:
         rig = f"rig = {toml_text(relative_path(known.rig, place))}"
         lines += ["# Its cameras stay as they are, lens and mount.", rig, ""]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,8 +32,13 @@ from rigkit.workflows.inputs.corners import (
     named_images,
     session_views,
 )
-from rigkit.workflows.inputs.folder_session import cameras_in, images_of_layout
-from rigkit.workflows.inputs.layouts import CameraLayout, layouts_of
+from rigkit.workflows.inputs.folder_session import (
+    ImagesByCamera,
+    cameras_in,
+    images_of_camera,
+    images_of_layout,
+)
+from rigkit.workflows.inputs.layouts import MIN_MOMENTS, CameraLayout, layouts_of
 
 _log = logging.getLogger(__name__)
 
@@ -88,6 +94,29 @@ def cameras_seen(
     if layouts:
         _log.info(f"the images may be of {named} by their names; by the boards they are one camera's")
     return found, corners
+
+
+def moments_by_order(
+    cameras: ImagesByCamera,
+    boards: Sequence[Board],
+    path: Path,
+    corners: dict[Path, FoundCorners],
+    progress: Progress,
+) -> bool:
+    """Return whether images of cameras whose names say no moments (DSC_1001.jpg, photo 37.jpg) are of one moment by
+    their order: as many of each camera, where boards move alike (see `on_one_mount`)."""
+    images = {name: images_of_camera(patterns) for name, patterns in cameras.items()}
+    if len(images) < 2 or len({len(own) for own in images.values()}) > 1:
+        return False
+    with suppress(InputError):
+        frames_of_images({name: list(map(str, own)) for name, own in images.items()})
+        return False
+    ordered = {name: {f"{k:04d}": image for k, image in enumerate(own)} for name, own in images.items()}
+    layout = CameraLayout(ordered, tuple(next(iter(ordered.values()))))
+    if len(layout.shared) < MIN_MOMENTS or not on_one_mount(layout, boards, path, corners, progress):
+        return False
+    _log.info("names do not say which images are of one moment: their order does, as boards move alike by it")
+    return True
 
 
 def on_one_mount(

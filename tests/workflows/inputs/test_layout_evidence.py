@@ -25,8 +25,8 @@ from rigkit.io.media.images import Image, read_image
 from rigkit.workflows.calibration.calibrate import RigSessionCalibration
 from rigkit.workflows.calibration.calibrate_any import calibrate_sources
 from rigkit.workflows.inputs.corners import named_images
-from rigkit.workflows.inputs.folder_session import images_of_layout, session_of_folders
-from rigkit.workflows.inputs.layout_evidence import cameras_seen
+from rigkit.workflows.inputs.folder_session import cameras_in, images_of_layout, session_of_folders
+from rigkit.workflows.inputs.layout_evidence import cameras_seen, moments_by_order
 from rigkit.workflows.inputs.layouts import CameraLayout
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions, FolderOptions
 
@@ -155,3 +155,29 @@ def test_images_of_other_moments_are_told_of_early_and_nothing_is_left(
         calibrate_sources(folders, declared, options)
     assert [r.message.partition(",")[0] for r in caplog.records].count("as it seems so far") == 1
     assert set(tmp_path.rglob("*")) == before
+
+
+def test_the_order_of_images_pairs_them_where_boards_agree(pictures: Path, tmp_path: Path) -> None:
+    """DSC_1001.jpg with photo 37.jpg; in another order, or one image short, the boards do not move alike."""
+    names = {side: sorted(pictures.glob(f"{side}*.jpg"))[:6] for side in ("left", "right")}
+    order = (3, 4, 5, 0, 1, 2)
+    for k, (left, right) in enumerate(zip(*names.values(), strict=True)):
+        for folder, source, name in (
+            ("A", left, f"DSC_10{k:02d}"),
+            ("B", right, f"photo {k + 37}"),
+            ("other", names["right"][order[k]], f"photo {k + 37}"),
+        ):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            shutil.copy(source, tmp_path / folder / f"{name}.jpg")
+    path = tmp_path / "session.toml"
+
+    def paired(*folders: str) -> bool:
+        cameras = cameras_in([tmp_path / folder for folder in folders])
+        return moments_by_order(cameras, [BOARD], path, {}, silent)
+
+    assert paired("A", "B") and not paired("A", "other")
+    for file, text in session_of_folders([tmp_path / "A", tmp_path / "B"], ["9x6x30"], path, by_order=True).items():
+        file.write_text(text)
+    assert load_rig_session(path).frames == "order"
+    (tmp_path / "B" / "photo 38.jpg").unlink()
+    assert not paired("A", "B")
