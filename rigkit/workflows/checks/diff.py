@@ -16,7 +16,14 @@ from rigkit.io.calibrations.rig_file import SavedRig, is_board_rigs_file, is_rig
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.report.pictures.figures import difference_png
-from rigkit.workflows.inputs.camera_files import calibration_of_file, import_camera, is_rig, rig_of_file, warn_if_bad
+from rigkit.workflows.inputs.camera_files import (
+    calibration_of_file,
+    camera_text,
+    import_camera,
+    is_rig,
+    rig_of_file,
+    warn_if_bad,
+)
 from rigkit.workflows.options.cameras import DiffOptions
 
 _log = logging.getLogger(__name__)
@@ -106,6 +113,7 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
             return _rigs(a, b)
     if any(rigs):
         other = b if rigs[0] else a
+        camera_text(other)  # A file that cannot be read is named as such.
         raise InputError(f"diff: a rig and a camera; compare '{other}' with the calibration beside the rig")
     ensure_writable(options.output, force=options.force, inputs=(a, b))
     if options.output is not None and options.output.suffix.lower() != ".png":

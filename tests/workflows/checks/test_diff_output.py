@@ -9,7 +9,10 @@ from helpers.calibration_scenes import lens
 
 from rigkit.calibration.compare import CalibrationComparison
 from rigkit.cameras.compare import compare_cameras
-from rigkit.workflows.checks.diff import CameraPair
+from rigkit.core.errors import InputError
+from rigkit.io.calibrations.calibration_file import save_camera
+from rigkit.io.calibrations.rig_file import load_saved_rig
+from rigkit.workflows.checks.diff import CameraPair, diff
 from rigkit.workflows.checks.diff_output import words_of, write_diff_page
 
 
@@ -35,3 +38,19 @@ def test_a_page_of_files_with_one_name_names_their_folders(tmp_path: Path) -> No
     write_diff_page(tmp_path / "page.html", pair, files, force=False)
     page = (tmp_path / "page.html").read_text()
     assert "rigkit diff: before/calibration.json and after/calibration.json" in page and "B after/" in page
+
+
+def test_files_of_another_kind_are_named_as_what_they_are(tmp_path: Path) -> None:
+    rig, camera = tmp_path / "rig.json", tmp_path / "camera.json"
+    rig.write_text('{"schema": "rigkit.rig/1"}')
+    save_camera(camera, lens("reg"))
+    with pytest.raises(InputError, match="a rig and a camera"):
+        diff(rig, camera)
+    with pytest.raises(InputError, match=r"none\.json' does not exist"):
+        diff(rig, tmp_path / "none.json")
+    # Calibrating again would not make it a rig.
+    with pytest.raises(InputError, match="give such a file"):
+        load_saved_rig(camera)
+    rig.write_text('{"schema": "rigkit.rig/0"}')
+    with pytest.raises(InputError, match="calibrate again"):
+        load_saved_rig(rig)
