@@ -10,6 +10,7 @@ const FROM = {free: START, front: {yaw: 0, pitch: 0, zoom: 1, flat: true}, top: 
   side: {yaw: Math.PI / 2, pitch: 0, zoom: 1, flat: true}};
 const NEAR_PX = 14;
 const SCALE_PX = 140;
+const AXIS_PX = 36;
 const DISTANCE = 3.2;
 // As it is first turned, the scene reaches so far from the middle of the view to its edge.
 const FILLED = 0.9;
@@ -146,10 +147,10 @@ function viewer(canvas, scene) {
     pen.font = `${12 * ratio}px sans-serif`;
     pen.fillText(length >= 1000 ? `${length / 1000} m` : `${length} mm`, x, y - 6 * ratio);
     // The axes of the first camera beside it.
-    const origin = project(middle), step = 0.12 * reach;
-    [["x", "#c62828"], ["y", "#2e7d32"], ["z", "#1565c0"]].forEach(([name, colour], k) => {
+    const origin = project(middle), step = 0.12 * reach, perPx = AXIS_PX * ratio / (step * pxPerMm);
+    [["x", "#e53935"], ["y", "#43a047"], ["z", "#1e88e5"]].forEach(([name, colour], k) => {
       const tip = project(middle.map((m, i) => m + (i === k ? step : 0)));
-      const to = [tip[0] - origin[0], tip[1] - origin[1]].map((d) => d / view.zoom);
+      const to = [tip[0] - origin[0], tip[1] - origin[1]].map((d) => d * perPx);
       const at = [canvas.width - 60 * ratio, canvas.height - 60 * ratio];
       pen.strokeStyle = pen.fillStyle = colour;
       pen.beginPath();
