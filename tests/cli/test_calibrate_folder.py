@@ -26,13 +26,14 @@ from rigkit.io.corners.corner_cache import FoundCorners
 from rigkit.io.corners.corners_file import read_corners
 from rigkit.io.manifests.rig_session import load_rig_session
 from rigkit.io.manifests.session import load_session
+from rigkit.workflows.calibration import calibrate_any
 from rigkit.workflows.calibration.calibrate import SessionCalibration, calibrate_session
 from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.inputs.camera_files import import_rig
 from rigkit.workflows.inputs.corners import first_calibration
 from rigkit.workflows.inputs.folder_session import cameras_in, session_of_folders
 from rigkit.workflows.inputs.known_cameras import known_cameras, known_cameras_first
-from rigkit.workflows.options.cameras import CalibrateOptions, Known
+from rigkit.workflows.options.cameras import CalibrateOptions, FolderOptions, Known
 
 SAME_LENS_PX = 0.1
 """Projections of the camera found against the true one, where boards were: corners of JPEGs to about 0.03 px, 9 images;
@@ -371,3 +372,23 @@ def test_an_existing_result_is_refused_before_boards_are_identified(
     monkeypatch.setattr("rigkit.workflows.calibration.calibrate_any.boards_seen", None)
     assert main(["calibrate", str(folder), "--square-mm", "30", "-r", "--export", "opencv"]) == 2
     assert f"'{folder / name}' exists and is left as it is" in capsys.readouterr().err
+
+
+def test_a_session_of_another_run_at_the_same_time_stays(
+    pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two runs in one folder: the second finds the first one's result, and leaves that one's session to it."""
+    for path in sorted(pictures.glob("left*.jpg"))[:2]:
+        shutil.copy(path, tmp_path)
+    result = tmp_path / "calibration.json"
+
+    def slower(session: Path, *_: object, **__: object) -> None:
+        if of_other_run:
+            result.write_text("of the other run")
+        raise InputError(f"'{result}' exists")
+
+    monkeypatch.setattr(calibrate_any, "calibrate_session_file", slower)
+    for of_other_run in (False, True):
+        with pytest.raises(InputError, match="exists"):
+            calibrate_any.calibrate_folders([tmp_path], FolderOptions(boards=("9x6x30",)), CalibrateOptions())
+        assert (tmp_path / "session.toml").exists() == of_other_run

@@ -91,6 +91,8 @@ def calibrate_session_file(
         raise InputError("one camera has no extrinsics to solve for; `rigkit pose` gives its pose relative to a board")
     output = options.output or listed.result_path
     options = replace(options, output=output, report=_report_path(options, output))
+    if options.report is None and (page := output.with_suffix(".html")).is_file():
+        _log.warning(f"'{page}' is of an earlier calibration and stays as it is; -r --force replaces it")
     # Before the frames of videos are chosen, which takes minutes; the videos are inputs as well as these frames.
     ensure_writable((output, options.report), force=options.force, inputs=session_inputs(listed, options))
     session = with_frames(listed, progress)
@@ -136,7 +138,7 @@ def calibrate_folders(
     ensure_writable([*new, *results], force=options.force, inputs=[*(set(wanted) - set(new)), *declared])
     before = {path: read_bytes(path, "session") for path in new if path.exists()}
     write_together(new, force=options.force)
-    made = list(set(new) - set(before))
+    made, missing = list(set(new) - set(before)), [path for path in results if not path.exists()]
     try:
         with _errors_about(folders, session):
             if session in made:
@@ -148,7 +150,8 @@ def calibrate_folders(
     except BaseException:
         if before:
             write_together(before, force=True)
-        for path in made:
+        # A result that appeared meanwhile is another run's, whose session this is.
+        for path in made if not any(path.exists() for path in missing) else ():
             with suppress(OSError):
                 path.unlink()
         raise
