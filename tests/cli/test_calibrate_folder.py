@@ -13,6 +13,7 @@ import pytest
 from helpers.schemas import faults
 from helpers.stereo_pictures import CAMERA, FRAMES, RIGHT_FROM_LEFT, of_one_camera
 
+from rigkit.calibration.certainty.displaced import covariance_of_modes
 from rigkit.cameras.base import Camera
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
@@ -316,9 +317,12 @@ def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(pictures: Pat
     session = replace(load_rig_session(folder / "session.toml"), lenses={"right": added})
     reported, saved_rig = known_cameras(session), load_saved_rig(added)
     assert reported is not None and reported.covariance is not None
-    of_file = saved_rig.covariance_with_departures
+    of_file = saved_rig.widened_covariance
     assert of_file is not None
-    np.testing.assert_array_equal(reported.covariance, of_file[9:18, 9:18])
+    # The mounts and the other lens are left out, but not what the other lens's departures do to this one.
+    others = covariance_of_modes(saved_rig.departures[:1], len(of_file))
+    np.testing.assert_allclose(reported.covariance, (of_file + others)[9:18, 9:18], rtol=1e-12)
+    assert reported.departures["right"].modes.shape == saved_rig.departures[1].modes.shape
 
 
 def test_known_cameras_are_written_to_the_session(

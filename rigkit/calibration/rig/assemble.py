@@ -24,7 +24,7 @@ from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.calibration.rig.solving.pose_jacobians import pose_jacobians
 from rigkit.calibration.rig.solving.shutters import readouts_of
 from rigkit.calibration.rig.solving.state import RigState
-from rigkit.calibration.solving.clustered import Clustered, effective_freedom
+from rigkit.calibration.solving.clustered import Clustered, effective_freedom, widening
 from rigkit.cameras.moving_pupil import PUPIL_TERMS, NearCamera, far_camera
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
@@ -43,7 +43,9 @@ def assemble_rig(
     layout = state.layout(observations)
     known, sigma = frame_covariance(observations, joint.solution, joint.sigma_px, joint.frames)
     overdispersion = known.clustered.overdispersion
-    extra = _error_of_held(joint, layout, normal.covariance[0])
+    reported = _lenses_and_mounts(layout, state)
+    wider = widening(effective_freedom(known.clustered.freedom, overdispersion, len(reported)))
+    extra = _error_of_held(joint, layout, normal.covariance[0], wider)
     off = shape_error(observations, state, sigma * overdispersion)
     extra[: len(off), : len(off)] += np.outer(off, off)
     by_readouts, readout_sigmas = readout_error(joint)
@@ -57,11 +59,10 @@ def assemble_rig(
     shapes = {b.board_id: points[first_row[i] : first_row[i + 1]] for i, b in enumerate(boards)}
     cameras, squared = _cameras(joint, heldout[1], known, extra)
     everything = np.concatenate(squared)
-    reported = _lenses_and_mounts(layout, state)
     # All boards were measured with one ruler: its error does not average out.
     scale = max((b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards)
     far = [FarProjection.of(camera.calibration) for camera in cameras]
-    departures, corners, frames = lens_modes(observations, joint.solution, far, reported, joint.frames, sigma)
+    departures, corners, frames = lens_modes(joint, far, reported, sigma)
     # Of the noise only what is left without the lenses' departures, which are stated beside it.
     frames = min(max(frames, corners / overdispersion**2), 1.0)
     given = covariance - (1.0 - frames) * known.covariance
@@ -141,9 +142,10 @@ def _cameras(
     return cameras, squared
 
 
-def _error_of_held(joint: JointRig, layout: Layout, unit: FloatArray) -> FloatArray:
+def _error_of_held(joint: JointRig, layout: Layout, unit: FloatArray, wider: float) -> FloatArray:
     """Return the contribution of the prior means of held lenses and mounts to the covariance (G, G) of all globals:
-    K W C W K, with the information W of these priors and the covariance C of their means."""
+    K W C W K, with the information W of these priors and the covariance C of their means, without departures. That of
+    known cameras is widened already, and `wider` is the factor by which quoted sigmas of the rig will be."""
     out = np.zeros_like(unit)
     known, names = joint.known, joint.views.names
     held = zip(names, layout.cameras, joint.views.single, joint.observations.held, strict=False)
@@ -154,7 +156,7 @@ def _error_of_held(joint: JointRig, layout: Layout, unit: FloatArray) -> FloatAr
     if known is not None and known.covariance is not None:
         index = known.index(names, layout)
         through = unit[:, index] * known.weights(joint.observations, layout)[index]
-        out += through @ known.covariance @ through.T
+        out += through @ (known.covariance / wider**2) @ through.T
     return out
 
 

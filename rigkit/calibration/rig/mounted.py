@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self
 
-from rigkit.calibration.certainty.displaced import LensModes, covariance_of_modes, with_modes
+from rigkit.calibration.certainty.departures import Departures
+from rigkit.calibration.certainty.displaced import LensModes, lens_modes, with_modes
 from rigkit.calibration.pupil import SolvedPupil
+from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.calibration.solving.clustered import effective_freedom, widening
 from rigkit.cameras.base import Camera
@@ -46,6 +48,20 @@ class MountedCameras:
     expected: FloatArray | None = None
     pupils: Mapping[str, SolvedPupil] = field(default_factory=dict)
 
+    @classmethod
+    def alone(cls, name: str, calibration: Calibration) -> Self:
+        """Return a camera that was calibrated alone, in its own frame; central."""
+        departures, camera = Departures.of(calibration), calibration.camera
+        count = camera.parameters.size
+        return cls(
+            cameras={name: (camera, Rigid3.identity())},
+            covariance=departures.near_covariance[:count, :count],
+            sigma_px=departures.noise.sigma_px,
+            freedom=calibration.freedom,
+            overdispersion=departures.noise.overdispersion,
+            departures=(lens_modes(calibration),),
+        )
+
     @property
     def lenses(self) -> tuple[Camera, ...]:
         """The central cameras, without their poses."""
@@ -70,11 +86,13 @@ class MountedCameras:
         return Layout.of_cameras(self.lenses)
 
     @property
-    def covariance_with_departures(self) -> FloatArray | None:
-        """The covariance of the same unknowns with what the departures of the lenses add to it."""
+    def widened_covariance(self) -> FloatArray | None:
+        """The covariance, widened so that two standard deviations contain 95 % of the errors; without departures."""
         if self.covariance is None:
             return None
-        return self.covariance + covariance_of_modes(self.departures, len(self.covariance))
+        return (
+            widening(effective_freedom(self.freedom, self.overdispersion, len(self.covariance))) ** 2 * self.covariance
+        )
 
     @property
     def with_departures(self) -> Self:
@@ -89,11 +107,9 @@ class MountedCameras:
     def quoted(self) -> UncertainRig | None:
         """The rig with departures, and its covariance widened for the degrees of freedom, so that two standard
         deviations contain 95 % of errors; None without a covariance."""
-        if self.covariance is None:
+        whole = replace(self, covariance=self.widened_covariance).with_departures
+        if whole.covariance is None:
             return None
-        wider = widening(effective_freedom(self.freedom, self.overdispersion, len(self.covariance)))
-        whole = replace(self, covariance=wider**2 * self.covariance).with_departures
-        assert whole.covariance is not None
         return UncertainRig(
             cameras=whole.lenses, cam_from_rig=whole.poses, covariance=whole.covariance, scale_sigma=self.scale_sigma
         )

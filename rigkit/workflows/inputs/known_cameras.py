@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
+from rigkit.calibration.rig.mounted import MountedCameras
 from rigkit.calibration.rig.solving.known import KnownCameras
-from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibrations.rig_file import SavedRig, is_rig_file
@@ -90,42 +87,22 @@ def known_cameras(session: RigSession) -> KnownCameras | None:
                 "give the images of a new one, too"
             )
     cameras: dict[str, tuple[Camera, Rigid3 | None]] = {name: rig.cameras[name] for name in mounted}
-    alone: dict[str, FloatArray | None] = {}
+    sources: list[tuple[MountedCameras, list[str]]] = [(rig, mounted)] if mounted else []
+    rigs: dict[Path, tuple[MountedCameras, list[str]]] = {}
     for name, path in session.lenses.items():
-        if name not in cameras:
-            lens, alone[name] = _camera_and_covariance(path, name, names)
-            cameras[name] = (lens, None)
-    if rig.covariance is None and all(covariance is None for covariance in alone.values()):
-        return KnownCameras(cameras)
-    return KnownCameras(cameras, _covariance(cameras, rig, mounted, alone))
-
-
-def _covariance(
-    cameras: dict[str, tuple[Camera, Rigid3 | None]],
-    rig: SavedRig,
-    mounted: Sequence[str],
-    alone: dict[str, FloatArray | None],
-) -> FloatArray:
-    """Return the covariance of all known parameters, in the order of `KnownCameras`; zero where no file states one."""
-    layout = Layout.of_cameras(camera for camera, _ in cameras.values())
-    lenses = dict(zip(cameras, layout.cameras, strict=True))
-    total = layout.cameras[-1].stop + 6 * max(len(mounted) - 1, 0)
-    out = np.zeros((total, total))
-    if (known := rig.covariance_with_departures) is not None:
-        here, there = _covariance_indices(cameras, mounted), _covariance_indices(rig.cameras, mounted)
-        out[np.ix_(here, here)] = known[np.ix_(there, there)]
-    for name, covariance in alone.items():
-        if covariance is not None:
-            out[lenses[name], lenses[name]] = covariance
-    return out
-
-
-def _covariance_indices(cameras: Mapping[str, tuple[Camera, object]], mounted: Sequence[str]) -> IntArray:
-    """Return the indices, in the covariance of `cameras`, of the lenses and mounts of those named `mounted`."""
-    layout = Layout.of_cameras(camera for camera, _ in cameras.values())
-    chosen = [list(cameras).index(name) for name in mounted]
-    runs = [layout.cameras[k] for k in chosen] + [layout.mount(k) for k in chosen[1:]]
-    return np.concatenate([np.arange(run.start, run.stop) for run in runs])
+        if name in cameras:
+            continue
+        source, own = rigs.get(path) or (_source_of_file(path, name, names), [])
+        if name not in source.cameras:
+            raise InputError(f"'{path}' has no camera '{name}'; there are {', '.join(source.cameras)}")
+        cameras[name] = (source.cameras[name][0], None)
+        own.append(name)
+        if len(own) == 1:
+            sources.append((source, own))
+        if is_rig(path):
+            # The errors of lenses of one rig are correlated.
+            rigs[path] = source, own
+    return KnownCameras.of(cameras, sources)
 
 
 def _rig_with_names(path: Path, names: Sequence[str]) -> SavedRig:
@@ -137,17 +114,14 @@ def _rig_with_names(path: Path, names: Sequence[str]) -> SavedRig:
     return replace(rig, cameras=dict(zip(names, rig.cameras.values(), strict=False)))
 
 
-def _camera_and_covariance(path: Path, name: str, names: Sequence[str]) -> tuple[Camera, FloatArray | None]:
-    """Return the camera of a file (of a rig's file, the one called `name`) and its covariance, or None."""
+def _source_of_file(path: Path, name: str, names: Sequence[str]) -> MountedCameras:
+    """Return the rig in a file, or its one camera as that called `name`; without a covariance where it states none."""
     if is_rig(path):
         rig = _rig_with_names(path, names)
-        if name not in rig.cameras:
-            raise InputError(f"'{path}' has no camera '{name}'; there are {', '.join(rig.cameras)}")
         warn_if_bad(path, rig.verdicts)
-        own, known = _covariance_indices(rig.cameras, [name]), rig.covariance_with_departures
-        return rig.cameras[name][0], None if known is None else known[np.ix_(own, own)]
-    if (calibration := calibration_of_file(path)) is not None:
-        warn_if_bad(path, calibration.verdicts)
-        warn_of_pupil(path, calibration)
-        return calibration.camera, np.asarray(calibration.covariance)
-    return import_camera(path), None
+        return rig
+    if (calibration := calibration_of_file(path)) is None:
+        return MountedCameras(cameras={name: (import_camera(path), Rigid3.identity())}, covariance=None)
+    warn_if_bad(path, calibration.verdicts)
+    warn_of_pupil(path, calibration)
+    return MountedCameras.alone(name, calibration)

@@ -15,32 +15,36 @@ import numpy as np
 from rigkit.calibration.certainty.departures import NOISE_ROUNDS
 from rigkit.calibration.certainty.displaced import LensModes, significant_modes, with_amounts
 from rigkit.calibration.certainty.uncertainty import FarProjection
+from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solving.pose_jacobians import pose_products
 from rigkit.calibration.rig.solving.solver import rig_data
-from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.calibration.solving.clustered import products_between, reduced_by_cluster, root_of_inverse, square_of_rest
-from rigkit.calibration.solving.solver import Solution
 from rigkit.cameras.moving_pupil import far_camera, with_pupil_of
 from rigkit.core.arrays import TINY, FloatArray, IntArray
 
 
 def lens_modes(
-    observations: RigObservations,
-    solution: Solution[RigState],
-    far: Sequence[FarProjection],
-    reported: IntArray,
-    frames: IntArray,
-    sigma_px: float,
+    joint: JointRig, far: Sequence[FarProjection], reported: IntArray, sigma_px: float
 ) -> tuple[tuple[LensModes, ...], float, float]:
     """Return the model inadequacy of each lens, with the error of the globals `reported` (G,), intrinsics and mounts,
-    and which parts of the variances of corners and between `frames` are left without it.
+    and which parts of the variances of corners and between frames are left without it.
 
-    `far` are the uncertainties of the cameras' projections in the rig, `frames` (F,) the frame of each pose, and
-    `sigma_px` is the standard deviation of a corner from all residuals.
+    `far` are the uncertainties of the cameras' projections in the rig, `sigma_px` is the standard deviation of a corner
+    from all residuals. Lenses that are held have the modes of their own calibrations, which determined the values held,
+    whatever these images say.
     """
-    state, normal = solution.state, solution.normal
-    n = state.layout(observations).shape.start
-    modes, means = zip(*(significant_modes(one) for one in far), strict=True)
+    observations, state, normal = joint.observations, joint.solution.state, joint.solution.normal
+    whole = state.layout(observations)
+    n = whole.shape.start
+    before = {} if joint.known is None else joint.known.departures
+    stated = [before.get(name) for name in joint.views.names]
+    modes, means = zip(
+        *(
+            significant_modes(one) if own is None else (own.modes, own.means)
+            for one, own in zip(far, stated, strict=True)
+        ),
+        strict=True,
+    )
     lenses = [with_amounts(far_camera(camera), own) for camera, own in zip(state.cameras, modes, strict=True)]
     cameras = tuple(with_pupil_of(lens, camera) for lens, camera in zip(lenses, state.cameras, strict=True))
     held = replace(observations, shape=observations.shape.held(state.unknowns))
@@ -49,15 +53,20 @@ def lens_modes(
     ends = [run.start + lens.parameters.size for run, lens in zip(layout.cameras, lenses, strict=True)]
     each = [np.arange(end - own.shape[1], end) for end, own in zip(ends, modes, strict=True)]
     amounts = np.concatenate(each)
-    known = np.delete(np.arange(layout.count), amounts)
+    free = np.delete(np.arange(layout.count), amounts)
     if n < len(normal.g):
         normal = replace(normal, gg=normal.gg[:n, :n], gp=normal.gp[:, :n], points_from=None)
     inverse, back, _ = normal.covariance
     by_pose = np.tensordot(back, data.gp[:, amounts], axes=((0, 1), (0, 2)))
-    moves = -(inverse @ (data.gg[np.ix_(known, amounts)] - by_pose))
+    moves = -(inverse @ (data.gg[np.ix_(free, amounts)] - by_pose))
+    if joint.known is not None and before:
+        # With these modes the values held are wrong, too.
+        index, weights = joint.known.index(joint.views.names, whole), joint.known.weights(observations, whole)
+        own = [np.zeros((len(index), m.shape[1])) if k is None else k.moves for m, k in zip(modes, stated, strict=True)]
+        moves += (inverse[:, index] * weights[index]) @ np.concatenate(own, axis=1)
     parts = np.split(moves[reported], np.cumsum([len(own) for own in each])[:-1], axis=1)
-    products = reduced_by_cluster(pose_products(held, displaced, data.products), layout.count, frames)
-    rest = _variances_left(*products, known, moves, max(float(data.costs.sum()), TINY), sigma_px)
+    products = reduced_by_cluster(pose_products(held, displaced, data.products), layout.count, joint.frames)
+    rest = _variances_left(*products, free, moves, max(float(data.costs.sum()), TINY), sigma_px)
     return tuple(LensModes(*own) for own in zip(modes, parts, means, strict=True)), *rest
 
 

@@ -11,6 +11,7 @@ import pytest
 from helpers.rig_scenes import MODELS, NOISE_PX, SIGMAS, mounts, rig_views, sizes
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.solving.known import KnownCameras
 from rigkit.io.calibrations.rig_file import load_saved_rig, rig_text
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.io.manifests.session import Session
@@ -19,6 +20,8 @@ from rigkit.validation.monitoring.watch import monitored_rig
 from rigkit.workflows.inputs.known_cameras import known_cameras
 
 DECENTRED_PX = 2.0
+AS_UNCERTAIN = 0.05
+"""Weights of corners follow from each solution's residuals."""
 
 
 def test_departures_of_two_lenses_are_no_noise_of_frames(tmp_path: Path) -> None:
@@ -57,6 +60,14 @@ def test_departures_of_two_lenses_are_no_noise_of_frames(tmp_path: Path) -> None
     )
     known = known_cameras(session)
     assert known is not None and known.covariance is not None
+    assert known.covariance == pytest.approx(rig.widening**2 * rig.covariance, rel=1e-9)
+    for name, modes in zip(sizes(), rig.departures, strict=True):
+        assert known.departures[name].moves == pytest.approx(modes.moves, rel=1e-9)
     beyond = rig.sigmas**2 - rig.widening**2 * np.diag(rig.covariance)
-    assert np.diag(known.covariance) == pytest.approx(np.diag(rig.covariance) + beyond, rel=1e-9)
     assert (beyond > 0.5 * np.diag(rig.covariance)).any()
+    # Held at this result, the lenses leave the mounts as uncertain as it does: their errors were compensated.
+    cameras = {camera.name: (camera.camera, None) for camera in rig.cameras}
+    held = calibrate_rig(views, sizes(), known=KnownCameras.of(cameras, [(rig.mounted, list(cameras))]), folds=0)
+    assert held.baseline_mm("reg", "fish") == pytest.approx((length, sigma), rel=AS_UNCERTAIN)
+    moved, before = (np.concatenate([m.moves[-12:] for m in r.departures], axis=1) for r in (held, rig))
+    assert (np.linalg.norm(moved - before, axis=1) < AS_UNCERTAIN * np.linalg.norm(before, axis=1)).all()

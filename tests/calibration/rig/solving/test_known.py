@@ -56,7 +56,8 @@ def test_mounts_of_lenses_not_known_exactly_are_as_unsure(rng: np.random.Generat
     covariance = free.covariance[:count, :count]
     sure = calibrate_rig(two, sizes(), known=KnownCameras(exact))
     unsure = calibrate_rig(two, sizes(), known=KnownCameras(exact, covariance))
-    added = unsure.covariance[unsure.mount(1), unsure.mount(1)] - sure.covariance[sure.mount(1), sure.mount(1)]
+    with_error, without = (rig.widening**2 * rig.covariance[rig.mount(1), rig.mount(1)] for rig in (unsure, sure))
+    added = with_error - without
     there = sure.cameras[1].cam_from_rig
     moved = []
     for error in np.linalg.cholesky(covariance).T:
