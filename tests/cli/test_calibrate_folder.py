@@ -343,6 +343,7 @@ def test_known_cameras_are_written_to_the_session(
     # Of the rig's file nobody knows how sure it is, nor of another tool's lens.
     reported = known_cameras(replace(session, lenses={"right": lens}))
     assert reported is not None and list(reported.cameras) == ["left", "right"] and reported.covariance is None
+    assert all(f"'{path}' states no uncertainty" in caplog.text for path in (known, lens))
     # A camera of the rig that has no images is not lost without a word.
     known_cameras_first(session)
     assert "without images here, top will not be in the new rig" in caplog.text

@@ -99,7 +99,9 @@ def pictures_of_a_corner(folder: Path, rng: np.random.Generator) -> tuple[Corner
 def test_two_images(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
     corner, names = pictures_of_a_corner(tmp_path, rng)
     assert run(tmp_path, "--images", *names, "--json") == 0
-    result = json.loads(capsys.readouterr().out)
+    out, err = capsys.readouterr()
+    result = json.loads(out)
+    assert f"'{tmp_path / 'camera.json'}' states no uncertainty" in err
     assert max(pose_errors_deg(Rigid3.from_matrix(result["cam2_from_cam1"]), CAM2_FROM_CAM1)) < 0.5
     found = sorted(p.name for p in (tmp_path / "out").iterdir())
     assert found == [

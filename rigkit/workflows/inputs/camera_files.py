@@ -133,6 +133,12 @@ def warn_if_bad(path: str | Path, verdicts: Iterable[Finding] | None = None) -> 
     return bad
 
 
+def warn_if_exact(path: str | Path, stated: object | None) -> None:
+    """Warn of a file that states no uncertainty, such as one of another tool; `stated` is None then."""
+    if stated is None:
+        _log.warning("'%s' states no uncertainty: sigmas do not include the errors of its cameras", path)
+
+
 def _neglected_pupil(which: str, camera: Camera, pupil: FloatArray, pixels: Pixels) -> str:
     """Return the note on a camera, with the largest displacement of its rays at `pixels`, mm."""
     rays = camera.unproject(pixels)[0]

@@ -20,6 +20,7 @@ from rigkit.workflows.inputs.camera_files import (
     is_rig,
     rig_of_file,
     warn_if_bad,
+    warn_if_exact,
     warn_of_pupil,
     warn_of_pupils,
 )
@@ -73,6 +74,7 @@ def known_cameras(session: RigSession) -> KnownCameras | None:
     )
     if session.known_rig is not None:
         warn_if_bad(session.known_rig, rig.verdicts)
+        warn_if_exact(session.known_rig, rig.covariance)
     mounted = [name for name in rig.cameras if name in names]
     if rig.cameras:
         first = next(iter(rig.cameras))
@@ -98,6 +100,7 @@ def known_cameras(session: RigSession) -> KnownCameras | None:
         cameras[name] = (source.cameras[name][0], None)
         own.append(name)
         if len(own) == 1:
+            warn_if_exact(path, source.covariance)
             sources.append((source, own))
         if is_rig(path):
             # The errors of lenses of one rig are correlated.

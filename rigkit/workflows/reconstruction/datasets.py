@@ -27,7 +27,7 @@ from rigkit.io.calibrations.calibration_file import calibration_text, load_calib
 from rigkit.io.disk.reading import about
 from rigkit.io.manifests.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.workflows.calibration.calibrate import calibrate_camera
-from rigkit.workflows.inputs.camera_files import warn_if_bad
+from rigkit.workflows.inputs.camera_files import warn_if_bad, warn_if_exact
 from rigkit.workflows.options.clouds import DatasetOptions
 from rigkit.workflows.outputs.results import CALIBRATIONS, require_folder, write_results
 
@@ -144,8 +144,9 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool = False, progress: Progr
             if entry.calibration.is_file() and (name not in used or not recalibrate):
                 known[name], sources[name] = _load(entry.calibration), entry.calibration
                 whole = known[name].calibration
-                if whole is not None and name in used:
-                    warn_if_bad(entry.calibration, whole.verdicts)
+                if name in used:
+                    warn_if_bad(entry.calibration, () if whole is None else whole.verdicts)
+                    warn_if_exact(entry.calibration, whole)
             elif name in used:
                 with about(dataset.manifest):
                     calibration = _calibrate(dataset, entry, progress)

@@ -25,7 +25,7 @@ from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.pages.cloud_page import build_cloud_page
 from rigkit.report.pictures.figures import as_png, cloud_figure
-from rigkit.workflows.inputs.camera_files import rig_of_file, warn_if_bad, warn_of_pupils
+from rigkit.workflows.inputs.camera_files import rig_of_file, warn_if_bad, warn_if_exact, warn_of_pupils
 from rigkit.workflows.options.clouds import RigSceneOptions
 from rigkit.workflows.outputs.provenance import software_facts
 from rigkit.workflows.outputs.results import require_folder, write_results
@@ -92,6 +92,7 @@ def reconstruct_rig_views(options: RigSceneOptions, *, progress: Progress = sile
     rig = rig_of_file(options.rig)
     warn_if_bad(options.rig, rig.verdicts)
     warn_of_pupils(options.rig, rig)
+    warn_if_exact(options.rig, rig.covariance)
     views, known = _views(options, rig.cameras), rig.quoted
     pairs = neighbouring_pairs([v.cam_from_world for v in views])
     grown: dict[tuple[str, str], PosedCloud] = {}

@@ -42,6 +42,7 @@ from rigkit.workflows.inputs.camera_files import (
     import_near_camera,
     import_pair,
     rig_of_file,
+    warn_if_exact,
 )
 from rigkit.workflows.options.clouds import SceneOptions
 from rigkit.workflows.outputs.provenance import software_facts
@@ -175,7 +176,7 @@ def _calibrations(options: SceneOptions, cameras: tuple[Camera, Camera]) -> Cali
         rig = rig_of_file(options.rig)
         names = list(rig.cameras)
         chosen = options.names or names[:2]
-        known_rig = rig.quoted
+        warn_if_exact(options.rig, known_rig := rig.quoted)
         return None if known_rig is None else known_rig.pair(*(names.index(name) for name in chosen))
     found = [
         None
@@ -183,6 +184,9 @@ def _calibrations(options: SceneOptions, cameras: tuple[Camera, Camera]) -> Cali
         else uncertain_camera(known, near=isinstance(camera, NearCamera))
         for path, camera in zip((options.camera, options.camera2), cameras, strict=True)
     ]
+    for path, known in zip((options.camera, options.camera2), found, strict=True):
+        if path is not None:
+            warn_if_exact(path, known)
     if all(known is None for known in found):
         return None
     first, second = (
