@@ -134,8 +134,8 @@ def frames_of(
 def of_worst_way(found: Monitored, task: Task, points: np.ndarray, weights: np.ndarray, off: np.ndarray) -> np.ndarray:
     """Return of errors of each way to hold the thing (N, ways) those (N,) of the way that the bound is of: that with
     the largest variance. The one that errs most often, looked for afterwards, would err by chance as well."""
-    by_corner, by_calibration, by_pixel, _ = gradients(found.cameras, found.cam_from_rig, points, weights)
-    variance = sum(variances(found, task, points, by_corner, by_calibration, by_pixel).values())
+    by_place = gradients(found.cameras, found.cam_from_rig, points, weights)
+    variance = sum(variances(found, task, points, by_place).values())
     return np.asarray(np.abs(off)[np.arange(len(off)), np.argmax(variance, axis=1)])
 
 

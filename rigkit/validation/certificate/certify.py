@@ -44,7 +44,7 @@ from rigkit.validation.monitoring.evidence import Monitored
 MAX_SHARE = 0.3
 """Largest bound, and uncertainty of points, relative to the measured size (for angles to a radian), at which the bound
 is relied upon. SIMULATED corner noise, lengths, depths, planes and angles: up to 0.5 94 to 96 % of the errors lie
-within a bound of 95 %, beyond 1 97 to 100 % (2026-11-29). The calibration's errors are propagated linearly."""
+within a bound of 95 %, beyond 1 97 to 100 % (2026-11-29). Propagation is to the second order."""
 AS_NORMAL = 1e6
 """Degrees of freedom from which Student's distribution counts as normal."""
 BISECTIONS = 50
@@ -68,15 +68,15 @@ def certify(instrument: Monitored, task: Task, *, cells: tuple[int, int] = MAP_C
     shape = pixels.shape[:2]
     rays, valid = first.unproject(pixels.reshape(-1, 2))
     points, weights = measured_points(np.where(valid[:, None], rays, [0.0, 0.0, 1.0]), task, instrument.is_rig)
-    by_corner, by_calibration, by_pixel, seen = gradients(instrument.cameras, instrument.cam_from_rig, points, weights)
-    seen &= valid
+    found = gradients(instrument.cameras, instrument.cam_from_rig, points, weights)
+    seen = found.seen & valid
     if not seen.any():
         raise DegenerateError(
             f"certificate: nowhere is a {task.quantity} of {task.size_mm:g} mm at {task.distance_mm:g} mm in view of "
             f"{' and '.join(instrument.names)}; give a shorter length or another distance"
         )
-    variance = variances(instrument, task, points, by_corner, by_calibration, by_pixel)
-    square = systematic(instrument, by_calibration)
+    variance = variances(instrument, task, points, found)
+    square = systematic(instrument, found.by_calibration)
     # Of several orientations the worst counts: an error of known size needs less than its share of the variance.
     whole = np.sqrt(np.maximum(sum(variance.values()) - square, TINY))
     upper = float(ndtri(0.5 + 0.5 * task.confidence))
@@ -92,7 +92,7 @@ def certify(instrument: Monitored, task: Task, *, cells: tuple[int, int] = MAP_C
     bound, quantile = _bound(sigma, expected, instrument.freedom, task.confidence)
     full_size = factor * (1.0 if task.quantity is Quantity.ANGLE else task.size_mm)
     # Largest displacement of any of the points by an error of one pixel, mm.
-    farthest = np.linalg.norm(by_pixel, ord=2, axis=(-2, -1)).max(axis=1)
+    farthest = np.linalg.norm(found.points_by_pixel, ord=2, axis=(-2, -1)).max(axis=1)
     uncertain = quantile * instrument.sigma_px * farthest.reshape(shape) > MAX_SHARE * task.size_mm
     in_view = seen.reshape(shape)
     certificate = Certificate(

@@ -12,17 +12,18 @@ lengths.
 
 Errors along the rays are many times those perpendicular to them. If they do not change a length or an angle to first
 order, they do to second: a length becomes longer, an angle smaller. With the Hessian H of g by the points, and C their
-covariance by the corners' noise, q = dX^T H dX / 2 has the mean square
+covariance, q = dX^T H dX / 2 has the mean square
 
-    E q^2 = tr(HC)^2 / 4 + tr(HCHC) / 2,
+    E q^2 = tr(HC)^2 / 4 + tr(HCHC) / 2
 
-which is added to that of the corners (JCGM 100 "GUM", 5.1.2, note; q and dg are uncorrelated). For the flatness of a
-plane it is negligible.
+(JCGM 100 "GUM", 5.1.2, note; q and dg are uncorrelated). That of the corners' noise alone is added to their variance;
+what the calibration's errors add to it, to that of the lenses. For the flatness of a plane it is negligible.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -119,12 +120,30 @@ def _differences(pairs: Sequence[tuple[int, int]], count: int) -> FloatArray:
     return np.asarray(np.kron(out, np.eye(3)))
 
 
+class Gradients(NamedTuple):
+    """Derivatives of M quantities at each of N places, and of their K points, for C cameras, one or two.
+
+    Attributes
+    ----------
+    by_corner : (N, M, K, 2 C) d quantity / d pixel.
+    by_calibration : (N, M, P) d quantity / d calibration, in the order of `Layout.of_cameras`.
+    points_by_pixel : (N, K, 3, 2 C) d point / d pixel.
+    points_by_calibration : (N, K, 3, P) d point / d calibration.
+    seen : (N,) whether all cameras see the place.
+    """
+
+    by_corner: FloatArray
+    by_calibration: FloatArray
+    points_by_pixel: FloatArray
+    points_by_calibration: FloatArray
+    seen: BoolArray
+
+
 def gradients(
     cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], points: Points, weights: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Return d quantity / d pixel (N, M, K, 2 C) for C cameras, one or two, d quantity / d calibration (N, M, P) in the
-    order of `Layout.of_cameras`, d point / d pixel (N, K, 3, 2 C), and a mask (N,) of the places that all cameras
-    see. `points` (N, K, 3) mm and the weights are in the frame of the first camera."""
+) -> Gradients:
+    """Return the derivatives at `points` (N, K, 3) mm with the gradients `weights` (N, M, K, 3) of the quantities, both
+    in the frame of the first camera."""
     layout, placed = Layout.of_cameras(cameras), zip(cameras, cam_from_rig, strict=True)
     rig_from_first = cam_from_rig[0].inverse()
     in_rig = rig_from_first.apply(points)
@@ -152,41 +171,37 @@ def gradients(
         # The pseudo-inverse of a 2x3 Jacobian moves a point perpendicular to its ray.
         by_pixel = np.linalg.pinv(J)
     by_corner = np.einsum("nmkx,nkxp->nmkp", weights, by_pixel)
-    return by_corner, -np.einsum("nmkp,nkpt->nmt", by_corner, D), by_pixel, seen
+    by_calibration = -np.einsum("nmkp,nkpt->nmt", by_corner, D)
+    return Gradients(by_corner, by_calibration, by_pixel, -by_pixel @ D, seen)
 
 
-def variances(
-    instrument: Monitored,
-    task: Task,
-    points: Points,
-    by_corner: FloatArray,
-    by_calibration: FloatArray,
-    by_pixel: FloatArray,
-) -> dict[str, FloatArray]:
+def variances(instrument: Monitored, task: Task, points: Points, found: Gradients) -> dict[str, FloatArray]:
     """Return the variance (N, M) by each cause, from `points` (N, K, 3) and their `gradients`.
 
     The part of the extrinsics' error that is correlated with the lenses counts as theirs: dm = C_ml C_ll^-1 dl + rest.
     """
     split = instrument.layout.cameras[-1].stop
     covariance = instrument.covariance
-    lens, mount = by_calibration[..., :split], by_calibration[..., split:]
+    lens, mount = found.by_calibration[..., :split], found.by_calibration[..., split:]
     own = covariance[:split, :split]
     follows = covariance[split:, :split] @ scaled_pinv(own)
     with_lens = lens + mount @ follows
     variance = {
-        OF_CORNERS: instrument.sigma_px**2 * np.sum(by_corner**2, axis=(-1, -2)),
+        OF_CORNERS: instrument.sigma_px**2 * np.sum(found.by_corner**2, axis=(-1, -2)),
         OF_LENSES: np.einsum("nmi,ij,nmj->nm", with_lens, own, with_lens),
     }
     if instrument.is_rig and task.quantity is not Quantity.PLANE:
-        bent = hessians(points, task.quantity)
-        variance[OF_CORNERS] = variance[OF_CORNERS] + _second_order(bent, by_pixel, instrument.sigma_px)
+        bent, noise, errors = hessians(points, task.quantity), *_of_points(instrument, found)
+        by_noise, by_both = _second_order(bent, noise), _second_order(bent, noise + errors)
+        variance[OF_CORNERS] = variance[OF_CORNERS] + by_noise
+        variance[OF_LENSES] = variance[OF_LENSES] + by_both - by_noise
     if instrument.is_rig:
         rest = covariance[split:, split:] - follows @ covariance[:split, split:]
         variance[OF_MOUNTS] = np.einsum("nmi,ij,nmj->nm", mount, rest, mount)
     if task.quantity in (Quantity.LENGTH, Quantity.DEPTH):
         relative = instrument.scale_sigma if instrument.is_rig else task.distance_sigma_mm / task.distance_mm
         cause = OF_SCALE if instrument.is_rig else OF_DISTANCE
-        variance[cause] = np.full(by_calibration.shape[:2], (relative * task.size_mm) ** 2)
+        variance[cause] = np.full(lens.shape[:2], (relative * task.size_mm) ** 2)
     return {cause: np.maximum(value, 0.0) for cause, value in variance.items()}
 
 
@@ -196,13 +211,21 @@ def systematic(instrument: Monitored, by_calibration: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(square, 0.0))
 
 
-def _second_order(bent: FloatArray, by_pixel: FloatArray, sigma_px: float) -> FloatArray:
-    """Return the mean square (N, M) of the second-order change by the corners' noise, from the `hessians` and d point /
-    d pixel (N, K, 3, 2 C)."""
-    count = by_pixel.shape[1]
-    root = np.zeros((len(by_pixel), 3 * count, count * by_pixel.shape[-1]))
-    for k in range(count):
-        root[:, 3 * k : 3 * k + 3, k * by_pixel.shape[-1] : (k + 1) * by_pixel.shape[-1]] = sigma_px * by_pixel[:, k]
-    moved = np.swapaxes(root, -1, -2)[:, None] @ bent @ root[:, None]
+def _of_points(instrument: Monitored, found: Gradients) -> tuple[FloatArray, FloatArray]:
+    """Return the covariances (N, 3 K, 3 K), mm^2, of the points by the corners' noise and by the calibration's
+    errors."""
+    by_pixel, by_calibration = found.points_by_pixel, found.points_by_calibration
+    count, points = by_pixel.shape[:2]
+    noise = np.zeros((count, points, 3, points, 3))
+    own = instrument.sigma_px**2 * by_pixel @ np.swapaxes(by_pixel, -1, -2)
+    noise[:, np.arange(points), :, np.arange(points)] = np.moveaxis(own, 1, 0)
+    stacked = by_calibration.reshape(count, 3 * points, -1)
+    return noise.reshape(count, 3 * points, -1), stacked @ instrument.covariance @ np.swapaxes(stacked, -1, -2)
+
+
+def _second_order(bent: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the mean square (N, M) of the second-order change, from the `hessians` and the covariance (N, 3 K, 3 K) of
+    the points."""
+    moved = bent @ covariance[:, None]
     trace = np.trace(moved, axis1=-2, axis2=-1)
-    return np.asarray(0.25 * trace**2 + 0.5 * (moved**2).sum(axis=(-1, -2)))
+    return np.asarray(0.25 * trace**2 + 0.5 * np.einsum("nmij,nmji->nm", moved, moved))

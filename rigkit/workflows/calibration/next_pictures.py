@@ -93,15 +93,15 @@ def length_goal(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], task:
         raise InputError(f"plan: one camera measures no {task.quantity}; give a length at a distance")
     for cells in (TASK_CELLS, MAP_CELLS):
         rays, valid = cameras[0].unproject(grid_pixels(cameras[0].size_px, cells).reshape(-1, 2))
-        _, by_calibration, _, seen = gradients(cameras, cam_from_rig, *measured_points(rays[valid], task, is_rig))
-        if seen.any():
+        found = gradients(cameras, cam_from_rig, *measured_points(rays[valid], task, is_rig))
+        if found.seen.any():
             break
-    if not seen.any():
+    if not found.seen.any():
         raise DegenerateError(
             f"nowhere is a length of {task.size_mm:g} mm at {task.distance_mm:g} mm in view; give a shorter "
             "length or another distance"
         )
-    rows = by_calibration[seen].reshape(-1, by_calibration.shape[-1])
+    rows = found.by_calibration[found.seen].reshape(-1, found.by_calibration.shape[-1])
     what = f"standard error of a length of {task.size_mm:g} mm at {task.distance_mm:g} mm"
     return Goal(rows.T @ rows / len(rows), "mm", what)
 

@@ -184,9 +184,9 @@ def _calibrations(options: SceneOptions, cameras: tuple[Camera, Camera]) -> Cali
         else uncertain_camera(known, near=isinstance(camera, NearCamera))
         for path, camera in zip((options.camera, options.camera2), cameras, strict=True)
     ]
-    for path, known in zip((options.camera, options.camera2), found, strict=True):
+    for path, of_file in zip((options.camera, options.camera2), found, strict=True):
         if path is not None:
-            warn_if_exact(path, known)
+            warn_if_exact(path, of_file)
     if all(known is None for known in found):
         return None
     first, second = (

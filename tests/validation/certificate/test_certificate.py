@@ -145,15 +145,28 @@ def test_what_noise_along_the_rays_does_to_second_order_is_counted(
     task = Task(quantity=quantity, size_mm=150.0, distance_mm=1500.0)
     rays, _ = rig.cameras[0].unproject(np.array([[620.0, 500.0], [800.0, 300.0]]))
     points, weights = measured_points(rays, task, True)
-    by_corner, by_calibration, by_pixel, _ = gradients(rig.cameras, rig.cam_from_rig, points, weights)
-    stated = variances(rig, task, points, by_corner, by_calibration, by_pixel)[OF_CORNERS]
-    off = rig.sigma_px * np.einsum("nkip,snkp->snki", by_pixel, rng.normal(size=(8000, *by_pixel.shape[:2], 4)))
-    moved = read_off(quantity, (points + off).reshape(-1, *points.shape[1:])).reshape(8000, len(points), -1)
-    error = (moved - read_off(quantity, points)) * (np.radians(1.0) if quantity is Quantity.ANGLE else 1.0)
-    np.testing.assert_allclose((error**2).mean(axis=0), stated, rtol=0.08)
-    first = rig.sigma_px**2 * (by_corner**2).sum(axis=(-1, -2))
+    found = gradients(rig.cameras, rig.cam_from_rig, points, weights)
+    stated = variances(rig, task, points, found)[OF_CORNERS]
+    noise = rng.normal(size=(8000, *found.points_by_pixel.shape[:2], 4))
+    off = rig.sigma_px * np.einsum("nkip,snkp->snki", found.points_by_pixel, noise)
+
+    def squares(off: np.ndarray) -> np.ndarray:
+        moved = read_off(quantity, (points + off).reshape(-1, *points.shape[1:])).reshape(8000, len(points), -1)
+        error = (moved - read_off(quantity, points)) * (np.radians(1.0) if quantity is Quantity.ANGLE else 1.0)
+        return np.asarray((error**2).mean(axis=0))
+
+    np.testing.assert_allclose(squares(off), stated, rtol=0.08)
+    first = rig.sigma_px**2 * (found.by_corner**2).sum(axis=(-1, -2))
     # What does not face the first order at all: depths, of which ends nearer or farther are that.
     assert (first < (1.0 if quantity is Quantity.DEPTH else 0.9) * stated).all()
+    # Errors of the calibration, too; those of lenses at places that differ do not shift all points alike.
+    sigmas = np.concatenate([*2 * [[2.0, 2.0, 2.0, 2.0, 0.02, 0.02, 0.02, 0.02]], [1e-4, 3e-3, 1e-4, 0.1, 0.1, 0.1]])
+    by_calibration = found.points_by_calibration * sigmas
+    off += np.einsum("nkip,sp->snki", by_calibration, rng.normal(size=(8000, len(sigmas))))
+    of_both = sum(variances(replace(rig, covariance=np.diag(sigmas**2)), task, points, found).values())
+    np.testing.assert_allclose(squares(off), of_both, rtol=0.08)
+    linear = np.sum((found.by_calibration * sigmas) ** 2, axis=-1)
+    assert quantity is not Quantity.ANGLE or (stated + linear < 0.9 * of_both).all()
 
 
 def test_bounds_of_one_camera_hold_as_often_as_they_say(rng: np.random.Generator) -> None:
@@ -241,10 +254,10 @@ def test_an_error_that_is_expected_does_not_vary(times: float, rng: np.random.Ge
     rig = replace(rig_of("brown", joint, scale_sigma=0.0), covariance=joint + square, expected=square)
     certificate = certify(rig, task, cells=(5, 4))
     points, weights = measured_points(rig.cameras[0].unproject(certificate.pixels[certificate.in_view])[0], task, True)
-    by_corner, by_calibration, by_pixel, _ = gradients(rig.cameras, rig.cam_from_rig, points, weights)
-    about = variances(replace(rig, covariance=joint), task, points, by_corner, by_calibration, by_pixel)
+    found = gradients(rig.cameras, rig.cam_from_rig, points, weights)
+    about = variances(replace(rig, covariance=joint), task, points, found)
     drawn = np.sqrt(np.sum(list(about.values()), axis=0)[:, 0, None]) * rng.normal(size=(len(points), 4000))
-    drawn += (by_calibration @ error)[:, :1]
+    drawn += (found.by_calibration @ error)[:, :1]
     inside = (np.abs(drawn) <= certificate.bound[certificate.in_view][:, None]).mean()
     assert inside == pytest.approx(0.95, abs=0.005)
     plain = certify(replace(rig, expected=None), task, cells=(5, 4))

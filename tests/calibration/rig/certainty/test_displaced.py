@@ -69,5 +69,5 @@ def test_departures_of_two_lenses_are_no_noise_of_frames(tmp_path: Path) -> None
     cameras = {camera.name: (camera.camera, None) for camera in rig.cameras}
     held = calibrate_rig(views, sizes(), known=KnownCameras.of(cameras, [(rig.mounted, list(cameras))]), folds=0)
     assert held.baseline_mm("reg", "fish") == pytest.approx((length, sigma), rel=AS_UNCERTAIN)
-    moved, before = (np.concatenate([m.moves[-12:] for m in r.departures], axis=1) for r in (held, rig))
-    assert (np.linalg.norm(moved - before, axis=1) < AS_UNCERTAIN * np.linalg.norm(before, axis=1)).all()
+    held_moves, own_moves = (np.concatenate([m.moves[-12:] for m in r.departures], axis=1) for r in (held, rig))
+    assert (np.linalg.norm(held_moves - own_moves, axis=1) < AS_UNCERTAIN * np.linalg.norm(own_moves, axis=1)).all()
