@@ -7,11 +7,12 @@ noise. 95 % of the errors should be within the certificate's 95 % bounds.
 With --departs PX the lenses deviate from every model: random displacements of their images (powers of the radius,
 decentring, thin prisms, shear) of PX pixels at the corners; with --half boards are only in the left half of the image.
 With --strange the lenses are of six kinds that no model fits, decentred, and the model is "auto" (ten times slower).
+With --held the certified rig is a second one: its lenses are held at those of the first, from the same or other images.
 Errors are listed separately for places where all cameras had boards. The standard error of a share is computed over
 sessions, because errors of one calibration are correlated all over the image.
 
     python scripts/measure_certificates.py [--trials 100] [--frames 12] [--lens brown | kannala_brandt]
-        [--departs 0] [--strange] [--half] [--noise 0.1]
+        [--departs 0] [--strange] [--half] [--noise 0.1] [--held same | other]
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ from rigkit.calibration.calibrate import FOLDS, calibrate
 from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.certainty.displaced import DisplacedCamera
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.solving.known import KnownCameras
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
@@ -76,13 +79,14 @@ STRANGE, DECENTRED_PX = "strange", 0.3
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """How a rig is calibrated: the model asked for, how many frames, the corners' noise, and which part of the image,
-    from the left, has boards."""
+    """How a rig is calibrated: the model asked for, how many frames, the corners' noise, which part of the image, from
+    the left, has boards, and from which images its mounts are solved for with held lenses, if they are."""
 
     model: str
     frames: int
     noise_px: float
     reach: float
+    held: str | None = None
 
     @property
     def degree(self) -> int | None:
@@ -146,13 +150,29 @@ def by_place(within: np.ndarray, covered: np.ndarray, what: str) -> Iterator[tup
             yield f"{what}, {place}", float(within[own].mean())
 
 
+def calibrated(lenses: Sequence[Camera], session: Session, rng: np.random.Generator) -> RigCalibration:
+    """Return the calibration of a rig, with held lenses if the session says so."""
+
+    def shown() -> dict[str, list[tuple[str, BoardView]]]:
+        views = frames_of(lenses, (Rigid3.identity(), MOUNT), session, rng)
+        return {name: [(v.image, v) for v in own] for name, own in zip(("left", "right"), views, strict=True)}
+
+    first, sizes = shown(), dict.fromkeys(("left", "right"), SIZE_PX)
+    rig = calibrate_rig(first, sizes, model=session.model, degree=session.degree, folds=session.folds)
+    if session.held is None:
+        return rig
+    known = KnownCameras.of({c.name: (c.camera, None) for c in rig.cameras}, [(rig.mounted, tuple(sizes))])
+    return calibrate_rig(shown() if session.held == "other" else first, sizes, known=known, folds=session.folds)
+
+
 def rig_trial(lenses: Sequence[Camera], session: Session, rng: np.random.Generator) -> Iterator[tuple[str, float]]:
     """Yield (quantity and place, share of errors within the bound) of a rig."""
     poses = (Rigid3.identity(), MOUNT)
-    views = dict(zip(("left", "right"), frames_of(lenses, poses, session, rng), strict=True))
-    sizes = dict.fromkeys(views, SIZE_PX)
-    named = {name: [(view.image, view) for view in own] for name, own in views.items()}
-    rig = calibrate_rig(named, sizes, model=session.model, degree=session.degree, folds=session.folds)
+    rig = calibrated(lenses, session, rng)
+    length, sigma = rig.baseline_mm("left", "right")
+    off_mm = length - float(np.linalg.norm(MOUNT.translation_mm))
+    yield "baseline, two sigmas", float(abs(off_mm) <= 2.0 * sigma)
+    yield "baseline, one sigma", float(abs(off_mm) <= sigma)
     found = instrument_of(monitored_rig(rig.mounted))
     for quantity, task in TASKS.items():
         certificate = certify(found, task, cells=CELLS)
@@ -215,16 +235,17 @@ def main() -> None:
     parser.add_argument("--strange", action="store_true", help="lenses that no model is")
     parser.add_argument("--half", action="store_true", help="boards in the left of the image alone")
     parser.add_argument("--noise", type=float, default=NOISE_PX, help="of corners, px")
+    parser.add_argument("--held", choices=("same", "other"), help="images before lenses that are held")
     args = parser.parse_args()
     print("| lens | quantity | sessions | errors within the 95 % bound |\n|:--|:--|--:|--:|")
     for name in [STRANGE] if args.strange else args.lens or LENSES:
         model = "auto" if args.strange else LENSES[name].model
-        session = Session(model, args.frames, args.noise, HALF if args.half else 1.0)
+        session = Session(model, args.frames, args.noise, HALF if args.half else 1.0, args.held)
         shares: dict[str, list[float]] = {}
         for trial in range(args.trials):
             rng = np.random.default_rng([trial, len(name)])
             lenses = lenses_of(name, trial, args.departs, rng)
-            for run in (rig_trial, alone_trial):
+            for run in (rig_trial,) if args.held else (rig_trial, alone_trial):
                 for quantity, share in run(lenses, session, rng):
                     shares.setdefault(quantity, []).append(share)
         for quantity, found in shares.items():

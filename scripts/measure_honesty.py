@@ -6,7 +6,7 @@ processed as a user's: boards are detected, the camera is calibrated, pairs are 
 angle, baseline and normal are compared with their sigmas: 68 and 95 % should be within one and two sigmas.
 
     python scripts/measure_honesty.py [--labs 0:20] [--odd] [--json FILE] [--model MODEL] [--views 14]
-    python scripts/measure_honesty.py --sessions 20 [--moving] [--images 3,4,5,7,10,20]
+    python scripts/measure_honesty.py --sessions 20 [--models | --moving] [--images 3,4,5,7,10,20]
 
 One laboratory takes 20 to 40 s. With --json, laboratories that the file has are not repeated, so it can run in parts;
 the table is of all. --sessions N uses SIMULATED corners, without images: N sessions of each kind, from three images on.
@@ -152,13 +152,13 @@ def table(rows: list[tuple[str, str, str, float]]) -> str:
     return "\n".join(lines)
 
 
-def print_sessions(seeds: int, images: list[int], moving: bool, readout_s: float) -> None:
+def print_sessions(seeds: int, images: list[int], moving: bool, readout_s: float, models: bool) -> None:
     """Print how many errors of small sessions lie within one and two stated sigmas."""
     print(
         "| images | boards seen | quantity | count | within 1 sigma | within 2 | rms |\n|--:|:--|:--|--:|--:|--:|--:|"
     )
     for count in images:
-        found = moving_sessions(count, seeds, readout_s) if moving else sessions(count, seeds)
+        found = moving_sessions(count, seeds, readout_s) if moving else sessions(count, seeds, models=models)
         for (what, seen), errors in found.items():
             shares = " | ".join(f"{100 * np.mean(errors < k):.0f} %" for k in (1, 2))
             rms = np.sqrt(np.mean(errors**2))
@@ -174,11 +174,12 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="results so far; new laboratories are added")
     parser.add_argument("--sessions", type=int, metavar="SEEDS", help="instead, small simulated sessions")
     parser.add_argument("--moving", action="store_true", help="of boards that move before cameras without a trigger")
+    parser.add_argument("--models", action="store_true", help="of one camera, with a lens of every model")
     parser.add_argument("--readout", type=float, default=0.0, help="s; and images that are read row by row")
     parser.add_argument("--images", default=",".join(map(str, IMAGES)), help="of these sessions")
     args = parser.parse_args()
     if args.sessions:
-        print_sessions(args.sessions, [int(n) for n in args.images.split(",")], args.moving, args.readout)
+        print_sessions(args.sessions, [int(n) for n in args.images.split(",")], args.moving, args.readout, args.models)
         return
     known = json.loads(args.json.read_text()) if args.json and args.json.is_file() else {}
     for seed in range(*map(int, args.labs.split(":"))):

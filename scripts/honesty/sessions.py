@@ -23,6 +23,8 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
+from rigkit.cameras.convert import convert_camera
+from rigkit.cameras.registry import MODELS
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, RigkitError
@@ -79,10 +81,28 @@ def lens_in_sigmas(found: Calibration, truth: Camera) -> list[float]:
 
 
 def camera_session(name: str, images: int, common_px: float, whole: bool, rng: np.random.Generator) -> Errors:
-    truth = lens(name)
+    return {"lens": _of_one_camera(name, lens(name), images, common_px, whole, rng)}
+
+
+def _of_one_camera(
+    name: str, truth: Camera, images: int, common_px: float, whole: bool, rng: np.random.Generator
+) -> list[float]:
     views, _, _ = random_views(truth, images, rng, reach_deg=REACH_DEG[name], noise_px=0.0)
     views = [disturbed(view, common_px, whole, rng) for view in views]
-    return {"lens": lens_in_sigmas(calibrate(views, SIZE, model=truth.model), truth)}
+    return lens_in_sigmas(calibrate(views, SIZE, model=truth.model), truth)
+
+
+def models_session(name: str, images: int, common_px: float, whole: bool, rng: np.random.Generator) -> Errors:
+    """Return the errors with the lens turned into one of each model that can follow it."""
+    out: Errors = {}
+    for model in MODELS:
+        try:
+            truth = convert_camera(lens(name), model).camera
+            own = _of_one_camera(name, truth, images, common_px, whole, rng)
+        except RigkitError:
+            continue
+        out[f"lens, {model}"] = own
+    return out
 
 
 def pair_session(name: str, images: int, common_px: float, whole: bool, rng: np.random.Generator) -> Errors:
@@ -168,14 +188,16 @@ def _placed(rng: np.random.Generator) -> Rigid3:
     return Rigid3(turned, middle - turned @ BOARD.points().mean(axis=0))
 
 
-def sessions(images: int, seeds: int) -> dict[tuple[str, str], FloatArray]:
-    """Return the errors in stated sigmas of sessions of so many images, by quantity and by how boards are seen."""
+def sessions(images: int, seeds: int, *, models: bool = False) -> dict[tuple[str, str], FloatArray]:
+    """Return the errors in stated sigmas of sessions of so many images, by quantity and by how boards are seen; with
+    `models` of one camera alone, with lenses of every model."""
     errors: dict[tuple[str, str], list[float]] = defaultdict(list)
     for whole in (True, False):
         for common_px in COMMON_PX:
             for seed in range(seeds):
                 for k, name in enumerate(LENSES):
-                    for make in (camera_session, *(ONE_LENS if name == LENSES[0] else ())):
+                    alone = (models_session,) if models else (camera_session,)
+                    for make in (*alone, *(ONE_LENS if name == LENSES[0] and not models else ())):
                         rng = np.random.default_rng([seed, images, k, int(1e3 * common_px), whole])
                         try:
                             found = make(name, images, common_px, whole, rng)
