@@ -20,7 +20,12 @@ from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.relative_pose.refinement.noise_level import POSE_FREEDOM, variance_factor
 from rigkit.relative_pose.refinement.refine import RefinedPose, refine_pose, rules_out
-from rigkit.relative_pose.refinement.select import DEFAULT_LEVEL_RAD, PoseTypeEvidence, pose_type_evidence
+from rigkit.relative_pose.refinement.select import (
+    DEFAULT_LEVEL_RAD,
+    EXACT_LEVEL_RAD,
+    PoseTypeEvidence,
+    pose_type_evidence,
+)
 from rigkit.relative_pose.solvers.pose import choose_pose, essential_from_pose
 from rigkit.relative_pose.solvers.registry import fundamental_for
 
@@ -107,7 +112,7 @@ def pair_geometry(
     pose_type : as declared; AUTO chooses the type that the data support best. A declared type is used even if the data
         contradict it; then `notes` says so.
     level_sigma_rad : standard deviation of the pose-type prior in the refinement. None: that of a carefully set spirit
-        level (DEFAULT_LEVEL_RAD); 0: the pose type is exact.
+        level (DEFAULT_LEVEL_RAD); 0: the pose type is exact, unless the data contradict that.
     level_frames : for cameras that are not level themselves but whose mounting is known; planar motion only.
     """
     declared = PoseType(pose_type)
@@ -118,6 +123,9 @@ def pair_geometry(
         captured = pair.captured if level_frames is None else level_frames.matches(pair.captured)
         decision = replace(decide_pose_type(captured, declared, level_sigma_rad), level_frames=level_frames)
         contradiction = () if declared is PoseType.AUTO else decision.notes
+        if contradiction and decision.level_sigma_rad is None:
+            # Held exactly it would bend the boards, and hide that this declaration is wrong.
+            decision = replace(decision, level_sigma_rad=DEFAULT_LEVEL_RAD)
         return _in_mm(pair, decision, _maximum_likelihood_pose(pair, decision))
     except DegenerateError as error:
         # A wrong declaration is the likeliest reason of a degenerate pose.
@@ -129,12 +137,13 @@ def decide_pose_type(captured: Matches, declared: PoseType, level_sigma_rad: flo
     if declared is PoseType.GENERAL:
         return PoseTypeDecision(declared, declared, None, None, ())
     level = DEFAULT_LEVEL_RAD if level_sigma_rad is None else level_sigma_rad
-    evidence = pose_type_evidence(captured, level or None)
+    # The choice of a type is by a level's accuracy, not by that of an exact type.
+    tested = level or (DEFAULT_LEVEL_RAD if declared is PoseType.AUTO else EXACT_LEVEL_RAD)
+    evidence = pose_type_evidence(captured, tested)
     if declared is PoseType.AUTO:
         chosen = evidence.types[0]
         words = f"pose type '{chosen.pose_type}' chosen (probability {chosen.probability:.3f})"
-        # The evidence is for the type with a level's accuracy, not for an exact type.
-        soft = None if chosen.pose_type is PoseType.GENERAL else evidence.level_sigma_rad
+        soft = None if chosen.pose_type is PoseType.GENERAL else tested
         return PoseTypeDecision(declared, chosen.pose_type, soft, evidence, (words,))
     contradiction = evidence.contradiction(declared)
     notes = () if contradiction is None else (contradiction,)

@@ -32,13 +32,14 @@ def declared(
     rng: np.random.Generator,
     level_deg: float = 0.2,
     boards: Sequence[Board] = BOARDS,
+    declared_level_deg: float = 0.2,
 ) -> Reconstruction:
     """Return a reconstruction of a pair of one pose type that was declared another, or with `boards` declared."""
     scene = trihedral_pair(
         BOARDS, regular_camera(), true, rng, level_sigma_deg=level_deg, distance=(0.9, 1.3), walls=False
     )
     pair = noisy_pair(scene, BOARDS, rng, 0.03, declared=boards)
-    return reconstruct_pair(pair, pose_type=printed, level_sigma_rad=np.deg2rad(0.2))
+    return reconstruct_pair(pair, pose_type=printed, level_sigma_rad=np.deg2rad(declared_level_deg))
 
 
 @pytest.mark.parametrize("pose_type", [PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD])
@@ -67,6 +68,19 @@ def test_a_level_that_was_off_fails_with_its_angle(rng: np.random.Generator) -> 
     assert not row.passed
     assert row.ours > 5.0
     assert row.k > row.limit_k
+
+
+@pytest.mark.parametrize("pose_type", [PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD])
+def test_an_exact_level_that_was_off_by_tenths_of_a_degree_fails_and_bends_nothing(
+    rng: np.random.Generator, pose_type: PoseType
+) -> None:
+    """Held exactly, it bends boards by degrees; where it holds it is used as declared."""
+    exact = declared(pose_type, pose_type, rng, level_deg=0.0, declared_level_deg=0.0)
+    assert validate(exact, TRUTH).passed
+    assert exact.geometry is not None and exact.geometry.decision.level_sigma_rad is None
+    report = validate(declared(pose_type, pose_type, rng, level_deg=0.4, declared_level_deg=0.0), TRUTH)
+    assert not report.check(f"pose type {pose_type}").passed
+    assert all(check.passed for check in report.checks if check.kind == "angle")
 
 
 def test_a_type_whose_pose_sees_nothing_in_front_is_not_checked(rng: np.random.Generator) -> None:

@@ -27,6 +27,10 @@ from rigkit.relative_pose.solvers.pose import pose_directions
 DEFAULT_LEVEL_RAD = float(np.radians(0.2))
 """Default sigma of the level: that of a carefully set spirit level on a tripod."""
 
+EXACT_LEVEL_RAD = float(np.radians(0.02))
+"""Sigma that tests a type declared as exact: a tenth of a careful level, and a third of a pixel of a lens of 1000 px,
+by which calibrations from pictures err."""
+
 CONTRADICTION_P = 1e-3
 """Significance level of the test of a declared type: its false alarm rate."""
 
