@@ -3,7 +3,7 @@
 examples:
   rigkit board 9x6 --square-mm 25 -o board                      a chessboard of 9 by 6 inner corners
   rigkit board 8x11 --square-mm 15 --charuco DICT_5X5_100 -o charuco
-  rigkit board aprilgrid:6x6x25,spacing=0.3 -o grid
+  rigkit board aprilgrid:6x6x22,spacing=0.3 -o grid
   rigkit board board.toml --ruler-x-mm 250.4 --ruler-y-mm 170.2 --sigma-mm 0.2      as measured on the print
   rigkit board identify photos                                  which board the images show
 """

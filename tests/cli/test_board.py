@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from rigkit.cli import board as cli_board
 from rigkit.cli.main import main
 from rigkit.io.boards.board_file import load_board
 from rigkit.io.boards.board_words import board_of_words
@@ -79,3 +80,11 @@ def test_half_a_layout_is_refused(board: Path, keys: str, capsys: pytest.Capture
     board.write_text(board.read_text() + keys)
     assert main(["board", str(board), *READ]) == 2
     assert "b.toml" in capsys.readouterr().err
+
+
+def test_what_help_shows_fits_on_its_paper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    lines = [line.split("   ")[0].split() for line in (cli_board.__doc__ or "").splitlines() if " -o " in line]
+    assert len(lines) == 3
+    for _, *words in lines:
+        assert main(words) == 0

@@ -3,14 +3,13 @@ the settings of OpenCV's calibration sample (XML or YAML)."""
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from rigkit.core.errors import InputError
-from rigkit.interop.yaml_text import parse_yaml
+from rigkit.interop.opencv_storage import parse_storage
 from rigkit.io.disk.reading import read_text
 
 FOREIGN_SUFFIXES = (".yaml", ".yml", ".xml")
@@ -32,13 +31,17 @@ def foreign_board(path: str | Path) -> Values | None:
         return _caliscope(source)
     if source.suffix.lower() not in FOREIGN_SUFFIXES:
         return None
-    text = read_text(source)
-    values: Mapping[str, Any]
-    values = _opencv_xml(text) if source.suffix.lower() == ".xml" else parse_yaml(text, str(source))
+    values: Mapping[str, Any] = parse_storage(read_text(source), str(source))
+    # OpenCV's sample writes its settings as a mapping of that name.
+    values = settings if isinstance(settings := values.get("Settings"), dict) else values
     for known, read in READERS:
         if known in values:
             try:
                 return read(values)
+            except NotImplementedError as error:
+                raise InputError(
+                    f"'{source}': {error}: rigkit has no such target; print another (rigkit board)"
+                ) from error
             except (KeyError, TypeError, ValueError, OverflowError) as error:
                 raise InputError(
                     f"'{source}': no target: {type(error).__name__} {error}; is the file whole?"
@@ -67,7 +70,7 @@ def _kalibr(values: Mapping[str, Any]) -> Values:
         return {**size, **sides}
     if kind == "circlegrid":
         return _circles(size, _mm(values["spacingMeters"]), asymmetric=bool(values.get("asymmetricGrid")))
-    raise ValueError(f"target_type {kind}")
+    raise NotImplementedError(f"target_type {kind}")
 
 
 def _boofcv(values: Mapping[str, Any]) -> Values:
@@ -78,12 +81,13 @@ def _boofcv(values: Mapping[str, Any]) -> Values:
         # BoofCV counts squares.
         return {"columns": columns - 1, "rows": rows - 1, "square_mm": float(grid["shapeSize"])}
     if kind not in ("CIRCLE_GRID", "CIRCLE_HEXAGONAL"):
-        raise ValueError(f"type {kind}")
+        raise NotImplementedError(f"type {kind}")
     lengths = {"distance_mm": float(grid["shapeDistance"]), "diameter_mm": float(grid["shapeSize"])}
     if kind == "CIRCLE_GRID":
         return {"type": "circles", "columns": columns, "rows": rows, **lengths}
     if columns % 2:
-        raise ValueError(f"{columns} columns, whose rows have {columns // 2 + 1} and {columns // 2} circles in turn")
+        counts = f"{columns // 2 + 1} and {columns // 2}"
+        raise NotImplementedError(f"{columns} columns, whose rows have {counts} circles in turn")
     # BoofCV counts half steps along a row; on its pages every second row is shifted to the left.
     staggered = {"layout": "hexagonal", "stagger": "left"}
     return {"type": "circles", **staggered, "columns": columns // 2, "rows": rows, **lengths}
@@ -91,15 +95,18 @@ def _boofcv(values: Mapping[str, Any]) -> Values:
 
 def _opencv(values: Mapping[str, Any]) -> Values:
     # The settings of samples/cpp/tutorial_code/calib3d/camera_calibration; squares in the user's unit, mm by default.
-    kind, square = values.get("Calibrate_Pattern", "CHESSBOARD"), float(values["Square_Size"])
+    # In the sample's XML words stand in quotes.
+    kind, square = str(values.get("Calibrate_Pattern", "CHESSBOARD")).strip('"'), float(values["Square_Size"])
     size = {"columns": int(values["BoardSize_Width"]), "rows": int(values["BoardSize_Height"])}
     if kind == "CHARUCOBOARD":
         # The only board whose squares OpenCV counts.
         inner = {"columns": size["columns"] - 1, "rows": size["rows"] - 1}
-        marker = {"dictionary": values["ArUco_Dict_Name"], "marker_mm": float(values["Marker_Size"])}
+        marker = {"dictionary": str(values["ArUco_Dict_Name"]).strip('"'), "marker_mm": float(values["Marker_Size"])}
         return {"type": "charuco", **inner, "square_mm": square, **marker}
     if kind in ("CIRCLES_GRID", "ASYMMETRIC_CIRCLES_GRID"):
         return _circles(size, square, asymmetric=kind.startswith("ASYMMETRIC"))
+    if kind != "CHESSBOARD":
+        raise NotImplementedError(f"Calibrate_Pattern {kind}")
     return {**size, "square_mm": square}
 
 
@@ -141,12 +148,6 @@ def _caliscope(source: Path) -> Values | None:
     }
 
 
-def _opencv_xml(text: str) -> Mapping[str, Any]:
-    """Return the flat entries of an XML file of OpenCV's, without parsing entities and nesting."""
-    found = re.findall(r"<(\w{1,40})>\s*\"?([^<>\"]{0,200}?)\"?\s*</\1>", text[:MAX_XML])
-    return {name: value.strip() for name, value in found}
-
-
 def _first_of(values: Mapping[str, Any], *names: str) -> Any:
     return next(values[name] for name in (*names, names[0]) if name in values or name == names[-1])
 
@@ -155,7 +156,6 @@ def _mm(metres: Any) -> float:
     return 1e3 * float(metres)
 
 
-MAX_XML = 100_000
 BOOFCV = "boofcv.alg.fiducial.calib.ConfigCalibrationTarget"
 READERS: tuple[tuple[str, Callable[[Mapping[str, Any]], Values]], ...] = (
     ("target_type", _kalibr),

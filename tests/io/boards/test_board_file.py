@@ -76,6 +76,10 @@ OPENCV = (
     "<BoardSize_Height>6</BoardSize_Height><Square_Size>50</Square_Size>"
     '<Calibrate_Pattern>"CHESSBOARD"</Calibrate_Pattern></Settings></opencv_storage>'
 )
+OPENCV_YAML = (
+    "%YAML:1.0\n---\nSettings:\n   BoardSize_Width: 9\n   BoardSize_Height: 6\n   Square_Size: 5.e+01\n"
+    '   Calibrate_Pattern: "CHARUCOBOARD"\n   ArUco_Dict_Name: DICT_4X4_50\n   Marker_Size: 25\n'
+)
 
 
 @pytest.mark.parametrize(
@@ -87,6 +91,7 @@ OPENCV = (
         ("hexagonal.yaml", HEXAGONAL, (14, 24), (1.2, 1.2), Circles("hexagonal", "left", 1.0)),
         ("charuco.toml", CALISCOPE, (3, 4), (54.0, 54.0), Charuco("DICT_4X4_50", 40.5, inverted=True)),
         ("settings.xml", OPENCV, (9, 6), (50.0, 50.0), Chessboard()),
+        ("settings.yml", OPENCV_YAML, (8, 5), (50.0, 50.0), Charuco("DICT_4X4_50", 25.0)),
     ],
 )
 def test_target_files_of_other_tools(
@@ -110,3 +115,17 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         (tmp_path / name).write_text(text)
         with pytest.raises(InputError, match=name):
             load_board(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "kind"),
+    [
+        ("circles.yaml", HEXAGONAL.replace("28", "27"), "27 columns, whose rows have 14 and 13 circles in turn"),
+        ("squares.yaml", HEXAGONAL.replace("CIRCLE_HEXAGONAL", "SQUARE_GRID"), "type SQUARE_GRID"),
+        ("settings.xml", OPENCV.replace("CHESSBOARD", "RADON"), "Calibrate_Pattern RADON"),
+    ],
+)
+def test_targets_of_other_tools_that_rigkit_lacks_are_named(name: str, text: str, kind: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=f"{name}': {kind}: rigkit has no such target"):
+        load_board(tmp_path / name)
