@@ -57,7 +57,11 @@ def read_image(path: str | Path) -> Image:
     """
     source = Path(path)
     data = read_bytes(source, "image")
-    if (name := unread_format(data)) is not None:
+    name = unread_format(data)
+    if name is None and data.startswith(TIFF_STARTS) and source.suffix.lower() in UNREAD_ENDINGS:
+        # DNG, NEF and ARW are TIFFs whose first picture is a thumbnail.
+        name = f"a raw image ({source.suffix[1:].upper()})"
+    if name is not None:
         raise InputError(
             f"image '{source}' is {name}, which is not read; convert it to PNG or TIFF without changing pixels"
         )

@@ -22,7 +22,8 @@ from rigkit.io.media.images import Image, is_image, quiet_opencv, require_pixels
 
 _log = logging.getLogger(__name__)
 
-VIDEO_ENDINGS = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv"})
+VIDEO_ENDINGS = frozenset({".3gp", ".avi", ".flv", ".m2ts", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov", ".mp4", ".mpeg",
+                           ".mpg", ".mts", ".ts", ".webm", ".wmv"})  # fmt: skip
 LIVE_CAMERA = re.compile(r"camera:(\d{1,2})")
 SEQUENCE = re.compile(r"%0?\d?d")
 COMPLETE = 0.95

@@ -103,3 +103,30 @@ def test_formats_that_are_not_read_are_named(start: bytes, name: str, tmp_path: 
     path.write_bytes(start + bytes(200))
     with pytest.raises(InputError, match=f"{name}.*which is not read"):
         read_image(path)
+
+
+def test_a_raw_image_is_not_read_by_its_thumbnail(tmp_path: Path) -> None:
+    thumbnail = cv2.imencode(".tiff", np.zeros((16, 24), np.uint8))[1].tobytes()
+    for name in ("photo.dng", "photo.NEF"):
+        (tmp_path / name).write_bytes(thumbnail)
+        with pytest.raises(InputError, match=f"{name}' is a raw image .*which is not read"):
+            read_image(tmp_path / name)
+
+
+@pytest.mark.parametrize(("ending", "code"), [(".3gp", "mp4v"), (".flv", "FLV1"), (".mjpg", "MJPG")])
+def test_recordings_of_camcorders_and_phones_are_videos(ending: str, code: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a{ending}"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 10, (64, 48))
+    if not writer.isOpened():
+        pytest.skip("OpenCV without this encoder")
+    for level in (40, 90, 140):
+        writer.write(np.full((48, 64, 3), level, np.uint8))
+    writer.release()
+    assert is_video(path)
+    assert videos_inside(tmp_path) == [path]
+    with Video(path) as source:
+        frame = source.frame(2)
+    assert frame is not None
+    assert abs(int(frame[20, 20]) - 140) <= 3
+    # A transport stream of three frames is too short for FFmpeg.
+    assert all(map(is_video, ("a.MTS", "a.m2ts", "a.ts")))
