@@ -42,7 +42,8 @@ ORTHONORMAL = 1e-12
 MIN_ALIGNMENT_WEIGHT = 0.1
 """Corners of less weight are outliers, and do not count for the largest radius."""
 ON_AXIS, NEAR_AXIS = 1e-4, 1e-3
-"""Radii, as parts of the largest: smallest divisor; and limit up to which a corner gives no depth."""
+"""Radii in the image, as parts of the largest: smallest divisor; and limit up to which a corner gives no depth, of its
+radius in the camera frame, along its radial line, too: that divides its weight."""
 NOTHING = 1e-9
 """Smallest divisor, of lengths (px, mm)."""
 NOTHING_RAD = 1e-6
@@ -119,7 +120,8 @@ class _Depths:
         self._rho, self._weight = rho, alignment.weight
         length = np.maximum(np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2), NOTHING)
         self._s = (xy * offset).sum(axis=1) / length
-        self._used = (alignment.weight > 0.0) & (self._s > 0.0) & (rho > NEAR_AXIS)
+        largest = np.where(alignment.weight > 0.0, self._s, 0.0).max(axis=1, keepdims=True)
+        self._used = (alignment.weight > 0.0) & (self._s > NEAR_AXIS * largest) & (rho > NEAR_AXIS)
         # Of each view: s rho^(k - 1) for each exponent k, the depth, and one for t3.
         self._rows = rows = np.ones((len(rho), len(EXPONENTS[0]) + 2, rho.shape[1]))
         np.divide(self._s, self._safe, out=rows[:, 0])
