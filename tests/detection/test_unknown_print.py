@@ -83,6 +83,27 @@ def test_edges_that_have_moved_too_far_for_the_border(sure: bool) -> None:
         assert (grid.other_border.pattern.border, grid.other_border.pattern.spacing) == (1, 0.81)
 
 
+@pytest.mark.parametrize("step", [1.1, 3.5])
+def test_tags_that_another_border_would_let_overlap_have_none(step: float) -> None:
+    """Of narrow borders read as wide ones, and of tags far apart, which are no grid: neither ends in an error."""
+    row, column = np.divmod(np.arange(12), 4)
+    own = unknown_tags._SeenTags(
+        image=0,
+        kind=("tag36h11", 1, True),
+        numbers=np.arange(12),
+        places=np.stack([column, row], axis=-1),
+        steps=np.full(17, step),
+        edges_moved=True,
+        border_ambiguous=True,
+    )
+    seen = TagObservations()
+    seen.kinds[own.kind] += 1
+    seen.seen.append(own)
+    grids = unknown_tags.guessed_grids(seen)
+    assert len(grids) == (step < 2.0)
+    assert all(grid.other_border is None for grid in grids)
+
+
 MARKED = Board("b", 10, 7, 60.0, 60.0, pattern=Charuco("DICT_4X4_50", 45.0))
 LEGACY = replace(MARKED, pattern=Charuco("DICT_4X4_50", 45.0, legacy=True))
 

@@ -23,6 +23,9 @@ TAG_FAMILIES: dict[str, str] = {
 NUMBERINGS = ("kalibr", "opencv")
 """Kalibr counts the rows of tags from the bottom, OpenCV's GridBoard from the top; both from the left."""
 
+MAX_SPACING = 2.0
+"""Widest gap, in sides of a tag: a larger number is a length."""
+
 MAX_BORDER = 2
 """Widest black border in use, in modules: that of Kalibr; AprilTag and OpenCV use 1."""
 
@@ -79,7 +82,7 @@ class AprilGrid(Pattern):
     def check(self, columns: int, rows: int, squares_mm: tuple[float, float]) -> None:
         if columns % 2 or rows % 2:
             raise InputError(f"{columns}x{rows} corners are no whole tags; there must be two columns and rows a tag")
-        if not 0.0 < self.spacing <= 2.0:
+        if not 0.0 < self.spacing <= MAX_SPACING:
             raise InputError(
                 f"a spacing of {self.spacing} is not a part of a tag's side; "
                 "write the gap over it, such as Kalibr's 0.3"
@@ -88,6 +91,11 @@ class AprilGrid(Pattern):
             raise InputError(f"a border of {self.border} modules is unknown; write 2 for Kalibr's tags, 1 for OpenCV's")
         if self.numbering not in NUMBERINGS:
             raise InputError(f"numbering '{self.numbering}' is unknown; known: {', '.join(NUMBERINGS)}")
+        if not self.dictionary.startswith("DICT_"):
+            raise InputError(
+                f"family '{self.family}' is unknown; OpenCV has {', '.join(TAG_FAMILIES)}, and dictionaries such as "
+                "DICT_4X4_50"
+            )
         count = len(dictionary_modules(self.dictionary))
         last = self.first_tag + columns * rows // 4 - 1
         if self.first_tag < 0 or last >= count:

@@ -16,7 +16,7 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import grid_turned
-from rigkit.core.patterns.aprilgrid import MAX_BORDER, TAG_FAMILIES, AprilGrid
+from rigkit.core.patterns.aprilgrid import MAX_BORDER, MAX_SPACING, TAG_FAMILIES, AprilGrid
 from rigkit.core.patterns.aruco import dictionary_modules, marker_count, smallest_dictionary
 from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
@@ -305,13 +305,16 @@ def _steps_of(groups: Sequence[NumberedTags]) -> FloatArray:
     return np.concatenate([item.steps for item, *_ in groups])
 
 
-def _of_other_border(board: Board) -> Board:
-    """Return the board with the other border whose modules have the same size and distance to those of the next tag."""
+def _of_other_border(board: Board) -> Board | None:
+    """Return the board with the other border whose modules have the same size and distance to those of the next tag;
+    None if its tags would overlap, or if none has so wide a gap."""
     pattern = board.pattern
     assert isinstance(pattern, AprilGrid)
     border = MAX_BORDER + 1 - pattern.border
     bits = dictionary_modules(pattern.dictionary).shape[1]
     spacing = (1.0 + pattern.spacing) * (bits + 2 * pattern.border) / (bits + 2 * border) - 1.0
+    if not 0.0 < round(spacing, 2) <= MAX_SPACING:
+        return None
     return replace(board, pattern=replace(pattern, border=border, spacing=round(spacing, 2)))
 
 
@@ -342,7 +345,7 @@ def _board_of(cluster: Sequence[NumberedTags], kind: Kind, steps: FloatArray, in
     least, most = (int(f([f(n) for n, _ in own])) for f in (np.min, np.max))
     first = max(least - (least - remainder) % columns, 0)
     spacing = round(float(np.median(steps)) - 1.0, 2) if len(steps) else 0.0
-    if spacing <= 0.0:
+    if not 0.0 < spacing <= MAX_SPACING:
         return None
     numbering = "opencv" if step > 0 else "kalibr"
     rows = (most - first) // columns + 1

@@ -25,7 +25,7 @@ def test_corners_less_certain_than_a_part_of_their_cell_are_dropped() -> None:
 
 @pytest.mark.parametrize("bent", [0.0, 0.005])
 def test_the_last_corner_of_two_rows_is_in_line_with_them(bent: float) -> None:
-    """In heat images the corner of a board moves where its outer square is as cold as the paper. `bent`: a wide lens."""
+    """In heat images the corner of a board moves where its last square is as cold as the paper. `bent`: a wide lens."""
     v, u = np.mgrid[:6, :8] - np.array([2.5, 3.5])[:, None, None]
     shrunk = 20.0 / (1.0 + bent * (u * u + v * v))
     every = np.ones((6, 8))

@@ -210,7 +210,8 @@ def test_tags_of_another_board_are_none(rng: np.random.Generator) -> None:
     "pattern", [{"border": 3}, {"first_tag": 580}, {"family": "tag7h1"}, {"numbering": "left"}, {"spacing": 0.0}]
 )
 def test_tags_that_cannot_be_are_refused(pattern: dict[str, object]) -> None:
-    with pytest.raises(InputError, match="board 'k'"):
+    family = ".*OpenCV has tag36h11, tag36h10, tag25h9, tag16h5" if "family" in pattern else ""
+    with pytest.raises(InputError, match=f"board 'k'{family}"):
         replace(KALIBR, pattern=AprilGrid(**{"spacing": 0.3, **pattern}))  # type: ignore[arg-type]
 
 
