@@ -46,6 +46,10 @@ MAX_LEVEL_DIFFERENCE = 0.35
 """Largest range of the levels within an empty square, over the contrast, due to shading and noise; with a marker it is
 1, or half of it when blurred."""
 
+FEW_TAGS, OUTNUMBERED = 8, 2
+"""Where an image shows fewer tags, markers are looked for, too, and tags are none if markers are more than OUTNUMBERED
+times as many: four tags of a small family may be random modules of larger markers (white on black, 7 x 7 modules: in 1
+of 4 RENDERED images, of 35 markers)."""
 
 SAME_PRINTED_RATIO = 0.05
 """Largest difference between ratios measured in images and those of the print."""
@@ -112,7 +116,9 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
             break
         progress(READING, read, len(images))
         read += 1
-        if not tags.look(k, images[k]):
+        before = tags.count
+        tags.look(k, images[k])
+        if tags.count - before < FEW_TAGS:
             markers.look(k, images[k])
     guess = _guess_from_observations(images, plain, tags, markers, marked=not sure)
     if read:
@@ -131,9 +137,10 @@ def _guess_from_observations(
     marked: bool,
 ) -> BoardGuess | None:
     grids = guessed_grids(tags)
-    if grids:
+    outnumbered = max(markers.kinds.values(), default=0) > OUTNUMBERED * tags.count
+    charuco = guessed_charuco(markers) if outnumbered or not grids else []
+    if grids and not charuco:
         return _guess_from_grids(grids)
-    charuco = guessed_charuco(markers)
     if charuco:
         shown = [images[k] for k in markers.images]
         more = has_next_row(charuco[0], shown)

@@ -354,3 +354,12 @@ def test_faults_of_an_identified_board_are_reported() -> None:
     grids = [board(12, 10, AprilGrid(spacing)) for spacing in (0.3, 0.2)]
     assert difference(*grids) == "spacing is 0.2 in the board file, 0.3 in the images: set spacing = 0.3"
     assert difference(grids[0], new) == 'an aprilgrid board of 6 x 5 tags is seen; set type = "aprilgrid"'
+
+
+def test_random_modules_of_large_markers_are_no_board_of_small_tags() -> None:
+    """Four consecutive numbers of tag16h5, beside 35 markers."""
+    board = Board("b", 9, 6, 60.0, 60.0, pattern=Charuco("DICT_7X7_50", 45.0, inverted=True))
+    rng = np.random.default_rng(52)
+    guess = guess_board([grey_image(one_board(rng, board=board).render(blur_px=0.8, noise_levels=2.0, rng=rng))])
+    assert guess is not None and isinstance(guess.board.pattern, Charuco)
+    assert (guess.board.size, guess.board.pattern.dictionary) == ((9, 6), "DICT_7X7_50")

@@ -111,6 +111,11 @@ class TagObservations:
     kinds: Counter[Kind] = field(default_factory=Counter)
     seen: list[_SeenTags] = field(default_factory=list)
 
+    @property
+    def count(self) -> int:
+        """Number of tags in all images."""
+        return sum(len(item.numbers) for item in self.seen)
+
     def look(self, index: int, image: GreyImage) -> bool:
         """Read the tags of an image; return whether there are any."""
         grey = 255 - image if self.inverted else image
