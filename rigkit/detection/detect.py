@@ -11,6 +11,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.detection.fields import of_one_moment
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.mosaic import without_mosaic
@@ -56,7 +57,7 @@ def detect_boards(
         `image` is not an image of a supported type, or there is no finder for the pattern of one of `boards`.
     """
     check_searchable(boards or ())
-    stored = without_mosaic(grey_image(image))
+    stored = of_one_moment(without_mosaic(grey_image(image)))
     search = Search(without_bad_pixels(stored), boards or (), min_corners, camera, stored, quick=quick)
     found: list[BoardDetection] = []
     for kind, finder in FINDERS.items():

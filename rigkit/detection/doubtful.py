@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import upper_median
 from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS, Evidence
+from rigkit.detection.fields import of_one_moment
 from rigkit.detection.lattices import SearchedImage, candidate_lattices
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.mosaic import without_mosaic
@@ -24,7 +25,7 @@ sigma: they decide which cause is reported."""
 
 def doubtful_grid(image: NDArray[np.generic]) -> str | None:
     """Return a message on the largest rejected grid of `image` that may be a board; None if there is none."""
-    grey = without_bad_pixels(without_mosaic(grey_image(image)))
+    grey = without_bad_pixels(of_one_moment(without_mosaic(grey_image(image))))
     fitted = refine(grey, candidate_lattices(SearchedImage.of(grey), MIN_EXPECTED_CORNERS, lambda *_: True))
     large = (item for item in fitted if item.lattice.count >= MIN_EXPECTED_CORNERS)
     seen = [item for item in large if Evidence.of(item).score > MIN_DOUBTFUL_SCORE]

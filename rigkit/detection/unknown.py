@@ -21,6 +21,7 @@ from rigkit.core.progress import Progress, silent
 from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS
 from rigkit.detection.circles.unknown import CircleObservations, guessed_circles
 from rigkit.detection.detect import detect_boards
+from rigkit.detection.fields import of_one_moment
 from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.unknown_charuco import MarkerObservations, guessed_charuco
@@ -97,8 +98,8 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
     chessboard that is whole in no image may follow from several images that show its sides. `progress` is called for
     every image.
     """
-    # The pixels of a mosaic look like markers in every square.
-    images = [without_mosaic(image) for image in images]
+    # The pixels of a mosaic look like markers in every square, and lines of two moments like none.
+    images = [of_one_moment(without_mosaic(image)) for image in images]
     tags, markers = TagObservations(), MarkerObservations()
     plain: list[list[GridExtent]] = []
     sure: list[int] = []

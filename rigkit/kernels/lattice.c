@@ -97,19 +97,19 @@ static double roughness(const part_t part, int64_t order, const scatter_rules_t 
     return count >= rules->min_differences ? quick_median(part.room, count) / rules->median_of_normal : NAN;
 }
 
-/* Return how many differences of the first order rows and columns have, both coordinates. */
-static int64_t difference_count(const double *pixels, int64_t rows, int64_t columns, int64_t order)
+/* Return whether rows and columns have `least` differences of `order`, both coordinates, and both have some. */
+static int has_differences(const double *pixels, int64_t rows, int64_t columns, int64_t order, int64_t least)
 {
-    int64_t count = 0;
+    int64_t counts[2] = {0};
     for (int along_row = 0; along_row < 2; along_row++)
         for (int64_t line = 0; line < (along_row ? rows : columns); line++) {
             int64_t run = 0;
             for (int64_t k = 0; k < (along_row ? columns : rows); k++) {
                 run = isfinite(pixels[2 * (along_row ? line * columns + k : k * columns + line)]) ? run + 1 : 0;
-                count += run > order ? 2 : 0;
+                counts[along_row] += run > order ? 2 : 0;
             }
         }
-    return count;
+    return counts[0] + counts[1] >= least && counts[0] > 0 && counts[1] > 0;
 }
 
 INLINE double product(const double *a, const double *b, int64_t count)
@@ -129,8 +129,8 @@ INLINE void take_away(double *values, const double *along, int64_t count)
 }
 
 /* Set `out` to the residuals of surfaces of both degrees over the corners' sigmas (rms), NaN where these fit any
- * (reference.lattice.surface_scatter), or where rows and columns have differences enough. `scratch` holds five numbers and all
- * terms for each corner. */
+ * (reference.lattice.surface_scatter), or where rows and columns both have differences, and enough. `scratch` holds five
+ * numbers and all terms for each corner. */
 void surface_scatter(
     const double *pixels, const double *sigma, int64_t rows, int64_t columns, const scatter_rules_t *rules, double *scratch,
     double *out)
@@ -141,7 +141,7 @@ void surface_scatter(
     int64_t count = 0, found = 0;
     double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY}, middle[2] = {0.0, 0.0};
     out[0] = out[1] = NAN;
-    if (difference_count(pixels, rows, columns, rules->first_order) >= rules->min_differences)
+    if (has_differences(pixels, rows, columns, rules->first_order, rules->min_differences))
         return;
     for (int64_t i = 0; i < size; i++) {
         if (!isfinite(pixels[2 * i]) || !isfinite(sigma[i]))

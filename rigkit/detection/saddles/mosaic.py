@@ -29,12 +29,15 @@ MIN_LEVELS = 12.0
 
 
 def without_mosaic(grey: GreyImage) -> GreyImage:
-    """Return `grey` with the four positions of its 2 x 2 cells on one scale; unchanged if it is not a mosaic."""
+    """Return `grey` with the four positions of its 2 x 2 cells on one scale; unchanged if it is not a mosaic, or if a
+    position has hardly any light: dots of a print, or of an image of two levels."""
     if not front.has_mosaic(grey, _step(grey, GLANCE), MIN_LEVELS, MOSAIC_SHARE):
         return grey
     values = _squares(grey, LOOK)
     mean = values.mean(axis=0)
     bright = mean > max(float(np.median(mean)), MIN_LEVELS)
+    if not np.median(values[:, bright], axis=1).all():
+        return grey
     out: FloatImage = grey.astype(np.float32)
     for (v, u), own in zip(PLACES, values, strict=True):
         gain, offset = _line(own, mean, bright)

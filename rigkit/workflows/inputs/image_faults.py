@@ -23,7 +23,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.core.patterns.aprilgrid import MAX_BORDER, AprilGrid
 from rigkit.core.patterns.charuco import Charuco
-from rigkit.detection.fields import shift_between_fields
+from rigkit.detection.fields import MAX_LINES, shift_between_fields
 from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.tags.printed import likeness_to_print
 from rigkit.io.media.images import Image, read_image, to_grey
@@ -32,8 +32,6 @@ MAX_CHECKED = 4
 """Images checked, spread over the session: the board need not move in all of them, and a border is where all are
 black."""
 
-MAX_LINES = 1088
-"""No interlaced format has more lines: larger images are not checked."""
 MIN_INTERLACED = 2
 MIN_FIELD_SHIFT_PX = 0.2
 """Minimum shift between the two fields of an interlaced image. On 239 boards in REAL progressive images, 50 of them

@@ -37,3 +37,12 @@ def test_images_of_one_colour_stay_as_they_are() -> None:
     for name in BLANKS:
         picture = blank(name, np.random.default_rng(2))
         assert without_mosaic(picture) is picture, name
+
+
+def test_dots_of_a_print_are_no_mosaic() -> None:
+    """An image of two levels by ordered dither has positions without any light."""
+    grey = one_board(np.random.default_rng(1)).render(rng=np.random.default_rng(0), blur_px=0.7)
+    order = 16 * np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]]) + 8
+    height, width = grey.shape
+    dots = 255 * (0.6 * grey > np.tile(order, (height // 4, width // 4))).astype(np.uint8)
+    assert without_mosaic(dots) is dots

@@ -27,6 +27,16 @@ def test_scatter_raises_sigmas(times: float, low: float, high: float) -> None:
     assert low <= np.median(factors) <= high
 
 
+def test_sigmas_of_boards_whose_columns_have_no_differences_are_raised_too() -> None:
+    """A board of 7 x 5 has 20 differences along its rows, as few as chance."""
+    rng = np.random.default_rng(5)
+    sigma_px = np.full((5, 7), SIGMA_PX)
+    noise = SIGMA_PX * rng.standard_normal((20, 5, 7, 2))
+    for times in (1.0, 4.0):
+        factors = [small_scatter(corners(7, 5) + times * one, sigma_px) for one in noise]
+        assert np.median(factors) == pytest.approx(times, rel=0.2)
+
+
 def test_lens_distortion_does_not_raise_sigmas() -> None:
     sigma_px = np.full((6, 4), 0.001)
     bent = corners(4, 6, bend=2.0) + 0.001 * np.random.default_rng(1).standard_normal((6, 4, 2))

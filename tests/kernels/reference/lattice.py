@@ -39,16 +39,17 @@ def excess_scatter(
 
 def surface_scatter(pixels: FloatArray, sigma_px: FloatArray, rules: ScatterRules) -> tuple[float, float]:
     assert (tuple(rules.degrees), rules.min_term) == (SURFACES, MIN_TERM)
-    if _difference_count(pixels) >= MIN_DIFFERENCES:
+    counts = _difference_counts(pixels)
+    if sum(counts) >= MIN_DIFFERENCES and min(counts) > 0:
         return np.nan, np.nan
     lower, higher = (_surface_roughness(pixels, sigma_px, degree) for degree in SURFACES)
     return lower, higher
 
 
-def _difference_count(pixels: FloatArray) -> int:
-    """Return how many differences of the lower order `pixels` (R, C, 2) have."""
+def _difference_counts(pixels: FloatArray) -> list[int]:
+    """Return how many differences of the lower order columns and rows of `pixels` (R, C, 2) have."""
     every = (np.diff(pixels, DIFFERENCES[0], axis=axis) for axis in (0, 1))
-    return sum(int(np.count_nonzero(np.isfinite(part))) for part in every)
+    return [int(np.count_nonzero(np.isfinite(part))) for part in every]
 
 
 def _surface_roughness(pixels: FloatArray, sigma_px: FloatArray, degree: int) -> float:
