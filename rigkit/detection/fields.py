@@ -73,8 +73,7 @@ def of_one_moment(grey: GreyImage) -> GreyImage:
         return grey
     even: FloatImage = np.zeros(grey.shape, np.float32)
     even[::2] = 2.0 * grey[::2]
-    out: FloatImage = cv2.sepFilter2D(even, -1, SPREAD, SPREAD)
-    return out
+    return np.asarray(cv2.sepFilter2D(even, -1, SPREAD, SPREAD), np.float32)
 
 
 def _alternating_tiles(grey: GreyImage) -> BoolArray:

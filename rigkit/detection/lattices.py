@@ -86,7 +86,7 @@ def find_lattices(
     `has_markers` : for boards with markers in their squares, which affect edges and fit. Lattices with edge offsets
     (`has_edge_offset`) are then not rejected, and those for which it is true are accepted regardless of their evidence
     and shape.
-    `enlarged` : search at twice the resolution of the image only, for narrow white lines between squares and markers.
+    `enlarged` : search at twice the resolution only, for small squares and narrow white lines beside markers.
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
@@ -144,7 +144,9 @@ class SearchedImage:
     def of(cls, grey: GreyImage, *, enlarged: bool = False) -> SearchedImage:
         levels = pyramid(grey)
         searched = [enlarged_level(grey), *levels] if enlarged else levels
-        return cls(grey, levels[0], searched, *find_corners(searched))
+        # Enlargement by interpolation does not make edges sharper.
+        finest = searched[0] if searched[0].scale >= 1.0 else levels[0]
+        return cls(grey, finest, searched, *find_corners(searched))
 
     def coarser(self, without: int) -> SearchedImage | None:
         """Return the corners of the coarser levels only, `without` the finest ones; None if there are too few.

@@ -24,9 +24,9 @@ MAX_EMPTY = 0.2
 """Largest share of a board's circles that may be covered if the others determine their place."""
 EMPTY_LINE = 0.5
 """Share of a line of the board beside the circles that is visible and empty, above which it is another board."""
-STRAY_CIRCLES = 2
+STRAY_CIRCLES = 1
 """Largest number of circles in a line beyond the board, mostly visible and empty, that do not belong to it: something
-round beside the board."""
+round beside the board. A second one in a place of the lattice is no chance: the board is larger."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -132,9 +132,7 @@ def pyramid(grey: GreyImage) -> list[Level]:
 
 def each_level(grey: GreyImage) -> Iterator[Level]:
     """Yield the levels of the search, the finest first."""
-    scale = 1
-    while grey.size > scale**2 * BASE_PIXELS:
-        scale *= 2
+    scale = _finest_scale(grey)
     base, offset = _shrunk(grey, scale), 0.5 * (scale - 1.0)
     for _ in range(OCTAVES):
         if min(base.shape) < 16:
@@ -145,11 +143,23 @@ def each_level(grey: GreyImage) -> Iterator[Level]:
 
 
 def enlarged_level(grey: GreyImage) -> Level:
-    """Return a level of twice the resolution of an image."""
-    twice: GreyImage = np.zeros((2 * grey.shape[0], 2 * grey.shape[1]), grey.dtype)
-    cv2.resize(grey, twice.shape[::-1], dst=twice, interpolation=cv2.INTER_CUBIC)
+    """Return a level of twice the resolution of the finest one of the search: of large images in their own pixels."""
+    scale = _finest_scale(grey) / 2.0
+    if scale < 1.0:
+        twice: GreyImage = np.zeros((2 * grey.shape[0], 2 * grey.shape[1]), grey.dtype)
+        cv2.resize(grey, twice.shape[::-1], dst=twice, interpolation=cv2.INTER_CUBIC)
+    else:
+        twice = _shrunk(grey, int(scale))
     smooth, _, thresholds = front.level(twice, _level_rules(), max(1, int(np.sqrt(twice.size / TYPICAL))))
-    return Level(smooth, thresholds, 0.5, -0.25)
+    return Level(smooth, thresholds, scale, 0.5 * (scale - 1.0))
+
+
+def _finest_scale(grey: GreyImage) -> int:
+    """Return the side, px, of the pixels of the finest level of the search."""
+    scale = 1
+    while grey.size > scale**2 * BASE_PIXELS:
+        scale *= 2
+    return scale
 
 
 def _shrunk(grey: GreyImage, factor: int) -> GreyImage:

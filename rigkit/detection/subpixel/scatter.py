@@ -71,8 +71,8 @@ def small_scatter(pixels: FloatArray, sigma_px: FloatArray) -> float:
 
     Boards whose columns, or rows, are too short for any are among them: a board of 7 x 5 has differences along its rows
     only, 20 of them, where the surfaces leave 40.
-    The factor follows from the residuals of cubic and quartic surfaces, which are similar if they are scatter. If the quartic
-    ones are much smaller, due to a strong lens, the factor is 1.
+    The factor follows from the residuals of cubic and quartic surfaces, which are similar if they are scatter. If the
+    quartic ones are much smaller, due to a strong lens, the factor is 1.
     """
     cubic, quartic = native.surface_scatter(pixels, sigma_px, _rules())
     if not (cubic < AS_ROUGH * quartic and quartic > UNEXPLAINED_SCATTER):

@@ -14,7 +14,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
-from rigkit.detection.checks.validate import has_edge_offset, is_large_enough
+from rigkit.detection.checks.validate import BY_CHANCE, has_edge_offset, is_large_enough
 from rigkit.detection.lattice.lattice import MIN_ROWS
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.lattices import MIN_BOARD_CORNERS, BoardCriteria, corner_count, find_lattices, fit_and_confirm
@@ -111,6 +111,11 @@ class Search:
         if marked and not self.quick and self.grey.size < BASE_PIXELS and _may_miss_squares(found, marked):
             every = find_lattices(self.grey, self.min_corners_seen, has_markers=has_markers, enlarged=True)
             found = max(found, every, key=corner_count)
+        if not found and plain and not self.quick and self.grey.size > BASE_PIXELS:
+            # Squares of 6 px of a 4K image are of 3 px in the finest level. Patterns as fine have the more places where
+            # a few squares alternate by chance.
+            least = max(self.min_corners_seen, min([BY_CHANCE, *(board.corner_count for board in self.boards)]))
+            found = find_lattices(self.grey, least, only, enlarged=True)
         if not found and self.grey.dtype != np.uint8:
             # In images of more than 8 bits a board may use a hundredth of the range of brightness.
             seen = [item.lattice for item in find_lattices(equalised(self.grey), self.min_corners_seen, only)]

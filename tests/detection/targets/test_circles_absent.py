@@ -31,6 +31,19 @@ def test_a_grid_of_another_size_is_no_board() -> None:
     assert detect_boards(image, [replace(REGULAR, pattern=Circles(diameter_mm=15.0, inverted=True))]) == ()
 
 
+def test_two_circles_of_a_covered_column_tell_a_larger_board() -> None:
+    scene = one_board(np.random.default_rng(0), lens="regular", board=REGULAR)
+    image = scene.render(noise_levels=2.0, rng=np.random.default_rng(0)).astype(np.uint8)
+    (truth,) = scene.truth()
+    last = truth.lattice()[2:, -2:]
+    for before, place in last:
+        radius = round(0.45 * float(np.hypot(*(place - before))))
+        cv2.circle(image, tuple(np.rint(place).astype(int).tolist()), radius, 200, -1)
+    assert detect_boards(image, [replace(REGULAR, board_id="s", columns=9)]) == ()
+    (found,) = detect_boards(image, [REGULAR])
+    assert found.board_id == "r" and len(found.grid) == REGULAR.corner_count - len(last)
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("name", sorted(set(BLANKS) - {"dots", "staggered"}))
 def test_nothing_is_found_where_no_circles_are(name: str) -> None:
