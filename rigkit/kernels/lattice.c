@@ -97,7 +97,7 @@ static double roughness(const part_t part, int64_t order, const scatter_rules_t 
     return count >= rules->min_differences ? quick_median(part.room, count) / rules->median_of_normal : NAN;
 }
 
-/* Return whether rows and columns have `least` differences of `order`, both coordinates, and both have some. */
+/* Return whether rows and columns have `least` differences of `order`, both coordinates, and both have some, or twice as many. */
 static int has_differences(const double *pixels, int64_t rows, int64_t columns, int64_t order, int64_t least)
 {
     int64_t counts[2] = {0};
@@ -109,7 +109,7 @@ static int has_differences(const double *pixels, int64_t rows, int64_t columns, 
                 counts[along_row] += run > order ? 2 : 0;
             }
         }
-    return counts[0] + counts[1] >= least && counts[0] > 0 && counts[1] > 0;
+    return counts[0] + counts[1] >= (counts[0] > 0 && counts[1] > 0 ? least : 2 * least);
 }
 
 INLINE double product(const double *a, const double *b, int64_t count)
@@ -129,7 +129,7 @@ INLINE void take_away(double *values, const double *along, int64_t count)
 }
 
 /* Set `out` to the residuals of surfaces of both degrees over the corners' sigmas (rms), NaN where these fit any
- * (reference.lattice.surface_scatter), or where rows and columns both have differences, and enough. `scratch` holds five
+ * (reference.lattice.surface_scatter), or where rows and columns have differences enough. `scratch` holds five
  * numbers and all terms for each corner. */
 void surface_scatter(
     const double *pixels, const double *sigma, int64_t rows, int64_t columns, const scatter_rules_t *rules, double *scratch,

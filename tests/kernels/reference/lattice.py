@@ -40,7 +40,7 @@ def excess_scatter(
 def surface_scatter(pixels: FloatArray, sigma_px: FloatArray, rules: ScatterRules) -> tuple[float, float]:
     assert (tuple(rules.degrees), rules.min_term) == (SURFACES, MIN_TERM)
     counts = _difference_counts(pixels)
-    if sum(counts) >= MIN_DIFFERENCES and min(counts) > 0:
+    if sum(counts) >= (MIN_DIFFERENCES if min(counts) > 0 else 2 * MIN_DIFFERENCES):
         return np.nan, np.nan
     lower, higher = (_surface_roughness(pixels, sigma_px, degree) for degree in SURFACES)
     return lower, higher
