@@ -69,8 +69,8 @@ def scatter_factors(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tu
 def small_scatter(pixels: FloatArray, sigma_px: FloatArray) -> float:
     """Return the factor, at least 1, of the sigmas of a board with too few corners (R, C, 2) for the DIFFERENCES.
 
-    Where columns, or rows, are too short for any, twice MIN_DIFFERENCES are asked of the others: a board of 7 x 5 has 20
-    along its rows, where the surfaces leave 40.
+    Where columns, or rows, are too short for any, twice MIN_DIFFERENCES are asked of the others: a board of 7 x 5 has
+    20 along its rows, where the surfaces leave 40.
     The factor follows from the residuals of cubic and quartic surfaces, which are similar if they are scatter. If the
     quartic ones are much smaller, due to a strong lens, the factor is 1.
     """
