@@ -20,7 +20,6 @@ import numpy as np
 
 from rigkit.calibration.diagnosis.two_kinds import (
     CHANCE,
-    CHANCE_OF_GROUPS,
     KINDS_REMEDY,
     MIN_OF_A_KIND,
     MIN_PREDICTED,
@@ -135,9 +134,7 @@ def _group(splits: _Splits) -> tuple[BoolArray, _Difference] | None:
     if found is None or found[1] < MIN_SHARE_OF_TWO:
         return None
     apart = splits.difference(found[0], against=AGAINST_PLACE_SEARCHED)
-    if apart is None:
-        return None
-    if splits.scores.chance_of_split(*found, explained_by_focus(splits.fit, splits.number)) > CHANCE_OF_GROUPS:
+    if apart is None or not splits.scores.is_of_two(*found, explained_by_focus(splits.fit, splits.number)):
         return None
     halves = ImageScores.of_halves(splits.observations, splits.fit, splits.number)
     if halves.predicted_across(found[0]) < MIN_PREDICTED:
