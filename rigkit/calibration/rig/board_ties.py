@@ -9,6 +9,7 @@ from dataclasses import replace
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.joint import solve_jointly
 from rigkit.calibration.rig.views.board_places import board_places
+from rigkit.calibration.rig.views.board_sizes import board_size_conflicts
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews, frame_observations
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
@@ -24,7 +25,8 @@ LIKE_BOARDS = "{0} boards of {1}x{2} corners"
 
 
 def suggest_rigid_boards(views: Sequence[BoardView], calibration: Calibration) -> tuple[Finding, ...]:
-    """Return a finding if boards kept their relative poses in all images that show several of them.
+    """Return a finding if boards kept their relative poses in all images that show several of them, or would have with
+    other sizes of their squares.
 
     `views` are those of the calibration, with their boards.
     """
@@ -41,6 +43,8 @@ def suggest_rigid_boards(views: Sequence[BoardView], calibration: Calibration) -
     flat = replace(calibration, boards=tuple(replace(b, kind="flat") for b in calibration.boards))
     try:
         named, notes = board_places([group], RigViews(["camera"], [seen], (flat,), {}), boards)
+        if sizes := board_size_conflicts(named):
+            return sizes
         joint = solve_jointly(named, silent)
     except (InputError, DegenerateError):
         return ()

@@ -13,7 +13,7 @@ from rigkit.calibration.diagnosis.pupil import modelled_pupil
 from rigkit.calibration.diagnosis.verdicts import UNCERTAIN_PX, with_headline
 from rigkit.calibration.rig.certainty.uncertainty import transfer_uncertainty
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.core.findings import Finding
+from rigkit.core.findings import Finding, Severity, worst
 
 FEW_SHARED = 5
 """A mount has six parameters: fewer shared boards give hardly any check of it."""
@@ -29,12 +29,14 @@ def diagnose_rig(
 ) -> tuple[Finding, ...]:
     """Return the verdicts, the headline first; `far` are the uncertainties of the cameras' projections, `notes`
     findings from elsewhere, `in_force` as for `judge`."""
+    # Effects of a cause that was found are not given another one.
+    named = worst(notes) is Severity.BAD
     causes = [
         *notes,
         *_not_converged(rig),
         *_left_out(rig),
-        *_worse(rig),
-        *_overdispersed(rig, in_force),
+        *_worse(rig, named=named),
+        *_overdispersed(rig, in_force, named=named),
         *_few_shared(rig),
     ]
     headline, *others = with_headline(rig, causes, list(_uncertain(rig, far)))
@@ -119,18 +121,24 @@ def _timing(rig: RigCalibration) -> str:
     return "the cameras' time lags vary" if rig.lags else "the cameras were not exactly synchronised"
 
 
-def _overdispersed(rig: RigCalibration, in_force: Collection[str]) -> Iterator[Finding]:
+def _overdispersed(rig: RigCalibration, in_force: Collection[str], *, named: bool) -> Iterator[Finding]:
     if rig.overdispersion <= OVERDISPERSED:
+        return
+    what = (
+        f"overdispersion: frames disagree {rig.overdispersion:.1f} times as much as corner noise explains (included in "
+        "all sigmas)"
+    )
+    if named:
+        yield Finding.look(what)
         return
     automatic = " and ".join(f'{name} = "auto"' for name in ("board_shape", "model") if name not in in_force)
     yield Finding.look(
-        f"overdispersion: frames disagree {rig.overdispersion:.1f} times as much as corner noise explains "
-        f"(included in all sigmas): boards or lenses depart from their models, or {_timing(rig)}",
+        f"{what}: boards or lenses depart from their models, or {_timing(rig)}",
         (f"try {automatic}, or " if automatic else "take ") + "a flatter board",
     )
 
 
-def _worse(rig: RigCalibration) -> Iterator[Finding]:
+def _worse(rig: RigCalibration, *, named: bool) -> Iterator[Finding]:
     known = [c.heldout_rms_px for c in rig.single if c.heldout_rms_px is not None]
     together = rig.heldout_rms_px
     if together is None or len(known) < len(rig.single):
@@ -138,7 +146,8 @@ def _worse(rig: RigCalibration) -> Iterator[Finding]:
     typical = float(np.sqrt(np.mean(np.square(known))))
     if together > WORSE * typical:
         several = len(rig.cameras) > 1
-        cause = f"{_timing(rig)}, or the rig is not rigid" if several else "the boards are not rigidly mounted"
+        cause = f": {_timing(rig)}, or the rig is not rigid" if several else ": the boards are not rigidly mounted"
         yield Finding.look(
-            f"held-out frames are predicted {together / typical:.1f} times worse than by the cameras alone: {cause}"
+            f"held-out frames are predicted {together / typical:.1f} times worse than by the cameras alone"
+            f"{'' if named else cause}"
         )

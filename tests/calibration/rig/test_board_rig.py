@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from operator import methodcaller
@@ -297,6 +298,56 @@ def test_boards_that_keep_their_places_are_noticed(alike: bool, rng: np.random.G
         if alike
         else ('boards = ["floor", "left", "right"]' in str(printed))
     )
+
+
+def declared_as(views: Views, name: str, times: float) -> Views:
+    """Return the views with the squares of one board declared so many times as large."""
+
+    def wrong(board: Board) -> Board:
+        return replace(board, square_x_mm=times * board.square_x_mm, square_y_mm=times * board.square_y_mm)
+
+    return {
+        camera: [(f, replace(v, board=wrong(v.board)) if v.board.board_id == name else v) for f, v in own]
+        for camera, own in views.items()
+    }
+
+
+@pytest.mark.parametrize("times", [1.01, 2.0])
+def test_a_wrong_size_of_a_mounted_board_is_named(times: float, rng: np.random.Generator) -> None:
+    """Of sizes far from the truth no place of the boards fits more than one image."""
+    room = corner_of_a_room(rng, DIFFERENT)
+    views = target_views(rng, REG, DIFFERENT, room, 8, noise_px=NOISE_PX, distance_mm=1000.0)
+    wrong = declared_as(views, DIFFERENT[1].board_id, times)
+    boards = tuple({v.board.board_id: v.board for _, v in wrong["reg"]}.values())
+    verdicts = solve(wrong, boards).verdicts
+    assert verdicts[0].severity is Severity.BAD and "declared sizes of boards" in verdicts[0].message
+    ratio = re.search(r"squares of '(\w+)' are ([\d.]+) times", verdicts[0].message)
+    assert ratio is not None
+    expected = 1.0 / times if ratio[1] == DIFFERENT[1].board_id else times
+    assert float(ratio[2]) == pytest.approx(expected, rel=2e-3)
+    assert "rigid" not in str(verdicts)
+    alone = calibrate([v for _, v in wrong["reg"]], REG["reg"][0].size_px, model="brown", board="flat")
+    (printed,) = suggest_rigid_boards([v for _, v in wrong["reg"]], alone)
+    assert "declared sizes of boards" in printed.message
+
+
+def test_boards_that_move_have_no_wrong_sizes() -> None:
+    """One of them hardly moves: smaller squares of all others would make them move as little."""
+    rng = np.random.default_rng(0)
+    views = []
+    for k in range(6):
+        room = corner_of_a_room(rng, DIFFERENT)
+        one = target_views(rng, REG, DIFFERENT, room, 1, noise_px=NOISE_PX, distance_mm=1000.0)["reg"]
+        views += [(f"{k}", replace(view, image=f"{k}.png")) for _, view in one]
+    still = next(view for _, view in views if view.board.board_id == "floor")
+    near = [
+        (f, replace(still, image=v.image, pixels=still.pixels + NOISE_PX * rng.normal(size=still.pixels.shape)))
+        if v.board.board_id == "floor"
+        else (f, v)
+        for f, v in views
+    ]
+    for own in (views, near):
+        assert "declared sizes" not in str(solve({"reg": own}, DIFFERENT).verdicts)
 
 
 def test_boards_that_move_are_not_taken_for_mounted(rng: np.random.Generator) -> None:

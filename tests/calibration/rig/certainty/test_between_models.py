@@ -91,7 +91,7 @@ def test_held_out_frames_are_compared_with_the_cameras_alone(
     alone: tuple[float | None, ...], together: float, printed: bool
 ) -> None:
     """What a camera alone comes to is not known where its images were too few to hold some out."""
-    assert bool(list(_worse(with_heldout_errors(alone, together)))) == printed
+    assert bool(list(_worse(with_heldout_errors(alone, together), named=False))) == printed
 
 
 @pytest.mark.parametrize(
@@ -99,5 +99,5 @@ def test_held_out_frames_are_compared_with_the_cameras_alone(
 )
 def test_solved_lags_are_not_named_as_a_cause_again(lags: dict[str, Lag], cause: str) -> None:
     """Frames worse than the cameras alone are explained by moments only as far as those were not solved for."""
-    (finding,) = _worse(replace(with_heldout_errors((0.1, 0.2), 0.3), lags=lags))
+    (finding,) = _worse(replace(with_heldout_errors((0.1, 0.2), 0.3), lags=lags), named=False)
     assert cause in finding.message
