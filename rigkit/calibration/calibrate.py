@@ -194,10 +194,12 @@ def _finish(group: Sequence[CandidateFits]) -> list[Calibration]:
         others = choose_lenses(on_boards)
         for model in dict.fromkeys(other.model for other in others):
             changed = [k for k, c in enumerate(choices) if others[k].model == model != c.model]
-            again = [group[k].outcome_of(model) for k in changed]
-            if changed and _better([found[k] for k in changed], again):
-                for k, one in zip(changed, again, strict=True):
-                    found[k], tried[k] = one, on_boards[k]
+            # The images that agree with another model alone may not determine it.
+            with suppress(DegenerateError):
+                again = [group[k].outcome_of(model) for k in changed]
+                if changed and _better([found[k] for k in changed], again):
+                    for k, one in zip(changed, again, strict=True):
+                        found[k], tried[k] = one, on_boards[k]
         choices, rivals = others, on_boards
     elif several:
         rivals = tried
