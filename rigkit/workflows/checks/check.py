@@ -42,6 +42,7 @@ from rigkit.io.media.images import read_image_of
 from rigkit.report.pages.check_page import check_facts, check_page
 from rigkit.report.pages.page_facts import PageFacts
 from rigkit.validation.monitoring.baseline import check_since
+from rigkit.validation.monitoring.copies import with_copies_shared
 from rigkit.validation.monitoring.epipolar import evidence_of_matches, matches_of_scenes
 from rigkit.validation.monitoring.evidence import SAME_BOARD, FreshView, Monitored, evidence_of
 from rigkit.validation.monitoring.flipped import consistently_numbered, flipped_pictures
@@ -295,7 +296,7 @@ def _views(
     left_out: list[tuple[str, str]],
 ) -> list[FreshView]:
     """Return the boards in all images; an image without any goes to `left_out`, with the reason."""
-    out: list[FreshView] = []
+    every: list[FreshView] = []
     own = [without_lookalikes(found, boards) for found in seen]
     whose = monitored.names if monitored.is_rig else (None,)
     for k, frame in enumerate(frames):
@@ -304,9 +305,12 @@ def _views(
             if str(path) not in own[c]:
                 continue
             views, reason = views_of_image(path.name, own[c][str(path)], boards, whose[c])
-            out += [consistently_numbered(monitored, FreshView(name, c, view), out) for view in views]
+            every += [FreshView(name, c, view) for view in views]
             if reason is not None:
                 left_out.append((str(path), reason))
+    out: list[FreshView] = []
+    for fresh in with_copies_shared(monitored, every):
+        out.append(consistently_numbered(monitored, fresh, out))
     return out
 
 
