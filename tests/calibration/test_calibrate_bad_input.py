@@ -11,11 +11,10 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration import assemble
-from rigkit.calibration import calibrate as calibrations
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.choosing.candidate_fits import CandidateFits
 from rigkit.calibration.choosing.choice import FittedModel
-from rigkit.calibration.choosing.lens_choice import ModelChoice
+from rigkit.calibration.choosing.lens_choice import ModelChoice, choose_lenses
 from rigkit.calibration.choosing.one_model import ModelOutcome
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.shape import shape_model
@@ -131,10 +130,10 @@ def test_a_better_model_that_its_own_images_do_not_determine_is_not_taken(
     """Of images that contradict each other, few agree with it."""
     bowed = BOARD.points() + 0.5 * np.outer(np.cos(BOARD.points()[:, 0] / 50.0), [0.0, 0.0, 1.0])
     views = random_views(lens("reg"), 8, rng, reach_deg=30.0, noise_px=0.05, points_mm=bowed)[0]
-    choices, outcome_of, found = calibrations.choose_lenses, CandidateFits.outcome_of, list[str]()
+    outcome_of, found = CandidateFits.outcome_of, list[str]()
 
     def choose(cameras: Sequence[Sequence[FittedModel]]) -> list[ModelChoice]:
-        (choice,) = choices(cameras)
+        (choice,) = choose_lenses(cameras)
         # At first the best on flat boards, then another one.
         found.append(choice.model if not found else "eucm" if found[0] == "ucm" else "ucm")
         return [replace(choice, model=found[-1])]
@@ -144,6 +143,6 @@ def test_a_better_model_that_its_own_images_do_not_determine_is_not_taken(
             return outcome_of(fits, model)
         raise DegenerateError("not identifiable")
 
-    monkeypatch.setattr(calibrations, "choose_lenses", choose)
+    monkeypatch.setattr("rigkit.calibration.calibrate.choose_lenses", choose)
     monkeypatch.setattr(CandidateFits, "outcome_of", outcome)
     assert calibrate(views, SIZE, model="auto", board="warp", folds=2).camera.model == found[0] != found[1]

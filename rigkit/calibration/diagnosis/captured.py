@@ -87,11 +87,6 @@ class Extent:
         )
 
 
-def diagnose_images(calibration: Calibration, *, upright: bool) -> list[Finding]:
-    """Return findings about what was done to all images alike; `upright`: no board was rotated about its normal."""
-    return [*cropped_images(calibration), *stretched_images(calibration, upright=upright)]
-
-
 def diagnose_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]:
     """Return findings about how the images were taken, the most severe first; `clusters` (V,) are the cluster numbers
     of the views' images, equal for near-duplicates."""

@@ -20,11 +20,12 @@ from rigkit.calibration.diagnosis.captured import (
     SMALL_PX,
     Extent,
     boards_never_rotated,
+    cropped_images,
     diagnose_capture,
-    diagnose_images,
     extrapolated,
     few_repeated,
     hardly_tilted,
+    stretched_images,
 )
 from rigkit.calibration.diagnosis.changing import CHANGES, changing
 from rigkit.calibration.diagnosis.mixed import two_cameras
@@ -110,16 +111,19 @@ def diagnose(
     effects = list(_uncertain(calibration, far))
     # Images that contradict each other make the lens uncertain. A cause found already explains a later other lens, too.
     contradicting, named = worst(effects) is Severity.BAD, bool(mixed) or worst(change) is Severity.BAD
+    # Nor do they tell then the ratio of its focal lengths: images of which some were turned look stretched.
+    stretched = list(stretched_images(calibration, upright=bool(upright)))
     # Findings that make the quality of the calibration unknown: it is not called good.
     causes = [
         *_not_converged(calibration, in_force),
         *mixed,
         *_of_another_kind(calibration, order),
         *change,
-        *diagnose_images(calibration, upright=bool(upright)),
+        *cropped_images(calibration),
+        *([] if contradicting else stretched),
         *unlike,
         *diagnose_capture(calibration, clusters),
-        *(pattern if contradicting else []),
+        *([*pattern, *stretched] if contradicting else []),
         *upright,
         *extrapolated(calibration, extent, far),
         *(finding for finding in also if finding.severity is Severity.BAD and not named),
