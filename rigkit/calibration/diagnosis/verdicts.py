@@ -103,16 +103,16 @@ def diagnose(
     far = FarProjection.of(calibration) if far is None else far
     clusters = _clusters(calibration.views) if clusters is None else clusters
     upright = list(boards_never_rotated(calibration))
+    stretched = list(stretched_images(calibration, upright=bool(upright)))
     extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
     mixed, change = _residuals(calibration, correlation, far, also, clusters, solved)
     # With the images of two cameras mixed, residuals are not informative about views, boards and model.
     unlike, unclear = ([], []) if mixed else _views(calibration)
     pattern = [] if mixed else list(_pattern(calibration, correlation, in_force, bool(change)))
     effects = list(_uncertain(calibration, far))
-    # Images that contradict each other make the lens uncertain. A cause found already explains a later other lens, too.
+    # Images that contradict each other make the lens uncertain: where some were turned, they look stretched. A cause
+    # found already explains a later other lens, too.
     contradicting, named = worst(effects) is Severity.BAD, bool(mixed) or worst(change) is Severity.BAD
-    # Nor do they tell then the ratio of its focal lengths: images of which some were turned look stretched.
-    stretched = list(stretched_images(calibration, upright=bool(upright)))
     # Findings that make the quality of the calibration unknown: it is not called good.
     causes = [
         *_not_converged(calibration, in_force),
@@ -128,12 +128,7 @@ def diagnose(
         *extrapolated(calibration, extent, far),
         *(finding for finding in also if finding.severity is Severity.BAD and not named),
     ]
-    found = [
-        *(finding for finding in also if finding.severity is not Severity.BAD),
-        *_left_out(calibration.dropped, calibration.views),
-        *few_repeated(calibration, clusters),
-        *_coverage(calibration),
-    ]
+    found = _about_images(calibration, also, clusters)
     if not mixed:
         found += [
             *unclear,
@@ -144,6 +139,12 @@ def diagnose(
             *_outliers(calibration, [finding.image for finding in (*unlike, *unclear)]),
         ]
     return (*with_headline(calibration, causes, effects, extent.where), *modelled_pupil(calibration), *found)
+
+
+def _about_images(c: Calibration, also: Sequence[Finding], clusters: IntArray) -> list[Finding]:
+    """Return findings that are no causes, of images left out, repeated or missing, after those of `also`."""
+    minor = [finding for finding in also if finding.severity is not Severity.BAD]
+    return [*minor, *_left_out(c.dropped, c.views), *few_repeated(c, clusters), *_coverage(c)]
 
 
 def _clusters(views: Sequence[ViewResult]) -> IntArray:
