@@ -22,18 +22,18 @@ MAX_LINES = 1088
 GROUPS, TILES = 60, 8
 """Groups of four lines that are looked at, and tiles across and down the image: a moving board may be a small part."""
 
-MIN_STEP, MIN_ALTERNATING, MIN_SHARE = 32.0, 3.0, 0.02
-"""A tile is of two moments if more places, by MIN_ALTERNATING and MIN_SHARE of all, have differences within four lines
+LINE_STEP, MIN_ALTERNATING, LINE_SHARE = 32.0, 3.0, 0.02
+"""A tile is of two moments if more places, by MIN_ALTERNATING and LINE_SHARE of all, have differences within four lines
 that alternate from line to line rather than lie between the first and the last two; of the larger of both by at least
-MIN_STEP, the sum of four grey levels. White noise, bad pixels and dither have up to 1.5 times as many in a tile, REAL
-images whose lines are 2 px apart 7 times and more; where hardly anything lies between, MIN_SHARE decides."""
+LINE_STEP, the sum of four grey levels. White noise, bad pixels and dither have up to 1.5 times as many in a tile, REAL
+images whose lines are 2 px apart 7 times and more; where hardly anything lies between, LINE_SHARE decides."""
 
 MIN_APART_PX, MAX_APART_PX = 4, 32
 BETTER_MATCH = 0.5
 """Smallest and largest shift between the fields that is undone, and the largest squared difference of the fields at
 their shift over that without it: lines of a screen, or of a pattern, match nowhere better."""
 
-SPREAD = np.array([1.0, 8.0, 23.0, 32.0, 23.0, 8.0, 1.0]) / 96.0
+LINE_SPLINE = np.array([1.0, 8.0, 23.0, 32.0, 23.0, 8.0, 1.0]) / 96.0
 """A cubic B-spline through every second line. It does not pass through the lines: interpolation that does moves edges
 that are sharper than the lines of one field by 0.05 px, and along the lines the blur must be the same."""
 
@@ -73,7 +73,7 @@ def of_one_moment(grey: GreyImage) -> GreyImage:
         return grey
     even: FloatImage = np.zeros(grey.shape, np.float32)
     even[::2] = 2.0 * grey[::2]
-    return np.asarray(cv2.sepFilter2D(even, -1, SPREAD, SPREAD), np.float32)
+    return np.asarray(cv2.sepFilter2D(even, -1, LINE_SPLINE, LINE_SPLINE), np.float32)
 
 
 def _alternating_tiles(grey: GreyImage) -> BoolArray:
@@ -87,9 +87,12 @@ def _alternating_tiles(grey: GreyImage) -> BoolArray:
         np.abs(part[:, : across * TILES]).reshape(TILES, groups // TILES, TILES, across)
         for part in (one - two + three - four, one + two - three - four)
     )
-    more, less = (alternating > np.maximum(between, MIN_STEP)), (between > np.maximum(alternating, MIN_STEP))
+    more, less = (
+        (alternating > np.maximum(between, LINE_STEP)),
+        (between > np.maximum(alternating, LINE_STEP)),
+    )
     counts = [np.count_nonzero(which, axis=(1, 3)) for which in (more, less)]
-    return np.asarray(counts[0] > MIN_ALTERNATING * counts[1] + MIN_SHARE * across * (groups // TILES))
+    return np.asarray(counts[0] > MIN_ALTERNATING * counts[1] + LINE_SHARE * across * (groups // TILES))
 
 
 def _fields_apart(part: FloatImage) -> bool:

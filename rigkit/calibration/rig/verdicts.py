@@ -28,7 +28,7 @@ def diagnose_rig(
     rig: RigCalibration, far: Sequence[FarProjection], notes: Sequence[Finding], *, in_force: Collection[str]
 ) -> tuple[Finding, ...]:
     """Return the verdicts, the headline first; `far` are the uncertainties of the cameras' projections, `notes`
-    findings from elsewhere, `in_force` as for `judge`."""
+    findings from elsewhere, `in_force` as for `diagnose`."""
     # Effects of a cause that was found are not given another one.
     named = worst(notes) is Severity.BAD
     causes = [

@@ -34,12 +34,12 @@ DISPLACED_SIGMAS = 8.0
 """A corner is an outlier if its distance from its prediction exceeds DISPLACED_CELLS, DISPLACED_SIGMAS times the median
 of the board, and DISPLACED_SIGMAS times its expected standard deviation: a finger, a glint, the end of a ruler."""
 
-MAX_GAIN, END_SIGMAS = 1.5, 3.0
+MAX_GAIN_OF_DROP, CORNER_SIGMAS = 1.5, 3.0
 """Largest gain of a prediction that is judged by the above. At the corners of a board it is 2.7; there a stiffer
 prediction, whose gain is 1.4, is compared with the stiff ones of the whole board, and the corner is an outlier if it is
-further off, by the above but of END_SIGMAS: light that ends with the board, or heat, moves such corners. In 13 sets of
-REAL boards, up to the rims of fisheyes, good ones are at most 6.9 times the median off, in heat images bad ones 12 to
-20 times, and 3.7 to 8.6 sigmas."""
+further off, by the above but of CORNER_SIGMAS: light that ends with the board, or heat, moves such corners. In 13 sets
+of REAL boards, up to the rims of fisheyes, good ones are at most 6.9 times the median off, in heat images bad ones 12
+to 20 times, and 3.7 to 8.6 sigmas."""
 
 COVERED_NOISE, COVERED_FACTOR = 0.06, 6.0
 COVERED_OFF = 3.5
@@ -108,7 +108,7 @@ def without_inconsistent(item: RefinedLattice, parts: Sequence[tuple[slice, slic
     known = item.lattice.known
     flexible = _Contradiction.of(item)
     # Predictions from a few corners on one side are not reliable.
-    judged = flexible.reliable & (flexible.gain < MAX_GAIN)
+    judged = flexible.reliable & (flexible.gain < MAX_GAIN_OF_DROP)
     ends = _displaced_ends(item, flexible.reliable & ~judged & (flexible.cells > DISPLACED_CELLS), parts)
     if ends.any():
         # They spoil the predictions of their neighbours.
@@ -147,7 +147,7 @@ def _displaced_ends(item: RefinedLattice, ends: BoolArray, parts: Sequence[tuple
         known = item.lattice.known[part]
         if known.sum() >= MIN_CHECKED:
             out[part] = relative[part] > DISPLACED_SIGMAS * upper_median(relative[part][known])
-    return out & ends & stiff.reliable & (stiff.cells > DISPLACED_CELLS) & (stiff.excess > END_SIGMAS)
+    return out & ends & stiff.reliable & (stiff.cells > DISPLACED_CELLS) & (stiff.excess > CORNER_SIGMAS)
 
 
 class _Contradiction(NamedTuple):

@@ -15,7 +15,7 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.validation.monitoring.copies import with_copies_shared
 from rigkit.validation.monitoring.evidence import FreshView
 from rigkit.validation.monitoring.flipped import consistently_numbered
-from rigkit.validation.monitoring.judge import CalibrationCheck, check_views
+from rigkit.validation.monitoring.verdict import CalibrationCheck, check_views
 
 MOUNT = Rigid3(exp_so3(np.array([0.01, -0.08, 0.02])), [-120.0, 2.0, 3.0])
 RIG = known_rig(MOUNT, [0.1, 0.1, 0.1, 0.1, 2e-5, 2e-5, 2e-5, 2e-5], 2e-5, 20.0)
