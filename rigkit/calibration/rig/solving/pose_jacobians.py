@@ -104,7 +104,11 @@ def summed_products(
             follow[:, p : p + 6, part.index] = part.globals
             follow[:, p : p + 6, count : count + 6] = part.target
             follow[:, -1, -1] = 1.0
-            np.add.at(out, part.poses, np.swapaxes(follow, -1, -2) @ own[part.views] @ follow)
+            more = np.swapaxes(follow, -1, -2) @ own[part.views] @ follow
+            if len(np.unique(part.poses)) == len(part.poses):
+                out[part.poses] += more
+            else:  # Slow, but adds all views of one pose.
+                np.add.at(out, part.poses, more)
     return out
 
 
