@@ -162,3 +162,19 @@ def test_a_rig_without_covariance_is_refused(rig: Path, capsys: pytest.CaptureFi
     rig.write_text(json.dumps(data))
     assert main(["certify", str(rig), "--length", "300", "--distance", "1200"]) == 2
     assert "the rig has no covariance" in capsys.readouterr().err
+
+
+def test_cameras_that_do_not_expose_at_once_are_named(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What moves between the exposures is no part of the bound."""
+    asked = ["certify", str(rig), "--length", "300", "--distance", "1200"]
+    assert main(asked) == 0
+    assert "at rest" not in capsys.readouterr().out
+    data = json.loads(rig.read_text())
+    data["cameras"][1]["lag"] = {"frames": -0.11, "sigma": 0.02, "scatter": 0.1}
+    rig.write_text(json.dumps(data))
+    assert main(asked) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert (
+        "Camera 'left' exposes 0.110 frame periods after 'right' (jitter 0.100): the bound is of things at rest"
+        in words
+    )

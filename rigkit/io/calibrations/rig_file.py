@@ -17,6 +17,7 @@ from rigkit.calibration.pupil import SolvedPupil, require_of_frame
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.mounted import MountedCameras
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.solving.exposure_times import Lag
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import Pixels, as_array, as_covariance, without_nan
@@ -57,11 +58,13 @@ class SavedRig(MountedCameras):
     boards : boards of the calibration.
     outlines : convex hull (N, 2) of all corners that a camera saw, px, by name.
     verdicts : verdicts on the calibration.
+    lags : by name, of cameras that do not expose with the first.
     """
 
     boards: tuple[Board, ...] = ()
     outlines: Mapping[str, Pixels] = field(default_factory=dict)
     verdicts: tuple[Finding, ...] = ()
+    lags: Mapping[str, Lag] = field(default_factory=dict)
 
 
 def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
@@ -119,6 +122,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
     outlines: dict[str, Pixels] = {}
     departures: dict[str, Any] = {}
     pupils: dict[str, SolvedPupil] = {}
+    lags: dict[str, Lag] = {}
     with damage_reported(path):
         for entry in data["cameras"]:
             if set(entry) | {"outline_px", "departures", "pupil", "lag", "readout"} != RIG_CAMERA_KEYS:
@@ -136,6 +140,8 @@ def load_saved_rig(path: str | Path) -> SavedRig:
                 pupils[name] = pupil_from_json(entry["pupil"])
             if "outline_px" in entry:
                 outlines[name] = as_array(reals(entry["outline_px"]), (None, 2), "outline_px")
+            if "lag" in entry:
+                lags[name] = Lag(*(real(entry["lag"][key]) for key in ("frames", "sigma", "scatter")))
         if not cameras:
             raise InputError(f"'{path}': no camera in it; calibrate again")
         size = Layout.of_cameras(camera for camera, _ in cameras.values()).count
@@ -154,6 +160,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
             departures=beyond,
             pupils=pupils,
             verdicts=findings_from_json(data.get("verdicts", ())),
+            lags=lags,
         )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.core.measurement_task import Task
 from rigkit.core.printing import brief
-from rigkit.io.calibrations.rig_file import is_rig_file
+from rigkit.io.calibrations.rig_file import is_rig_file, load_saved_rig
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.report.pages.certificate_page import certificate_facts, certificate_page, certificate_pdf
@@ -54,6 +56,9 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
     if any(isinstance(camera, NearCamera) for camera in certificate.instrument.cameras):
         message = Finding.good("the lens is not central: its moving entrance pupil is included")
         certificate = replace(certificate, findings=(*certificate.findings, message))
+    certificate = replace(
+        certificate, findings=(*certificate.findings, *_not_at_once(path, certificate.instrument.names))
+    )
     title = f"Certificate: {task.quantity} with {Path(path).name}"
     facts = {Path(path).name: digest_line(Path(path)), **software_facts()}
     files: dict[Path, str | bytes] = {}
@@ -64,6 +69,20 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
     write_together(files, force=options.force)
     words = certificate_facts(certificate, options.limit)
     return CertifiedFile(certificate=certificate, words=words, written=tuple(files))
+
+
+def _not_at_once(path: str | Path, names: Sequence[str]) -> Iterator[Finding]:
+    """Yield a finding where the cameras of a rig do not expose at one instant."""
+    lags = load_saved_rig(path).lags if is_rig_file(path) else {}
+    if any(name in lags for name in names):
+        first, last = sorted(names, key=lambda name: lags[name].frames if name in lags else 0.0)
+        apart = sum(sign * lags[name].frames for name, sign in ((first, -1.0), (last, 1.0)) if name in lags)
+        jitter = math.hypot(*(lags[name].scatter for name in names if name in lags))
+        yield Finding.look(
+            f"camera '{last}' exposes {apart:.3f} frame periods after '{first}' (jitter {jitter:.3f}): the bound is of "
+            "things at rest",
+            "measure nothing that moves, or trigger the cameras together",
+        )
 
 
 def load_instrument(
