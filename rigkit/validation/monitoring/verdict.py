@@ -18,7 +18,7 @@ from scipy.special import fdtrc
 
 from rigkit.calibration.solving.clustered import LARGE_FREEDOM
 from rigkit.core.arrays import FloatArray
-from rigkit.core.errors import DegenerateError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.planning.goal import Goal
 from rigkit.validation.monitoring.evidence import FreshEvidence, FreshView, Monitored, evidence_of
 from rigkit.validation.monitoring.hypotheses import Hypothesis, hypotheses_of, lens_goals, turn_weight
@@ -32,6 +32,8 @@ ALARM_CHANCE = 0.01
 """p-values below raise an alarm."""
 ALARM_PX = 0.07
 """Changes that move the projection by less raise no alarm, however significant."""
+HALVINGS = 10
+"""Of a change that leaves the range of the lens model: a thousandth of it is none."""
 FIX_ROUNDS = 3
 """Further Gauss-Newton iterations of a change."""
 MAX_OF_EXPECTED = 3.0
@@ -276,11 +278,22 @@ def _cost(change: Change, penalty: float) -> float:
     return change.amounts.size * penalty + rare
 
 
+def _as_far_as_the_model(monitored: Monitored, change: Change) -> tuple[FloatArray, Monitored]:
+    """Return the amounts of a change and the calibration after it; a linear change to where the lens model has no
+    parameters is halved until it has."""
+    amounts = change.amounts
+    for _ in range(HALVINGS):
+        try:
+            return amounts, monitored.changed(change.hypothesis.directions @ amounts)
+        except InputError:
+            amounts = 0.5 * amounts
+    return np.zeros_like(amounts), monitored
+
+
 def _refined(monitored: Monitored, look: Look, change: Change) -> tuple[FloatArray, Monitored, FreshEvidence]:
     """Return the amounts of a change, the calibration after it, and the evidence of the frames there, after further
     Gauss-Newton iterations while these lower the residuals."""
-    amounts = change.amounts
-    fixed = monitored.changed(change.hypothesis.directions @ amounts)
+    amounts, fixed = _as_far_as_the_model(monitored, change)
     after = look(fixed)
     for _ in range(FIX_ROUNDS):
         try:
@@ -289,10 +302,10 @@ def _refined(monitored: Monitored, look: Look, change: Change) -> tuple[FloatArr
             again = None
         if again is None:
             break
-        closer = monitored.changed(change.hypothesis.directions @ (amounts + again.amounts))
         try:
+            closer = monitored.changed(change.hypothesis.directions @ (amounts + again.amounts))
             then = look(closer)
-        except DegenerateError:  # The step is so large that no point is in the field of view.
+        except (DegenerateError, InputError):  # So large a step that no point, or no such lens, is left.
             break
         if then.rms_px > after.rms_px:
             break

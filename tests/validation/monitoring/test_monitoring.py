@@ -16,6 +16,7 @@ from rigkit.calibration.certainty.departures import with_own_noise
 from rigkit.calibration.certainty.displaced import DisplacedCamera, lens_of
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
+from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import scaled_pinv
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
@@ -27,7 +28,7 @@ from rigkit.io.calibrations.history_file import load_history
 from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.planning.goal import projection_goal
 from rigkit.report.pages.check_page import change_svg, check_facts, check_page
-from rigkit.validation.monitoring.evidence import FreshView, evidence_of
+from rigkit.validation.monitoring.evidence import FreshView, Monitored, evidence_of
 from rigkit.validation.monitoring.power import FOUND
 from rigkit.validation.monitoring.verdict import ALARM_CHANCE, check_views
 from rigkit.validation.monitoring.watch import monitored_camera
@@ -129,6 +130,24 @@ def test_another_camera_is_explained_by_nothing(calibration: Calibration, rng: n
     check = checked(calibration, other, rng)
     assert check.unexplained and not check.holds
     assert "another camera" in " ".join(check_facts(check).sentences)
+
+
+def test_a_change_beyond_the_range_of_the_lens_model_is_none_that_explains(rng: np.random.Generator) -> None:
+    """As a step from the linear solution is in REAL pairs of bouguet and bumblebee2."""
+    size_px, (poses, sigmas) = lens("reg").size_px, (poses_held("reg", 3), [0.1, 0.1, 0.1, 0.1, 1e-3, 1e-3])
+    flat = camera_model("eucm")(size_px, np.array([1200.0, 1200.0, 811.0, 619.0, 0.05, 1.0]))
+    other = camera_model("brown")(size_px, np.array([1200.0, 1200.0, 811.0, 619.0, 0.15, 0.0, 0.0, 0.0, 0.0]))
+    known = Monitored(
+        names=("cam",),
+        cameras=(flat,),
+        cam_from_rig=(Rigid3.identity(),),
+        covariance=np.diag(sigmas) ** 2,
+        sigma_px=NOISE_PX,
+    )
+    views = [FreshView(f"{k}", 0, noisy_view(other, pose, f"{k}", rng, NOISE_PX)) for k, pose in enumerate(poses)]
+    check = check_views(known, views)
+    assert check.unexplained and not check.holds
+    np.testing.assert_allclose(check.fixed.cameras[0].parameters, flat.parameters + check.step, rtol=1e-12)
 
 
 def test_a_view_all_of_whose_corners_stray_says_nothing(calibration: Calibration, rng: np.random.Generator) -> None:
