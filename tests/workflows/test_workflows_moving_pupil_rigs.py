@@ -11,6 +11,7 @@ import pytest
 from helpers.calibration_scenes import SIZE, lens
 from helpers.schemas import faults
 
+from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
@@ -113,6 +114,20 @@ def test_the_file_holds_the_pupils(rig: RigCalibration, saved: Path) -> None:
         assert camera.calibration.pupil is not None
         np.testing.assert_array_equal(known.pupils[camera.name].terms, camera.calibration.pupil.terms)
         assert known.pupils[camera.name].with_frame.shape == (len(rig.covariance), 2)
+
+
+def test_the_file_holds_the_shapes_of_boards(rig: RigCalibration, tmp_path: Path) -> None:
+    first, path = rig.cameras[0], tmp_path / "rig.json"
+    declared = first.calibration.boards[0].declared
+    assert declared is not None
+    bent = declared.points() + np.linspace(0.0, 0.3, declared.corner_count)[:, None] ** 2
+    solved = replace(first.calibration, boards=(BoardShape.of(declared, "released", bent),))
+    text = rig_text(replace(rig, cameras=(replace(first, calibration=solved), *rig.cameras[1:])))
+    path.write_text(text, encoding="utf-8")
+    assert not faults(json.loads(text))
+    known, boards = load_monitored(path)
+    np.testing.assert_array_equal(known.boards_mm[declared.board_id], bent)
+    assert [board.board_id for board in boards] == [declared.board_id]
 
 
 def test_a_damaged_pupil_is_named(saved: Path, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.certainty.coverage import outline_of_corners
 from rigkit.calibration.certainty.displaced import LensModes
 from rigkit.calibration.pupil import SolvedPupil, require_of_frame
@@ -20,7 +21,7 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.exposure_times import Lag
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import Pixels, as_array, as_covariance, without_nan
+from rigkit.core.arrays import Pixels, Points, as_array, as_covariance, without_nan
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
@@ -56,12 +57,14 @@ class SavedRig(MountedCameras):
     Attributes
     ----------
     boards : boards of the calibration.
+    boards_mm : solved corners (N, 3) of those that are not flat, by name.
     outlines : convex hull (N, 2) of all corners that a camera saw, px, by name.
     verdicts : verdicts on the calibration.
     lags : by name, of cameras that do not expose with the first.
     """
 
     boards: tuple[Board, ...] = ()
+    boards_mm: Mapping[str, Points] = field(default_factory=dict)
     outlines: Mapping[str, Pixels] = field(default_factory=dict)
     verdicts: tuple[Finding, ...] = ()
     lags: Mapping[str, Lag] = field(default_factory=dict)
@@ -96,15 +99,22 @@ def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
             for c, own in zip_longest(rig.cameras, rig.departures)
         ],
         "covariance": rig.covariance.tolist(),
-        "boards": [{"board_id": b.board_id, "target": board_values(b)} for b in _boards_of(rig)],
+        "boards": [
+            {
+                "board_id": shape.board_id,
+                "target": board_values(shape.board),
+                **({} if shape.kind == "flat" else {"points_mm": shape.points_mm.tolist()}),
+            }
+            for shape in _shapes_of(rig)
+        ],
     }
     return json_text(data)
 
 
-def _boards_of(rig: RigCalibration) -> tuple[Board, ...]:
-    """Return the declared boards that the cameras saw, with the shape from the first of these cameras."""
+def _shapes_of(rig: RigCalibration) -> tuple[BoardShape, ...]:
+    """Return the shapes of the declared boards that the cameras saw, from the first of these cameras."""
     shapes = [shape for camera in rig.cameras for shape in camera.calibration.boards if shape.declared is not None]
-    return tuple({shape.board_id: shape.board for shape in reversed(shapes)}.values())
+    return tuple({shape.board_id: shape for shape in reversed(shapes)}.values())
 
 
 def load_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
@@ -156,6 +166,11 @@ def load_saved_rig(path: str | Path) -> SavedRig:
             freedom=freedom(data.get("freedom")),
             overdispersion=positive(data.get("overdispersion", data.get("spread", 1.0))),
             boards=tuple(board_of_values(entry["target"], entry["board_id"]) for entry in data.get("boards", ())),
+            boards_mm={
+                entry["board_id"]: as_array(reals(entry["points_mm"]), (None, 3), "points_mm")
+                for entry in data.get("boards", ())
+                if "points_mm" in entry
+            },
             outlines=outlines,
             departures=beyond,
             pupils=pupils,

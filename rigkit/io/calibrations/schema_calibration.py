@@ -178,7 +178,14 @@ RIG_FILE = file(
         "covariance?": described(
             matrix(), "of all intrinsics, camera by camera, then of the extrinsics of all but the first (rad, mm)"
         ),
-        "boards?": rows({"board_id": described(TEXT, "its name"), "target": DECLARED_BOARD}, "boards used"),
+        "boards?": rows(
+            {
+                "board_id": described(TEXT, "its name"),
+                "target": DECLARED_BOARD,
+                "points_mm?": described(matrix(columns=3), "corners, row by row, of one that is not flat"),
+            },
+            "boards used",
+        ),
         "baselines?": rows(
             {"from": TEXT, "to": TEXT, "value_mm": NUMBER, "sigma_mm": NUMBER}, "distances between cameras"
         ),

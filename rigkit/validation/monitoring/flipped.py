@@ -14,8 +14,10 @@ import numpy as np
 from rigkit.calibration.views.flips import FLIP_SIGNS, Flip
 from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.board_pose import cam_from_seen_board
+from rigkit.core.arrays import Pixels, Points
 from rigkit.core.detections import BoardView, grid_turned
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
 from rigkit.validation.monitoring.evidence import FreshView, Monitored, evidence_of
 from rigkit.validation.monitoring.verdict import check_views, exceeds_expected, unchanged_px
 
@@ -77,25 +79,54 @@ def _all_unflipped(
 
 
 def consistently_numbered(monitored: Monitored, fresh: FreshView, before: Sequence[FreshView]) -> FreshView:
-    """Return a view of a rotationally symmetric board, numbered from the same end as by another camera."""
+    """Return a view of a rotationally symmetric board, numbered from the same end as by another camera, or else from
+    that which fits the board's calibrated shape."""
     view, c = fresh.view, fresh.camera
     name = view.board.board_id
     same = [v for v in before if v.frame == fresh.frame and v.view.board.board_id == name and v.camera != c]
-    if not same or not view.board.looks_same_turned:
+    if not view.board.looks_same_turned:
         return fresh
+    if not same:
+        return _numbered_as_calibrated(monitored, fresh)
     first = same[0]
     try:
         pose = cam_from_seen_board(monitored.cameras[first.camera], first.view.pixels, first.view.points())
     except (InputError, DegenerateError):
         return fresh
     here = monitored.cam_from_rig[c] @ monitored.cam_from_rig[first.camera].inverse() @ pose
-    turned = replace(view, grid=grid_turned(view.grid, view.board.size, 2))
 
     def distance_px(one: BoardView) -> float:
-        pixels, seen = monitored.cameras[c].project(here.apply(one.points()))
-        return float(np.median(np.linalg.norm(pixels - one.pixels, axis=1)[seen])) if seen.any() else np.inf
+        return _distance_px(monitored.cameras[c], here, one.pixels, one.points())
 
-    return replace(fresh, view=turned) if distance_px(turned) < distance_px(view) else fresh
+    return min(fresh, _from_the_other_end(fresh), key=lambda one: distance_px(one.view))
+
+
+def _numbered_as_calibrated(monitored: Monitored, fresh: FreshView) -> FreshView:
+    """Return a view of a rotationally symmetric board from the end from which its calibrated shape fits better."""
+    board, camera = fresh.view.board, monitored.cameras[fresh.camera]
+    shape = monitored.boards_mm.get(board.board_id)
+    if shape is None or len(shape) != board.corner_count:
+        return fresh
+
+    def distance_px(one: FreshView) -> float:
+        points = shape[one.view.grid @ np.array([1, board.size[0]])]
+        pose = cam_from_seen_board(camera, one.view.pixels, points)
+        return _distance_px(camera, pose, one.view.pixels, points)
+
+    try:
+        return min(fresh, _from_the_other_end(fresh), key=distance_px)
+    except (InputError, DegenerateError):
+        return fresh
+
+
+def _from_the_other_end(fresh: FreshView) -> FreshView:
+    return replace(fresh, view=replace(fresh.view, grid=grid_turned(fresh.view.grid, fresh.view.board.size, 2)))
+
+
+def _distance_px(camera: Camera, pose: Rigid3, seen: Pixels, points_mm: Points) -> float:
+    """Return the median distance of pixels (N, 2) from the projections of their points (N, 3)."""
+    pixels, valid = camera.project(pose.apply(points_mm))
+    return float(np.median(np.linalg.norm(pixels - seen, axis=1)[valid])) if valid.any() else np.inf
 
 
 def _fits(monitored: Monitored, views: Sequence[FreshView]) -> bool:

@@ -196,7 +196,7 @@ def load_monitored(source: Path) -> tuple[Monitored, tuple[Board, ...]]:
         return monitored_camera(known, source.stem), boards
     rig = load_saved_rig(source)
     with about(source):
-        return monitored_rig(rig), without_parts(rig.boards)
+        return replace(monitored_rig(rig), boards_mm=rig.boards_mm), without_parts(rig.boards)
 
 
 def _replaced_by_known(boards: Sequence[Board], known: Sequence[Board]) -> tuple[Board, ...]:

@@ -67,3 +67,20 @@ def test_two_copies_in_a_frame_are_not_matched(rng: np.random.Generator) -> None
     """Two of each camera fit by chance."""
     few = [view for view in wall(MOUNT, rng) if view.view.board.board_id.endswith(("(0)", "(1)"))]
     assert len({view.view.board.board_id for view in with_copies_shared(RIG, few)}) == len(few)
+
+
+def test_a_bent_board_has_its_calibrated_shape_from_whichever_end_it_is_numbered(rng: np.random.Generator) -> None:
+    """As that of REAL bumblebee2, of whose unchanged pairs two in five fitted a flat board."""
+    bent = COPY.points() + rng.normal(size=(COPY.corner_count, 3)) * np.array([0.02, 0.02, 0.2])
+    known = replace(RIG, boards_mm={COPY.board_id: bent})
+    views: list[FreshView] = []
+    for camera, motion in enumerate((Rigid3.identity(), MOUNT)):
+        held = motion @ Rigid3(exp_so3(np.array([0.3, 0.4, 0.1])), [-80.0, -50.0, 500.0])
+        pixels, valid = lens("wide").project(held.apply(bent))
+        assert valid.all() and COPY.looks_same_turned
+        noisy = pixels + NOISE_PX * rng.normal(size=pixels.shape)
+        grid = np.array(COPY.size) - 1 - COPY.grid()
+        view = BoardView("0", COPY, grid, noisy, np.full(len(grid), NOISE_PX))
+        views.append(consistently_numbered(known, FreshView("0", camera, view), views))
+    assert all((one.view.grid == COPY.grid()).all() for one in views)
+    assert check_views(known, views).rms_px < 2.0 * NOISE_PX < check_views(RIG, views).rms_px
