@@ -1,7 +1,8 @@
 """Calibrations from two halves of a rig's frames: do baselines and mounts differ by what their sigmas predict?
 
 Frames are split at random, every second one apart, and in time: neighbouring frames may err alike, which only the last
-shows.
+shows. With the model "auto" boards may have any shape, and each half measures the boards of the other
+(`halves.lengths`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from halves.lengths import Measured, both_see, measured, share
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.compare import compare_mounts
 from rigkit.calibration.rig.mounted import MountedCameras
@@ -71,7 +73,7 @@ def load_rig(name: str, data: Path, cache: Path) -> tuple[RigViews, dict[str, tu
 
 
 def split_rig(name: str, data: Path, cache: Path, splits: int, model: str) -> None:
-    """Print how far apart the baselines and mounts of halves are; with the model "auto" boards may have any shape."""
+    """Print how far apart the baselines and mounts of halves are, and how many of their lengths are within bounds."""
     views, sizes = load_rig(name, data, cache)
     frames = sorted({frame for own in views.values() for frame, _ in own}, key=natural_key)
     half, rng = len(frames) // 2, np.random.default_rng(len(name))
@@ -80,6 +82,7 @@ def split_rig(name: str, data: Path, cache: Path, splits: int, model: str) -> No
         order = [frames[i] for i in rng.permutation(len(frames))]
         parts[f"random {k}"] = order[::2], order[1::2]
     off: dict[str, list[float]] = {"in time": [], "mixed": []}
+    lengths, whole = list[Measured](), _calibrated(views, sizes, set(frames), model) if model == "auto" else None
     for how, halves in parts.items():
         try:
             a, b = (_calibrated(views, sizes, set(own), model) for own in halves)
@@ -93,8 +96,37 @@ def split_rig(name: str, data: Path, cache: Path, splits: int, model: str) -> No
             words.append(f"{'-'.join(pair)} {first:.2f} ± {sigma_a:.2f} and {second:.2f} ± {sigma_b:.2f} mm")
         chance = compare_mounts(_without_departures(a), _without_departures(b)).chance
         print(f"{name}, {how}: {'; '.join(words)}; chance of such mounts {chance:.4f}", flush=True)
+        if whole is not None:
+            for rig, others in ((a, halves[1]), (b, halves[0])):
+                own = _lengths(rig, whole, views, set(others))
+                print(f"{name}, {how}: lengths within bounds: {share(own)}", flush=True)
+                lengths += own
     rms = [f"{how} {np.sqrt(np.mean(np.square(own))):.2f} ({len(own)})" for how, own in off.items() if own]
     print(f"{name}: baselines, observed over stated (rms): {', '.join(rms)}", flush=True)
+    if lengths:
+        print_lengths(name, lengths)
+
+
+def _lengths(rig: RigCalibration, whole: RigCalibration, views: RigViews, frames: set[str]) -> list[Measured]:
+    """Return the lengths of each two cameras in some frames, held against the boards' shapes by the `whole` set."""
+    out = list[Measured]()
+    for names in combinations(views, 2):
+        seen = {frame: pair for frame, pair in both_see(whole, views, names).items() if frame in frames}
+        shapes = {shape.board_id: shape for shape in whole.cameras[whole.index(names[0])].calibration.boards}
+        out += measured(rig, names, seen, shapes)
+    return out
+
+
+def print_lengths(name: str, lengths: list[Measured]) -> None:
+    """Print how many lengths are within their bounds, in all frames and in those that `rigkit check` accepts."""
+    print(
+        f"{name}: lengths within bounds of 95 %: {share(lengths)}; where check accepts the frame "
+        f"{share([own for own in lengths if own.holds])}, else {share([own for own in lengths if not own.holds])}"
+    )
+    for frame in sorted({own.frame for own in lengths}, key=natural_key):
+        of_it = [own for own in lengths if own.frame == frame]
+        accepted = sum(own.holds for own in of_it)
+        print(f"{name}: frame {frame}: {share(of_it)}, {accepted} accepted", flush=True)
 
 
 def _calibrated(views: RigViews, sizes: Mapping[str, tuple[int, int]], frames: set[str], model: str) -> RigCalibration:

@@ -89,7 +89,7 @@ def certify(instrument: Monitored, task: Task, *, cells: tuple[int, int] = MAP_C
         for cause, value in variance.items()
     }
     expected = factor * np.sqrt(square[chosen, worst]).reshape(shape)
-    bound, quantile = _bound(sigma, expected, instrument.freedom, task.confidence)
+    bound, quantile = bound_of(sigma, expected, instrument.freedom, task.confidence)
     full_size = factor * (1.0 if task.quantity is Quantity.ANGLE else task.size_mm)
     # Largest displacement of any of the points by an error of one pixel, mm.
     farthest = np.linalg.norm(found.points_by_pixel, ord=2, axis=(-2, -1)).max(axis=1)
@@ -107,7 +107,7 @@ def certify(instrument: Monitored, task: Task, *, cells: tuple[int, int] = MAP_C
     return replace(certificate, findings=tuple(_findings(certificate)))
 
 
-def _bound(
+def bound_of(
     sigma: Mapping[str, FloatArray], expected: FloatArray, freedom: float, confidence: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the bound (R, C) at each place, and the quantile of Student's distribution, from the standard deviations

@@ -32,7 +32,7 @@ ALARM_CHANCE = 0.01
 """p-values below raise an alarm."""
 ALARM_PX = 0.07
 """Changes that move the projection by less raise no alarm, however significant."""
-HALVINGS = 10
+RANGE_HALVINGS = 10
 """Of a change that leaves the range of the lens model: a thousandth of it is none."""
 FIX_ROUNDS = 3
 """Further Gauss-Newton iterations of a change."""
@@ -282,7 +282,7 @@ def _as_far_as_the_model(monitored: Monitored, change: Change) -> tuple[FloatArr
     """Return the amounts of a change and the calibration after it; a linear change to where the lens model has no
     parameters is halved until it has."""
     amounts = change.amounts
-    for _ in range(HALVINGS):
+    for _ in range(RANGE_HALVINGS):
         try:
             return amounts, monitored.changed(change.hypothesis.directions @ amounts)
         except InputError:
