@@ -41,6 +41,7 @@ from rigkit.geometry.triangulation import triangulate_pixels as triangulate_pixe
 from rigkit.geometry.triangulation import triangulate_rays as triangulate_rays
 from rigkit.identification.identify import identify_pair as identify_pair
 from rigkit.interop.open3d import to_open3d as to_open3d
+from rigkit.io.boards.board_words import board_of_words as board_of_words
 from rigkit.io.calibrations.calibration_file import load_calibration as load_calibration
 from rigkit.io.calibrations.calibration_file import load_camera as load_camera
 from rigkit.io.calibrations.calibration_file import save_calibration as save_calibration

@@ -54,7 +54,8 @@ def detect_boards(
     Raises
     ------
     InputError
-        `image` is not an image of a supported type, or there is no finder for the pattern of one of `boards`.
+        `image` is not an image of a supported type, `boards` are not boards, or there is no finder for the pattern of
+        one.
     """
     check_searchable(boards or ())
     stored = of_one_moment(without_mosaic(grey_image(image)))

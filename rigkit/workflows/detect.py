@@ -12,6 +12,7 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
+from rigkit.calibration.views.usable import other_size
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
@@ -122,6 +123,8 @@ def detect_in_images(
         why = why_not_detected(images, boards, progress)
         if why is not None:
             _log.warning(f"none of the boards given is seen whole: {why}")
+    elif boards and (other := other_size(found, boards)) is not None:
+        _log.warning(f"check columns and rows: {other}")
     if options.output is not None and any(found.values()):
         write_corners(options.output, found, force=options.force)
     return DetectionResult(found, failures, doubtful)

@@ -16,6 +16,8 @@ rigkit.Board("a", "oops", 6, 50.0, 50.0)  # type: ignore[arg-type]
 rigkit.Board("a", 8, 6, 50.0)  # type: ignore[call-arg]
 rigkit.detect_boards(1)  # type: ignore[arg-type]
 rigkit.detect_boards(rigkit.read_image(Path("a.png")), boards=3)  # type: ignore[arg-type]
+rigkit.detect_boards(rigkit.read_image(Path("a.png")), "9x6x25")  # type: ignore[arg-type]
+rigkit.board_of_words(3)  # type: ignore[arg-type]
 rigkit.detect_bords(rigkit.read_image(Path("a.png")))  # type: ignore[attr-defined]
 rigkit.load_camera(3)  # type: ignore[arg-type]
 rigkit.load_calibration("a.json").reprojection_error  # type: ignore[attr-defined]  # noqa: B018

@@ -150,3 +150,13 @@ def test_parts_of_a_larger_board_are_not_taken_for_the_given_one(
 ) -> None:
     assert main(["detect", str(images / "0.png"), "--board", "5x4x30", "--jobs", "1"]) == 0
     assert "seen whole: in 1 image 9 x 6 inner corners are seen, 5 x 4 are declared" in capsys.readouterr().err
+
+
+def test_images_of_a_larger_board_are_told_though_others_show_the_given_one(
+    images: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = single(Board("a", 8, 6, 30.0, 30.0), [0.2, 0.1, 0.1], 600.0)
+    cv2.imwrite(str(images / "smaller.png"), scene.image(np.random.default_rng(3)))
+    assert main(["detect", str(images), "--board", "8x6x30"]) == 0
+    words = "check columns and rows: 9 x 6 inner corners are seen in 3 of 4 images, 8 x 6 are declared"
+    assert words in capsys.readouterr().err

@@ -284,6 +284,12 @@ def test_a_board_that_nothing_looks_for_is_told_rather_than_never_found() -> Non
         detect_boards(np.zeros((60, 80), np.uint8), [board])
 
 
+@pytest.mark.parametrize("boards", ["8x6x50", ["8x6x50"], Board("a", 8, 6, 50.0, 50.0)])
+def test_boards_in_words_are_told_how_to_become_boards(boards: Any) -> None:
+    with pytest.raises(InputError, match=r"list of rigkit.Board; rigkit.board_of_words makes"):
+        detect_boards(np.zeros((60, 80), np.uint8), boards)
+
+
 @pytest.mark.parametrize("image", [np.zeros((4, 100, 100)), np.zeros((100, 100), np.int32), np.zeros((8, 8), np.uint8)])
 def test_what_is_no_image_is_refused(image: np.ndarray) -> None:
     with pytest.raises(InputError, match="image:"):

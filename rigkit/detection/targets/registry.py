@@ -26,7 +26,12 @@ FINDERS: dict[str, Finder] = {
 
 
 def check_searchable(boards: Sequence[Board]) -> None:
-    """Raise InputError if there is no finder for the pattern of one of `boards`."""
+    """Raise InputError if `boards` is not a sequence of boards, or there is no finder for the pattern of one."""
+    if isinstance(boards, (str, Board)) or not all(isinstance(board, Board) for board in boards):
+        raise InputError(
+            "boards must be a list of rigkit.Board; rigkit.board_of_words makes one of words, such as '9x6x25', or of "
+            "a file"
+        )
     for board in boards:
         if board.pattern.type not in FINDERS:
             raise InputError(

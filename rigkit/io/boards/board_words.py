@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.patterns.base import Key
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.registry import PATTERNS, pattern_type
 from rigkit.io.boards.board_file import DECLARED_BOARD, load_board, measured_board
@@ -47,14 +48,23 @@ def board_in_words(words: str) -> Board | None:
     for pair in filter(None, match["keys"].split(",")):
         name, _, value = pair.partition("=")
         values[name] = _value(words, name, value, known.get(name, str))
+    lacking = [key for key in pattern.keys if key.required and key.name not in values]
+    if lacking:
+        names = " and ".join(f"'{key.name}'" for key in lacking)
+        such = ",".join([words, *(_key_in_words(key) for key in lacking)])
+        raise InputError(
+            f"board '{words}': {names} {'are' if lacking[1:] else 'is'} missing; write, with your values, {such}"
+        )
     first = values.get("first_tag") or values.get("first_marker")
     size = f"{match['columns']}x{match['rows']}x{float(match['mm']):g}"
     name = "-".join([match["type"] or "board", size, *([f"first{first}"] if first else [])])
     return measured_board(TomlTable(values, DECLARED_BOARD, Path(f"board '{words}'")), name)
 
 
-def board_of_words(words: str) -> Board:
-    """Return the board in words (see `board_in_words`) or in a file; raises InputError for anything else."""
+def board_of_words(words: str | Path) -> Board:
+    """Return the board in words, such as "9x6x25" (see `board_in_words`), or in a file; raises InputError for anything
+    else."""
+    words = str(words)
     board = board_in_words(words)
     if board is not None:
         return board
@@ -92,6 +102,11 @@ def with_length(words: str, length_mm: float) -> str:
     """
     words = re.sub(r"\(([0-9.]+) MM\)", lambda part: f"{float(part[1]) * length_mm:.4g}", words)
     return words.replace("xMM", f"x{length_mm:.8g}")
+
+
+def _key_in_words(key: Key) -> str:
+    """Return the example of a key, 'marker_mm = 22.0 (with the black border)', as words take it: marker_mm=22.0."""
+    return key.hint.partition(" (")[0].replace(" ", "").replace('"', "")
 
 
 def _written(value: object) -> str:

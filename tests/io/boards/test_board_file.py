@@ -58,6 +58,9 @@ def test_boards_in_words() -> None:
     ):
         with pytest.raises(InputError, match=words.partition(",")[0]):
             board_in_words(words)
+    with pytest.raises(InputError, match=r"'dictionary' and 'marker_mm' are missing.* ") as lacking:
+        board_in_words("charuco:6x4x30")
+    assert board_in_words(str(lacking.value).rpartition(" ")[2]) is not None
 
 
 KALIBR = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.088\ntagSpacing: 0.3\n"
