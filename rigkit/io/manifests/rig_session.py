@@ -202,11 +202,11 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
     stems = [PurePath(image).stem for own in images.values() for image in own]
     if how is None and stems and all(TIME.fullmatch(stem) for stem in stems):
         how = "time"
+    counts = ", ".join(f"{len(own)} of '{name}'" for name, own in images.items())
+    as_many = len(set(map(len, images.values()))) == 1
     if how == "order":
-        counts = {name: len(own) for name, own in images.items()}
-        if len(set(counts.values())) > 1:
-            words = ", ".join(f"{n} of '{name}'" for name, n in counts.items())
-            raise InputError(f'frames = "order" needs as many images of every camera, there are {words}')
+        if not as_many:
+            raise InputError(f'frames = "order" needs as many images of every camera, there are {counts}')
         return {name: {image: f"{k:04d}" for k, image in enumerate(own)} for name, own in images.items()}
     if how == "time":
         return _frames_by_time(images)
@@ -222,14 +222,15 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
         alike = alike or twice
     if how is None and all(len(own) == 1 for own in images.values()):
         return frames_of_images(images, "order")
+    remedy = "give the images of one moment one name or number"
+    if as_many:
+        remedy += ', or write frames = "order" in the session if the sorted lists correspond one by one'
+    else:
+        remedy += f", or as many of every camera in the same order; there are {counts}"
     if alike is not None:
-        raise InputError(
-            f"{alike} are simultaneous by their names, which is impossible; "
-            'rename the images, or write frames = "order" if the sorted lists correspond one by one'
-        )
+        raise InputError(f"{alike} are simultaneous by their names, which is impossible; {remedy}")
     raise InputError(
-        "no two cameras have an image of the same name or number, so simultaneous images are unknown; "
-        'rename the images, or write frames = "order" if the sorted lists correspond one by one'
+        "no two cameras have an image of the same name or number, so simultaneous images are unknown; " + remedy
     )
 
 

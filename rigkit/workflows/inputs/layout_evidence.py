@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,7 +37,7 @@ from rigkit.workflows.inputs.folder_session import (
     images_of_camera,
     images_of_layout,
 )
-from rigkit.workflows.inputs.layouts import MIN_MOMENTS, CameraLayout, layouts_of
+from rigkit.workflows.inputs.layouts import MIN_MOMENTS, CameraLayout, layout_by_names, layouts_of
 
 _log = logging.getLogger(__name__)
 
@@ -78,6 +77,10 @@ def cameras_seen(
     except InputError as error:
         found, doubt = {}, error
     if len(folders) > 1 or len(found) > 1:
+        if len(folders) == 1:
+            _log.info(
+                f"by names the images are of the cameras {', '.join(found)}; --cameras 1 takes them as one camera's"
+            )
         return (found if doubt is None else cameras_in(folders)), corners
     images = images_below(folders[0])
     layouts = layouts_of(images)
@@ -103,17 +106,23 @@ def moments_by_order(
     corners: dict[Path, FoundCorners],
     progress: Progress,
 ) -> bool:
-    """Return whether images of cameras whose names say no moments (DSC_1001.jpg, photo 37.jpg) are of one moment by
-    their order: as many of each camera, where boards move alike (see `on_one_mount`)."""
+    """Return whether images are of one moment by their order: as many of each camera, where boards move alike (see
+    `on_one_mount`), but names say no moments (DSC_1001.jpg, photo 37.jpg), or only for some images and boards do not
+    move alike by these (the counters of two cameras, DSC_1001 to DSC_1013 and DSC_1006 to DSC_1018)."""
     images = {name: images_of_camera(patterns) for name, patterns in cameras.items()}
     if len(images) < 2 or len({len(own) for own in images.values()}) > 1:
         return False
-    with suppress(InputError):
-        frames_of_images({name: list(map(str, own)) for name, own in images.items()})
+    count = len(next(iter(images.values())))
+    named = layout_by_names(images)
+    if named is not None and (len(named.shared) == count or on_one_mount(named, boards, path, corners, progress)):
         return False
     ordered = {name: {f"{k:04d}": image for k, image in enumerate(own)} for name, own in images.items()}
     layout = CameraLayout(ordered, tuple(next(iter(ordered.values()))))
-    if len(layout.shared) < MIN_MOMENTS or not on_one_mount(layout, boards, path, corners, progress):
+    if count < MIN_MOMENTS:
+        return False
+    if not on_one_mount(layout, boards, path, corners, progress):
+        if named is None:
+            _log.info("nor does the order of the images say it: boards do not move alike by it")
         return False
     _log.info("names do not say which images are of one moment: their order does, as boards move alike by it")
     return True

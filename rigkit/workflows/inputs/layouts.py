@@ -67,12 +67,18 @@ def _layout(images: Sequence[Path], names: Sequence[str]) -> CameraLayout | None
     cameras = sorted(set(names), key=natural_key)
     if not 2 <= len(cameras) <= MAX_CAMERAS or not all(map(is_identifier, cameras)):
         return None
-    columns = {camera: [i for i, n in zip(images, names, strict=True) if n == camera] for camera in cameras}
+    layout = layout_by_names(
+        {camera: [i for i, n in zip(images, names, strict=True) if n == camera] for camera in cameras}
+    )
+    return layout if layout and len(cameras) * len(layout.shared) >= MIN_SHARE * len(images) else None
+
+
+def layout_by_names(images: Mapping[str, Sequence[Path]]) -> CameraLayout | None:
+    """Return the layout of the images of each camera by their names; None where these share too few moments."""
     try:
-        frames = frames_of_images({camera: list(map(str, own)) for camera, own in columns.items()})
+        frames = frames_of_images({camera: list(map(str, own)) for camera, own in images.items()})
     except InputError:
         return None
-    moments = {camera: {frames[camera][str(i)]: i for i in own} for camera, own in columns.items()}
+    moments = {camera: {frames[camera][str(i)]: i for i in own} for camera, own in images.items()}
     shared = sorted(set.intersection(*map(set, moments.values())), key=natural_key)
-    enough = len(cameras) * len(shared) >= MIN_SHARE * len(images)
-    return CameraLayout(moments, tuple(shared)) if len(shared) >= MIN_MOMENTS and enough else None
+    return CameraLayout(moments, tuple(shared)) if len(shared) >= MIN_MOMENTS else None

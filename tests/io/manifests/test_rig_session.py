@@ -151,6 +151,8 @@ def test_images_of_one_name_in_many_folders_are_told_apart_by_what_differs() -> 
 def test_images_without_a_common_frame_are_named() -> None:
     with pytest.raises(InputError, match='frames = "order"'):
         frames_of_images({"l": ["a.jpg", "b.jpg"], "r": ["c.jpg", "d.jpg"]})
+    with pytest.raises(InputError, match="as many of every camera in the same order; there are 2 of 'l', 1 of 'r'"):
+        frames_of_images({"l": ["a.jpg", "b.jpg"], "r": ["c.jpg"]})
     with pytest.raises(InputError, match="2 of 'l', 1 of 'r'"):
         frames_of_images({"l": ["a.jpg", "b.jpg"], "r": ["c.jpg"]}, "order")
     with pytest.raises(InputError, match=r"'a1\.jpg' and 'b1\.jpg' of camera 'l'"):

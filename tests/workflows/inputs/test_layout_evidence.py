@@ -159,7 +159,8 @@ def test_images_of_other_moments_are_told_of_early_and_nothing_is_left(
 
 
 def test_the_order_of_images_pairs_them_where_boards_agree(pictures: Path, tmp_path: Path) -> None:
-    """DSC_1001.jpg with photo 37.jpg; in another order, or one image short, the boards do not move alike."""
+    """DSC_1001.jpg with photo 37.jpg; in another order, or one image short, the boards do not move alike. Numbers of
+    two counters that overlap (DSC_1003 with IMG_1003) pair images of other moments."""
     names = {side: sorted(pictures.glob(f"{side}*.jpg"))[:4] for side in ("left", "right")}
     order = (2, 3, 0, 1)
     for k, (left, right) in enumerate(zip(*names.values(), strict=True)):
@@ -167,6 +168,7 @@ def test_the_order_of_images_pairs_them_where_boards_agree(pictures: Path, tmp_p
             ("A", left, f"DSC_10{k:02d}"),
             ("B", right, f"photo {k + 37}"),
             ("other", names["right"][order[k]], f"photo {k + 37}"),
+            ("counter", right, f"IMG_10{k + 1:02d}"),
         ):
             (tmp_path / folder).mkdir(exist_ok=True)
             shutil.copy(source, tmp_path / folder / f"{name}.jpg")
@@ -176,7 +178,14 @@ def test_the_order_of_images_pairs_them_where_boards_agree(pictures: Path, tmp_p
         cameras = cameras_in([tmp_path / folder for folder in folders])
         return moments_by_order(cameras, [BOARD], path, corners, silent)
 
-    assert paired("A", "B") and not paired("A", "other")
+    assert paired("A", "B") and not paired("A", "other") and paired("A", "counter")
+    # Boards agree with the numbers that both cameras have: these count, though the order would pair one more.
+    (tmp_path / "counter").rename(tmp_path / "gaps")
+    for k, image in enumerate(sorted((tmp_path / "gaps").iterdir())):
+        image.rename(tmp_path / "gaps" / f"frame_10{k:02d}.jpg")
+    shutil.copytree(tmp_path / "A", tmp_path / "others")
+    (tmp_path / "others" / "DSC_1003.jpg").rename(tmp_path / "others" / "DSC_1009.jpg")
+    assert not paired("others", "gaps")
     for file, text in session_of_folders([tmp_path / "A", tmp_path / "B"], ["9x6x30"], path, by_order=True).items():
         file.write_text(text)
     assert load_rig_session(path).frames == "order"
