@@ -33,7 +33,7 @@ SIGMA_COMMENT = "sigmas: noise of the image points and of the relative pose"
 WITH_CALIBRATIONS = ", and the covariance of the calibrations"
 SIGMAS_COMMENT = {
     True: f"{SIGMA_COMMENT}{WITH_CALIBRATIONS}",
-    False: f"{SIGMA_COMMENT}; the calibrations count as exact",
+    False: f"{SIGMA_COMMENT}; the calibrations, or one of two, count as exact",
 }
 """Comment about the sigmas, by `OrientedCloud.calibration_in_sigmas`."""
 FROM_ORIGIN_COMMENT = "all points were seen from the origin"

@@ -63,13 +63,15 @@ def grouped_by_moment(columns: Sequence[Sequence[Path]]) -> tuple[ImagesByMoment
 
     Raises InputError where they give none, and the cameras have unequal numbers of images.
     """
+    places = [f"{own[0].parent}" for own in columns]
+    keys = places if len(set(places)) == len(places) else [f"{k}" for k in range(len(places))]
     try:
-        known = frames_of_images({f"{k}": [path.name for path in own] for k, own in enumerate(columns)})
+        known = frames_of_images({key: [path.name for path in own] for key, own in zip(keys, columns, strict=True)})
     except InputError:
         if len({len(own) for own in columns}) > 1:
             raise
         return [list(moment) for moment in zip(*columns, strict=True)], []
-    frames = [{known[f"{k}"][path.name]: path for path in own} for k, own in enumerate(columns)]
+    frames = [{known[key][path.name]: path for path in own} for key, own in zip(keys, columns, strict=True)]
     shared = [frame for frame in frames[0] if all(frame in own for own in frames)]
     if not shared:
         raise InputError(

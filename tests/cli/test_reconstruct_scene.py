@@ -13,11 +13,12 @@ from helpers.epipolar_scenes import REGULAR, pair, pose_errors_deg
 from helpers.textured_scene import Corner
 
 from rigkit.affine.correspondences import Correspondences
+from rigkit.calibration.result import Calibration
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cli.main import main
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.calibrations.calibration_file import save_camera
+from rigkit.io.calibrations.calibration_file import save_calibration, save_camera
 from rigkit.io.corners.correspondences import correspondences_text, read_correspondences
 from rigkit.io.ply import read_ply
 
@@ -83,6 +84,19 @@ def test_other_layouts_of_the_file(files: tuple[Path, Rigid3], layout: str, caps
         assert run(folder, "--correspondences", str(folder / name), "--json", "--no-pictures", "--force") == 0
         results.append(np.array(json.loads(capsys.readouterr().out)["cam2_from_cam1"]))
     np.testing.assert_allclose(results[0], results[1], atol=1e-7)
+
+
+@pytest.mark.parametrize(("second", "stated"), [("camera.json", False), ("calibration.json", True)])
+def test_sigmas_are_said_to_include_the_calibrations_only_where_both_state_one(
+    second: str, stated: bool, files: tuple[Path, Rigid3], calibration: Calibration
+) -> None:
+    folder, _ = files
+    save_calibration(folder / "calibration.json", calibration)
+    cameras = ["--camera", str(folder / "calibration.json"), "--camera2", str(folder / second)]
+    assert (
+        main(["reconstruct", *cameras, "-o", str(folder / "out"), "--correspondences", str(folder / "found.csv")]) == 0
+    )
+    assert read_ply(folder / "out" / "scene.ply").calibration_in_sigmas == stated
 
 
 def pictures_of_a_corner(folder: Path, rng: np.random.Generator) -> tuple[Corner, list[str]]:

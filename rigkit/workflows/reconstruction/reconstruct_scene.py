@@ -134,6 +134,8 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
         shifts = calibration_shifts(scene.reconstruction, *both, pose_is_known=known)
         scene = replace(scene, reconstruction=with_calibrations(scene.reconstruction, shifts))
     r = scene.reconstruction
+    if isinstance(of, tuple) and not all(known is None or known.covariance.any() for known in of):
+        r = replace(r, cloud=replace(r.cloud, calibration_in_sigmas=False))  # One file of two states no uncertainty.
     scene = replace(scene, reconstruction=replace(r, notes=(*notes, *r.notes)))
     files = _files(options, scene, found, images)
     if maps:
