@@ -13,13 +13,15 @@ from rigkit.io.calibrations.history_file import Edition, HistoryEntry, editions
 from rigkit.report import svg
 from rigkit.report.pages.page_facts import PageFacts, build_facts_page
 from rigkit.report.svg import DRAWN_WIDTH, INK, SOFT, WRONG
+from rigkit.report.tables import rounded_words
 from rigkit.validation.monitoring.drift import HeatDrift, heat_drift
 from rigkit.validation.monitoring.verdict import ALARM_CHANCE
 
 DRIFT_HEIGHT, LEFT_MARGIN = 190.0, 56.0
 ZERO_HEIGHT = 0.5 * (DRIFT_HEIGHT - 24.0)
 CONTROL_SIGMAS = 3.0
-"""Control limits, which an amount exceeds in one of 370 checks of an unchanged camera."""
+"""Control limits, which an amount exceeds in one of 370 checks of an unchanged camera if all sigmas hold. Verdicts have
+p-values of simulated checks, which also count few frames and what lens models leave out."""
 
 
 def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
@@ -44,7 +46,8 @@ def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
         passed=not bad,
         sentences=(
             "Each quantity as if it alone had changed since the calibration, with its standard deviation. Dashed: "
-            "control limits (three standard deviations of each entry). Red: alarms.",
+            "control limits (three standard deviations of each entry). Red: entries that do not hold; all frames together "
+            "decide that by their p-value, so that single amounts may lie beyond their limits.",
             *overwritten(kept),
         ),
         tables=(*_heat_tables(kept), _history_table(entries)),
@@ -111,7 +114,7 @@ def _heat_tables(kept: Sequence[Edition]) -> tuple[Table, ...]:
             if heat is not None:
                 low, high = own[0].temperature_c, own[-1].temperature_c
                 what, _, unit = name.rpartition(", ")
-                message = f"{heat.per_degree:+.2g} ± {heat.sigma:.1g} {unit} per °C"
+                message = f"{rounded_words(heat.per_degree, heat.sigma)} {unit} per °C"
                 rows.append(
                     cells(f"{edition.name}: {what}" if len(kept) > 1 else what)
                     + cells(Cell(message, best=heat.chance < ALARM_CHANCE), f"{heat.chance:.2g}")
@@ -141,7 +144,9 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
         )
     y = ZERO_HEIGHT * (1.0 - value / top)
     out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{INK}" stroke-opacity="0.4"/>')
-    return "".join([*out, *_points(own, name, x, top), *_x_labels(x, [entry.date[:10] for entry in own]), "</svg>"])
+    of_one_day = own[0].date[:10] == own[-1].date[:10]
+    labels = [entry.date[11:16] if of_one_day else entry.date[:10] for entry in own]
+    return "".join([*out, *_points(own, name, x, top), *_x_labels(x, labels), "</svg>"])
 
 
 def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -70,8 +71,10 @@ def test_amounts_follow_the_temperature() -> None:
 def test_the_page_and_what_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     warm = [entry(k, "a", 0.01 * (k - 5), 15.0 + k) for k in range(1, 10)]
     page = history_page(warm, "cam", {})
-    assert "focus, %: against temperature" in page and "+0.01 ± 0.003 % per °C" in page
-    assert "is another file" not in page
+    assert "focus, %: against temperature" in page and "0.0100 ± 0.0026 % per °C" in page
+    assert "is another file" not in page and ">2026-03-01</text>" in page
+    one_day = [replace(warm[0], date=f"2026-03-01T{hour:02d}:30:00Z") for hour in (8, 14)]
+    assert all(label in history_page(one_day, "cam", {}) for label in (">08:30</text>", ">14:30</text>"))
     calibration, register = tmp_path / "cam.json", tmp_path / "cam.jsonl"
     calibration.write_text("one")
     one = hashlib.sha256(b"one").hexdigest()
