@@ -8,7 +8,7 @@ import pytest
 
 from rigkit.core.errors import InputError
 from rigkit.interop.ros import read_camera_info
-from rigkit.workflows.inputs.camera_files import import_camera
+from rigkit.workflows.inputs.camera_files import import_camera, import_rig
 
 OST = """# oST version 5.0 parameters
 
@@ -56,6 +56,8 @@ def test_ost_txt_of_ros(model: str, distortion: str, tmp_path: Path) -> None:
     camera = import_camera(tmp_path / "ost.txt")
     assert (camera.model, camera.size_px) == (model, (640, 480))
     assert camera.parameters.tolist() == [500.5, 501.5, 320.25, 240.75, *(float(d) for d in distortion.split())]
+    with pytest.raises(InputError, match=r"ost.txt': one camera of ROS, no rig"):
+        import_rig(tmp_path / "ost.txt")
 
 
 @pytest.mark.parametrize(

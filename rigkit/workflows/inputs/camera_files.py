@@ -209,9 +209,10 @@ def import_rig(path: str | Path, *, size_px: tuple[int, int] | None = None) -> d
         return load_rig(path)
     if COLMAP_RIG.search(text):
         return read_colmap_rig(text, name, size_px)
+    one = " one camera of ROS," if kind == "ros" else ""
     raise InputError(
-        f"'{name}': no rig of rigkit, Kalibr (camchain), OpenCV (M1, D1, M2, D2, R, T), COLMAP or MATLAB; check the "
-        "file"
+        f"'{name}':{one} no rig of rigkit, Kalibr (camchain), OpenCV (M1, D1, M2, D2, R, T), COLMAP or MATLAB; check "
+        "the file"
     )
 
 
