@@ -26,7 +26,7 @@ from rigkit.detection.duplicate_marks import duplicate_boards
 from rigkit.detection.lattices import MIN_BOARD_CORNERS
 from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.corners.corners_file import write_corners
-from rigkit.io.disk.reading import about
+from rigkit.io.disk.reading import about, paths_of
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.io.media.images import (
     folder_of_images,
@@ -79,7 +79,7 @@ class _DetectJob:
 
 
 def detect_in_images(
-    paths: Sequence[str | Path], options: DetectOptions | None = None, *, progress: Progress = silent
+    paths: str | Path | Sequence[str | Path], options: DetectOptions | None = None, *, progress: Progress = silent
 ) -> DetectionResult:
     """Detect the boards of images, videos, and folders of either, and write what `options` ask for.
 
@@ -96,7 +96,7 @@ def detect_in_images(
         )
     process_count(options.jobs)  # an impossible number of jobs is refused before the work
     boards = tuple(board_of_words(str(board)) for board in options.boards)
-    given = [one for path in paths for one in videos_inside(Path(path))]
+    given = [one for path in paths_of(paths) for one in videos_inside(path)]
     videos, bad = _frames_of(list(filter(is_video, given)), boards, progress)
     if bad and len(given) == len(bad) == 1:
         raise next(iter(bad.values()))

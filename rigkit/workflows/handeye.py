@@ -26,7 +26,7 @@ from rigkit.geometry.board_pose import BoardPose, board_poses
 from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.calibrations.calibration_file import load_calibration
 from rigkit.io.disk.json_reader import json_text
-from rigkit.io.disk.reading import about
+from rigkit.io.disk.reading import about, paths_of
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.io.manifests.robot_poses import read_robot_poses
 from rigkit.io.media.images import read_image_of
@@ -82,7 +82,11 @@ class PlacedCamera:
 
 
 def calibrate_hand_eye(
-    poses: str | Path, images: Sequence[str | Path], options: HandEyeOptions, *, progress: Progress = silent
+    poses: str | Path,
+    images: str | Path | Sequence[str | Path],
+    options: HandEyeOptions,
+    *,
+    progress: Progress = silent,
 ) -> HandEyeCalibration:
     """Return the hand-eye calibration from the robot's poses (CSV, by image) and images of a board, or folders of them.
 
@@ -92,7 +96,7 @@ def calibrate_hand_eye(
     half turn, poses that contradict the images; CheckFailed: no image shows the board; DegenerateError: too few images,
     or rotations about one axis only.
     """
-    paths = list(images_in([Path(path) for path in images]))
+    paths = list(images_in(paths_of(images)))
     ensure_writable(options.output, force=options.force, inputs=[poses, *paths, options.camera, options.board])
     robot = read_robot_poses(poses, [path.name for path in paths])
     missing = [path.name for path in paths if path.name not in robot]

@@ -19,7 +19,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.identifiers import known_name
 from rigkit.core.printing import brief, counted
 from rigkit.core.progress import Progress, silent
-from rigkit.io.disk.reading import about
+from rigkit.io.disk.reading import about, paths_of
 from rigkit.io.disk.writing import ensure_writable, npz_bytes, write_atomic, write_together
 from rigkit.io.media.images import Image, quiet_opencv, read_image_of, require_pixels, require_size
 from rigkit.io.media.video import Video, is_video
@@ -97,7 +97,7 @@ def rectify_image(
     An image that cannot be read or has another size goes into `failures`; its error is raised if it is the only image.
     Raises InputError for a view outside the camera's field, a damaged calibration, or a file that cannot be written.
     """
-    given = [Path(image)] if isinstance(image, str | Path) else [Path(one) for one in image]
+    given = paths_of(image)
     if holds_several(given) and options.output.suffix:
         what = "are several images" if len(given) > 1 else "is a folder" if given[0].is_dir() else "is a video"
         named = f"'{given[0]}'" + (", ..." if len(given) > 1 else "")

@@ -14,6 +14,8 @@ from helpers.detection_scenes import single
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.io.corners.corners_file import read_corners
+from rigkit.workflows.detect import detect_in_images
+from rigkit.workflows.options.cameras import DetectOptions, FolderOptions
 
 BOARD_TOML = """schema = "rigkit.board/1"
 columns = 9
@@ -150,6 +152,15 @@ def test_parts_of_a_larger_board_are_not_taken_for_the_given_one(
 ) -> None:
     assert main(["detect", str(images / "0.png"), "--board", "5x4x30", "--jobs", "1"]) == 0
     assert "seen whole: in 1 image 9 x 6 inner corners are seen, 5 x 4 are declared" in capsys.readouterr().err
+
+
+def test_a_single_folder_and_board_need_no_list_in_python(images: Path) -> None:
+    one, listed = (
+        detect_in_images(folder, DetectOptions(boards=board, jobs=1))  # type: ignore[arg-type]
+        for folder, board in ((str(images), "9x6x30"), ([images], (Path("9x6x30"),)))
+    )
+    assert one.found.keys() == listed.found.keys() and len(one.found) == 3
+    assert FolderOptions(boards="9x6x30") == FolderOptions(boards=("9x6x30",))  # type: ignore[arg-type]
 
 
 def test_images_of_a_larger_board_are_told_though_others_show_the_given_one(

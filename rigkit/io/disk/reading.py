@@ -10,7 +10,7 @@ import io
 import math
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -31,6 +31,11 @@ MIN_POSITIVE = 1e-9
 def is_file_or_broken_link(path: Path) -> bool:
     """Return whether a folder's entry is a file or a broken link, which its reader reports."""
     return path.is_file() or (path.is_symlink() and not path.exists())
+
+
+def paths_of(given: str | Path | Sequence[str | Path]) -> list[Path]:
+    """Return paths; a single one need not be in a list."""
+    return [Path(given)] if isinstance(given, str | Path) else [Path(one) for one in given]
 
 
 def usable_path(path: str | Path) -> Path:

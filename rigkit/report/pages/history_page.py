@@ -46,8 +46,8 @@ def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
         passed=not bad,
         sentences=(
             "Each quantity as if it alone had changed since the calibration, with its standard deviation. Dashed: "
-            "control limits (three standard deviations of each entry). Red: entries that do not hold; all frames together "
-            "decide that by their p-value, so that single amounts may lie beyond their limits.",
+            "control limits (three standard deviations of each entry). Red: entries that do not hold; the p-value of "
+            "all frames together decides it, so that single amounts may lie beyond their limits.",
             *overwritten(kept),
         ),
         tables=(*_heat_tables(kept), _history_table(entries)),

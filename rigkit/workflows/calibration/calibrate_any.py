@@ -14,7 +14,7 @@ from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.progress import Progress, silent
 from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.corners.corner_cache import FoundCorners
-from rigkit.io.disk.reading import about, read_bytes, read_text, usable_path
+from rigkit.io.disk.reading import about, paths_of, read_bytes, read_text, usable_path
 from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.manifests.rig_session import RigSession, load_any_session
 from rigkit.io.manifests.session import SESSION_NAME, Session, beside_session
@@ -103,7 +103,7 @@ def calibrate_session_file(
 
 
 def calibrate_folders(
-    folders: Sequence[str | Path],
+    folders: str | Path | Sequence[str | Path],
     folder_options: FolderOptions,
     options: CalibrateOptions,
     *,
@@ -118,7 +118,8 @@ def calibrate_folders(
     Raises InputError: no board given, no images, a file that cannot be written, and as `calibrate_session_file`;
     DegenerateError: the views do not determine a camera.
     """
-    given = [inside for folder in folders for inside in videos_inside(Path(folder))]
+    folders = paths_of(folders)
+    given = [inside for folder in folders for inside in videos_inside(folder)]
     videos = _videos_of(given, options.output)
     if videos and folder_options.cameras not in (None, len(videos)):
         raise InputError(f"calibrate: --cameras {folder_options.cameras}, but the videos are of {len(videos)}")

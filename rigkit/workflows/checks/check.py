@@ -36,7 +36,7 @@ from rigkit.io.calibrations.calibration_file import (
 from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, ensure_register, path_from_register
 from rigkit.io.calibrations.rig_file import is_rig_file, load_saved_rig
 from rigkit.io.disk.json_reader import json_text
-from rigkit.io.disk.reading import about, read_text
+from rigkit.io.disk.reading import about, paths_of, read_text
 from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.media.images import read_image_of
 from rigkit.report.pages.check_page import check_facts, check_page
@@ -82,7 +82,11 @@ class CheckedPictures:
 
 
 def check_pictures(
-    path: str | Path, images: Sequence[str | Path], options: CheckOptions | None = None, *, progress: Progress = silent
+    path: str | Path,
+    images: str | Path | Sequence[str | Path],
+    options: CheckOptions | None = None,
+    *,
+    progress: Progress = silent,
 ) -> CheckedPictures:
     """Check a calibration or a rig with fresh images, or folders of them; for a rig as for `moments_of`.
 
@@ -96,7 +100,7 @@ def check_pictures(
     warn_if_bad(source)
     if not images:
         raise InputError("check: give new images, or a folder of them")
-    now, single = moments_of(monitored.names, [Path(image) for image in images])
+    now, single = moments_of(monitored.names, paths_of(images))
     before, alone = moments_of(monitored.names, options.before) if options.before else ([], [])
     inputs = [source, *(image for frame in (*now, *before) for image in frame)]
     ensure_writable((options.fix, options.report), force=options.force, inputs=inputs)

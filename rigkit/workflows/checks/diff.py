@@ -13,7 +13,7 @@ from rigkit.cameras.compare import CameraDifference, compare_cameras
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.io.calibrations.rig_file import SavedRig, is_board_rigs_file, is_rig_file, load_board_rigs
-from rigkit.io.disk.reading import about
+from rigkit.io.disk.reading import about, paths_of
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.report.pictures.figures import difference_png
 from rigkit.workflows.inputs.camera_files import (
@@ -84,12 +84,12 @@ class BoardsPair:
         return all(target.same is not False for target in self.targets.values())
 
 
-def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | RigPair | BoardsPair:
+def diff(a: str | Path, b: str | Path, options: DiffOptions | None = None) -> CameraPair | RigPair | BoardsPair:
     """Compare two files of calibrations, of rigs, or of boards on one mount.
 
     Raises InputError for files of different kinds, rigs of other cameras or boards, or a map that cannot be written.
     """
-    options = options or DiffOptions()
+    (a, b), options = paths_of((a, b)), options or DiffOptions()
     ensure_writable(options.report, force=options.force, inputs=(a, b))
     boards = [is_board_rigs_file(path) for path in (a, b)]
     if any(boards):

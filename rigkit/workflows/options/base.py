@@ -5,7 +5,8 @@ from pathlib import Path
 
 
 class NamesFiles:
-    """Base of option dataclasses: converts strings in fields of type Path."""
+    """Base of option dataclasses: strings become paths in fields of type Path, and a single value need not be in a
+    tuple."""
 
     __slots__ = ()
 
@@ -14,6 +15,10 @@ class NamesFiles:
             value = getattr(self, field.name)
             if isinstance(value, str) and field.type in (Path, Path | None, "Path", "Path | None"):
                 object.__setattr__(self, field.name, Path(value))
+            elif isinstance(value, str | Path) and field.type in (tuple[Path, ...], "tuple[Path, ...]"):
+                object.__setattr__(self, field.name, (Path(value),))
+            elif isinstance(value, str) and field.type in (tuple[str, ...], "tuple[str, ...]"):
+                object.__setattr__(self, field.name, (value,))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
