@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from rigkit.core.findings import Finding, Severity
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.manifests.manifest import Dataset
+from rigkit.io.media.images import to_grey
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.board_planes import BoardPlanes
 from rigkit.reconstruction.calibration_shifts import CalibrationShifts, with_calibrations
@@ -27,6 +28,7 @@ from rigkit.report.pages.page_facts import PageFacts
 from rigkit.report.pages.validation_page import PairSection, pair_section
 from rigkit.report.pictures.drawings import normal_errors_svg, residuals_svg
 from rigkit.report.pictures.figures import pair_jpeg, pair_pictures
+from rigkit.validation.board_ends import contradicted_counts
 from rigkit.validation.checks import ValidationReport, validate_each
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.validation.diagnose import diagnose, diagnose_cameras
@@ -165,6 +167,8 @@ def _validated(
     fitted = _fitted_planes(geometry, job)
     known = [shifts[m] for m in reconstructions]
     reports = validate_each(list(reconstructions.values()), pair.truth, known, fitted, pair.layout)
+    counts = contradicted_counts(matched, [to_grey(image) for image in (image1, image2)])
+    reports = tuple(replace(report, checks=(*report.checks, *counts)) for report in reports)
     best = best_report(reports)
     files: dict[str, bytes] = {
         f"{pair.pair_id}/{method}.ply": ply_bytes(with_calibrations(r, shifts[method]).cloud)

@@ -1,0 +1,118 @@
+"""Check the declared numbers of columns and rows of chessboards against where the boards end in both images.
+
+A smaller board passes for a part of the declared one. The colours of its squares alternate up to the line on which the
+declaration has further corners, and no further. A cover alternates nowhere, and rarely ends on such a line; in two
+images from different places it does so only if it lies on the board.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, IntArray, Pixels
+from rigkit.core.boards import Board
+from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.detection.saddles.response import sample
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.reconstruction.pairing import MatchedPair
+from rigkit.validation.check import Check
+from rigkit.validation.declarations import MAX_DECLARED_SIGMAS
+
+BESIDE_LINE = 0.15
+"""Distance from the line of an end, in squares, at which colours are compared: 2 px or more where corners are found,
+so that blur leaves most of the contrast; the pose predicts the line several times better."""
+HALF_CONTRAST = 0.5
+"""Contrast over that of the squares of the last corners: 1 within a square, 0 beyond the board, -1 in a next square."""
+MIN_SHARE_ENDING = 0.75
+"""Share of the pairs of squares along a side whose contrast ends there; single ones may be covered or in glare."""
+MIN_PAIRS_IN_IMAGE = 3
+"""Smallest number of such pairs within an image: two of noise end there by chance once in twenty times."""
+
+
+def contradicted_counts(pair: MatchedPair, images: Sequence[NDArray[Any]]) -> tuple[Check, ...]:
+    """Return a failed check for every chessboard with fewer columns or rows than declared.
+
+    Both ends of its columns (rows) must be visible in at least one of the two images (H, W), and no image that has
+    room for more may show anything else there.
+    """
+    moves = Rigid3.identity(), pair.identity.cam2_from_cam1
+    cameras = pair.camera1, pair.camera2
+    by_id = {board.board_id: board for board in pair.boards}
+    checks = []
+    for detections in pair.identity.pairs():
+        board = by_id[str(detections[0].board_id)]
+        if not isinstance(board.pattern, Chessboard):
+            continue
+        pose = pair.identity.cam1_from_board[board.board_id]
+        views = [(image, camera, move @ pose) for image, camera, move in zip(images, cameras, moves, strict=True)]
+        grid = np.concatenate([detection.grid for detection in detections])
+        corners = grid.min(axis=0), grid.max(axis=0)
+        count = np.ptp(grid, axis=0) + 1
+        short = [
+            axis
+            for axis in (0, 1)
+            if count[axis] < board.size[axis] and all(_ends(views, board, corners, axis, up) for up in (False, True))
+        ]
+        size = " x ".join(str(count[axis] if axis in short else board.size[axis]) for axis in (0, 1))
+        checks += [_check(board, axis, int(count[axis]), size, len(grid)) for axis in short]
+    return tuple(checks)
+
+
+def _ends(
+    views: Sequence[tuple[NDArray[Any], Camera, Rigid3]],
+    board: Board,
+    corners: tuple[IntArray, IntArray],
+    axis: int,
+    up: bool,
+) -> bool:
+    """Return whether a board ends one square beyond its last corners along an axis (`up`), or before its first; views:
+    image, camera, and its pose of the board."""
+    first, last = corners
+    edge, out = (last[axis], 1.0) if up else (first[axis], -1.0)
+    along = np.arange(first[1 - axis] - 1, last[1 - axis] + 1) + 0.5
+    places = np.empty((3, len(along), 2))
+    places[..., 1 - axis] = along
+    places[..., axis] = (edge + out * np.array([0.5, 1.0 - BESIDE_LINE, 1.0 + BESIDE_LINE]))[:, None]
+    points = np.concatenate([places * board.squares_mm, np.zeros((*places.shape[:-1], 1))], axis=-1)
+    found = [_ends_in(image, *camera.project(pose.apply(points))) for image, camera, pose in views]
+    return any(found) and all(one is not False for one in found)
+
+
+def _ends_in(image: NDArray[Any], pixels: Pixels, valid: BoolArray) -> bool | None:
+    """Return whether the contrast of adjacent squares ends between the second and third row of pixels (3, N, 2), of
+    which the first is in their middle; None if too few are in the image."""
+    inside = valid & ((pixels >= 0.0) & (pixels <= np.array(image.shape[::-1]) - 1.0)).all(axis=-1)
+    pairs = (inside[:, 1:] & inside[:, :-1]).all(axis=0)
+    if np.count_nonzero(pairs) < MIN_PAIRS_IN_IMAGE:
+        return None
+    levels = sample(image, np.where(inside[..., None], pixels, 0.0)).astype(np.float64)
+    square, before, beyond = np.diff(levels, axis=1)[:, pairs]
+    enough = HALF_CONTRAST * np.median(np.abs(square))
+    ending = (before * np.sign(square) > enough) & (np.abs(beyond) < enough)
+    return bool(ending.mean() >= MIN_SHARE_ENDING)
+
+
+def _check(board: Board, axis: int, count: int, size: str, corners: int) -> Check:
+    """Return the failed check of the number of columns (axis 0) or rows, which has no uncertainty."""
+    declared = board.size[axis]
+    return Check(
+        name=f"{('columns', 'rows')[axis]} {board.board_id}",
+        kind="board size",
+        unit="corners",
+        measured=float(declared),
+        measured_sigma=0.0,
+        how=f"declared; the images show where {size} inner corners end: correct the board file",
+        ours=float(count),
+        our_sigma=0.0,
+        difference=float(count - declared),
+        combined_sigma=(declared - count) / MAX_DECLARED_SIGMAS,
+        k=MAX_DECLARED_SIGMAS,
+        limit_k=0.0,
+        passed=False,
+        count=corners,
+    )

@@ -1,0 +1,88 @@
+"""A chessboard declared with more columns or rows than both images show ends there is contradicted; a cover is not."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers.board_scenes import regular_camera
+from helpers.reconstructions import BOARDS
+from numpy.typing import NDArray
+
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.posetype import PoseType
+from rigkit.reconstruction.pairing import match_pair
+from rigkit.synthetic.pairs import StereoScene, trihedral_pair
+from rigkit.validation.board_ends import contradicted_counts
+from rigkit.validation.check import Check
+
+Shown = tuple[StereoScene, tuple[NDArray[Any], NDArray[Any]]]
+COLUMNS, ROWS = BOARDS[0].size
+
+
+@functools.cache
+def shown() -> Shown:
+    rng = np.random.default_rng(5)
+    scene = trihedral_pair(BOARDS, regular_camera(), PoseType.STANDARD, rng, distance=(1.0, 1.4), walls=False)
+    return scene, scene.images()
+
+
+def contradicted(
+    images: tuple[NDArray[Any], NDArray[Any]],
+    declared: Board,
+    kept: Callable[[BoardDetection], BoardDetection] | None = None,
+) -> tuple[Check, ...]:
+    """Check the pair with its first board `declared`, and its corners as `kept` leaves them."""
+    scene, _ = shown()
+    first, second = ([(kept or (lambda d: d))(found[0]), *found[1:]] for found in scene.detections())
+    pair = match_pair("made", scene.camera1, scene.camera2, first, second, [declared, *BOARDS[1:]])
+    assert declared.board_id in [board.board_id for board in pair.boards]
+    return contradicted_counts(pair, images)
+
+
+@pytest.mark.parametrize(("more", "name"), [((2, 0), "columns"), ((0, 1), "rows")])
+def test_a_board_that_ends_before_its_declared_corners_fails_with_its_size(more: tuple[int, int], name: str) -> None:
+    _, images = shown()
+    declared = replace(BOARDS[0], columns=COLUMNS + more[0], rows=ROWS + more[1])
+    (check,) = contradicted(images, declared)
+    assert not check.passed and check.kind == "board size" and check.name == f"{name} {declared.board_id}"
+    axis = more.index(max(more))
+    assert (check.measured, check.ours) == (declared.size[axis], BOARDS[0].size[axis])
+    assert f"{COLUMNS} x {ROWS}" in check.how
+
+
+@pytest.mark.parametrize("depth", [0.75, 1.3, 3.0])
+def test_a_cover_over_the_last_columns_of_both_images_contradicts_nothing(depth: float) -> None:
+    """It ends `depth` squares beyond the last corner that is left: of a board as declared, and of one with one
+    more column. At 3 it is beside the board, of which corners were not found."""
+    scene, images = shown()
+    covered = []
+    for image, found in zip(images, scene.detections(), strict=True):
+        corners = found[0].lattice().astype(np.float32)
+        square = [[0, 0], [COLUMNS - 1, 0], [COLUMNS - 1, ROWS - 1], [0, ROWS - 1]]
+        at = np.array([corners[row, column] for column, row in square])
+        onto = cv2.getPerspectiveTransform(np.array(square, np.float32), at)
+        edge = COLUMNS - 3 + depth
+        cover = np.array([[[edge, -2], [COLUMNS + 1, -2], [COLUMNS + 1, ROWS + 1], [edge, ROWS + 1]]], np.float32)
+        painted: NDArray[np.uint8] = image.astype(np.uint8)
+        cv2.fillPoly(painted, np.round(cv2.perspectiveTransform(cover, onto)).astype(np.int32), (128,))
+        covered.append(painted)
+
+    def left(found: BoardDetection) -> BoardDetection:
+        seen = found.grid[:, 0] < COLUMNS - 2
+        kept = found.grid[seen], found.pixels[seen], found.sigma_px[seen]
+        return BoardDetection(found.board_id, COLUMNS - 2, ROWS, *kept)
+
+    for more in (0, 1):
+        declared = replace(BOARDS[0], columns=COLUMNS + more)
+        assert contradicted((covered[0], covered[1]), declared, left) == ()
+
+
+def test_what_is_declared_and_seen_contradicts_nothing() -> None:
+    assert contradicted(shown()[1], BOARDS[0]) == ()
