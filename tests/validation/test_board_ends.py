@@ -71,7 +71,7 @@ def test_a_cover_over_the_last_columns_of_both_images_contradicts_nothing(depth:
         edge = COLUMNS - 3 + depth
         cover = np.array([[[edge, -2], [COLUMNS + 1, -2], [COLUMNS + 1, ROWS + 1], [edge, ROWS + 1]]], np.float32)
         painted: NDArray[np.uint8] = image.astype(np.uint8)
-        cv2.fillPoly(painted, np.round(cv2.perspectiveTransform(cover, onto)).astype(np.int32), (128,))
+        cv2.fillPoly(painted, [np.round(cv2.perspectiveTransform(cover, onto)).astype(np.int32)], 128.0)
         covered.append(painted)
 
     def left(found: BoardDetection) -> BoardDetection:

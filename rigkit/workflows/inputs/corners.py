@@ -89,10 +89,11 @@ def session_views(
             dropped.append((name, reason))
     wrong = other_size({name: item.detections for name, item in found.items()}, session.boards)
     if wrong is not None:
+        # Nobody reads why the first calibration fails.
+        wrong = (_other_size_undeclared(session) if corners.source else None) or wrong
         raise InputError(f"{session.path}: {wrong}; correct columns and rows in --board or the board file")
     if not views:
         reasons = Counter(reason for _, reason in dropped).most_common(1)[0]
-        # Nobody reads why the first calibration fails.
         shown = why_not_detected(session.images, session.boards) if corners.source else None
         alone = "look whether that camera saw the boards, else leave it out; or " if session.whose else ""
         raise InputError(
@@ -100,6 +101,15 @@ def session_views(
             + (shown or f"{reasons[1]} times: {reasons[0]}; {alone}check columns and rows in the board file")
         )
     return views, size_px, dropped
+
+
+def _other_size_undeclared(session: Session) -> str | None:
+    """Return `other_size` of corners detected as of no declared board: in some images a larger board passes for one."""
+    paths = named_images(session)
+    unknown = replace(session, boards=())
+    found = in_threads(lambda path: _found_or_error(path, unknown, None), list(paths.values()))
+    seen = {name: one.detections for name, one in zip(paths, found, strict=True) if not isinstance(one, InputError)}
+    return other_size(seen, session.boards)
 
 
 def _common_size(session: Session, found: Mapping[str, FoundCorners]) -> tuple[int, int]:
