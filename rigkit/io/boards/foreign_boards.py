@@ -3,6 +3,7 @@ the settings of OpenCV's calibration sample (XML or YAML)."""
 
 from __future__ import annotations
 
+import logging
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,6 +18,14 @@ FOREIGN_SUFFIXES = (".yaml", ".yml", ".xml")
 
 Values = dict[str, Any]
 INCH_MM = 25.4
+YES, NO = ("true", "yes", "on", "1"), ("false", "no", "off", "0", "", "none")
+"""Words of YAML and C for a truth value, also in quotes."""
+KALIBR_TAGS = "tagrows", "tag_rows", "tagcols", "tag_cols", "tagsize", "tag_size", "tagspacing", "tag_spacing"
+KALIBR_GRIDS = "targetcols", "targetrows", "rowspacingmeters", "colspacingmeters", "spacingmeters", "asymmetricgrid"
+KALIBR_KEYS = {"target_type", "codeoffset", *KALIBR_TAGS, *KALIBR_GRIDS}
+"""Keys of Kalibr's target.yaml, in lower case."""
+
+_log = logging.getLogger(__name__)
 
 
 def foreign_board(path: str | Path) -> Values | None:
@@ -36,6 +45,8 @@ def foreign_board(path: str | Path) -> Values | None:
     values = settings if isinstance(settings := values.get("Settings"), dict) else values
     for known, read in READERS:
         if known in values:
+            if read is _kalibr:
+                _name_unused(values, source)
             try:
                 return read(values)
             except NotImplementedError as error:
@@ -60,7 +71,10 @@ def _kalibr(values: Mapping[str, Any]) -> Values:
             _first_of(values, f"tag{axis_name}", f"tag_{axis_name.lower()}") for axis_name in ("Rows", "Cols")
         )
         size, spacing = _first_of(values, "tagSize", "tag_size"), _first_of(values, "tagSpacing", "tag_spacing")
-        return {"type": "aprilgrid", "columns": columns, "rows": rows, "tag_mm": _mm(size), "spacing": float(spacing)}
+        # A line of older files of Kalibr's, and of forks.
+        first = {"first_tag": values["codeOffset"]} if "codeOffset" in values else {}
+        target = {"columns": columns, "rows": rows, "tag_mm": _mm(size), "spacing": float(spacing), **first}
+        return {"type": "aprilgrid", **target}
     # Kalibr counts the inner corners of checkerboards, as rigkit does.
     size = {"columns": values["targetCols"], "rows": values["targetRows"]}
     if kind == "checkerboard":
@@ -69,7 +83,7 @@ def _kalibr(values: Mapping[str, Any]) -> Values:
         }
         return {**size, **sides}
     if kind == "circlegrid":
-        return _circles(size, _mm(values["spacingMeters"]), asymmetric=bool(values.get("asymmetricGrid")))
+        return _circles(size, _mm(values["spacingMeters"]), asymmetric=_yes(values.get("asymmetricGrid", False)))
     raise NotImplementedError(f"target_type {kind}")
 
 
@@ -150,6 +164,22 @@ def _caliscope(source: Path) -> Values | None:
 
 def _first_of(values: Mapping[str, Any], *names: str) -> Any:
     return next(values[name] for name in (*names, names[0]) if name in values or name == names[-1])
+
+
+def _yes(value: Any) -> bool:
+    """Return a value that may stand in quotes; raises ValueError for one that is neither yes nor no."""
+    word = str(value).strip().lower()
+    if word not in YES + NO:
+        raise ValueError(f"'{value}' is neither true nor false")
+    return word in YES
+
+
+def _name_unused(values: Mapping[str, Any], source: Path) -> None:
+    """Log the keys of a target of Kalibr's that no reader uses: forks have more of them."""
+    # Keys in lower case come first, of which the file has the other.
+    unused = {key.lower(): key for key in values if key.lower() not in KALIBR_KEYS}
+    if unused:
+        _log.warning("'%s': not used: %s; look whether they describe another board", source, ", ".join(unused.values()))
 
 
 def _mm(metres: Any) -> float:

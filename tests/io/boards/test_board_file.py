@@ -65,6 +65,7 @@ def test_boards_in_words() -> None:
 
 KALIBR = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.088\ntagSpacing: 0.3\n"
 CHECKERS = "target_type: checkerboard\ntargetCols: 7\ntargetRows: 6\nrowSpacingMeters: 0.05\ncolSpacingMeters: 0.06\n"
+DOTS = "target_type: circlegrid\ntargetCols: 7\ntargetRows: 6\nspacingMeters: 0.02\nasymmetricGrid: False\n"
 BOOFCV = "boofcv.alg.fiducial.calib.ConfigCalibrationTarget:\n  grid: {numRows: 7, numCols: 5, shapeSize: 30.0}\n"
 HEXAGONAL = (
     "boofcv.alg.fiducial.calib.ConfigCalibrationTarget:\n  type: CIRCLE_HEXAGONAL\n"
@@ -89,6 +90,10 @@ OPENCV_YAML = (
     ("name", "text", "size", "squares", "pattern"),
     [
         ("target.yaml", KALIBR, (12, 10), (88.0, 88.0), AprilGrid(0.3)),
+        ("offset.yaml", KALIBR + "codeOffset: 7\n", (12, 10), (88.0, 88.0), AprilGrid(0.3, first_tag=7)),
+        ("regular.yaml", DOTS, (7, 6), (20.0, 20.0), Circles()),
+        ("quoted.yaml", DOTS.replace("False", '"False"'), (7, 6), (20.0, 20.0), Circles()),
+        ("asymmetric.yaml", DOTS.replace("False", "'True'"), (7, 6), (40.0, 40.0), Circles("asymmetric")),
         ("checkers.yaml", CHECKERS, (7, 6), (60.0, 50.0), Chessboard()),
         ("calibration_target.yaml", BOOFCV, (4, 6), (30.0, 30.0), Chessboard()),
         ("hexagonal.yaml", HEXAGONAL, (14, 24), (1.2, 1.2), Circles("hexagonal", "left", 1.0)),
@@ -108,10 +113,22 @@ def test_target_files_of_other_tools(
     assert board.pattern == pattern
 
 
+def test_keys_of_other_tools_that_are_not_used_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "target.yaml"
+    path.write_text(KALIBR)
+    load_board(path)
+    assert not caplog.messages
+    path.write_text(KALIBR + "tagFamily: 16h5\nblackBorder: 1\n")
+    load_board(path)
+    (words,) = caplog.messages
+    assert "not used: tagFamily, blackBorder;" in words
+
+
 def test_other_files_are_refused(tmp_path: Path) -> None:
     for name, text in (
         ("a.yaml", "cam0: {}\n"),
         ("b.yaml", "target_type: aprilgrid\n"),
+        ("neither.yaml", DOTS.replace("False", "maybe")),
         ("odd.yaml", HEXAGONAL.replace("28", "27")),
         ("c.xml", "<a>1</a>"),
     ):
