@@ -178,7 +178,7 @@ def _inverted_or_aruco_grids(
     for inverted in (False, True) if not grids and not determined else ():
         aruco = TagObservations(ARUCO_TAGS, inverted=inverted)
         for k, image in enumerate(images):
-            aruco.read_lone_tags(k, image)
+            aruco.look(k, image)
         grids = grids or guessed_grids(aruco)
     return grids
 

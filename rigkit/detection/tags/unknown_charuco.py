@@ -39,6 +39,10 @@ nearly all do, or few by chance."""
 SURE_OF_KIND = 2
 """Number of images with markers after which only kinds seen before are read."""
 
+DIAGONAL = 0.5
+"""Smallest ratio of the distances, along rows and along columns, of two diagonally adjacent markers: it is 1, and 0 for
+markers in one row or column."""
+
 OFF_SQUARE = 0.2
 """Largest distance, in squares, of a marker's middle from that of its square as predicted by another marker."""
 
@@ -118,9 +122,12 @@ def _in_squares(quads: FloatArray, numbers: IntArray) -> Markers | None:
     # Positions of the others (second index) relative to each marker, in its sides from its middle.
     offset = seen[..., :2] / seen[..., 2:] - 0.5
     distance = np.linalg.norm(offset, axis=2) + np.where(np.eye(len(middle)) > 0.0, np.inf, 0.0)
-    nearest = offset[np.arange(len(middle)), distance.argmin(axis=1)]
-    # The nearest marker is diagonally adjacent.
-    step = float(np.median(np.abs(nearest)))
+    nearest = np.abs(offset[np.arange(len(middle)), distance.argmin(axis=1)])
+    # The nearest marker is diagonally adjacent; in a grid of tags it is in the same row or column.
+    diagonal = nearest.min(axis=1) > DIAGONAL * nearest.max(axis=1)
+    if 2 * np.count_nonzero(diagonal) < len(diagonal):
+        return None
+    step = float(np.median(nearest[diagonal]))
     if not 1.0 < step < 1.0 / MIN_MARKER_SIDE:
         return None
     squares = np.rint(offset / step).astype(np.int64)
