@@ -18,7 +18,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, known_median
 from rigkit.detection.guided.board_guide import BoardState
 from rigkit.detection.guided.corner_fit import MARKER_BLURS
 from rigkit.detection.guided.guided import MARGIN_PX, MAX_ADDED_RESIDUAL
-from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.subpixel.edge_fit import (
     BLUR_RANGE,
     LIGHT_SIGMA_PER_PX,
@@ -45,6 +45,10 @@ saturated paper do not follow the model to a pixel."""
 CURVATURE_SIGMAS = 0.3
 """Standard deviation of the middles of a tag's sides relative to its corners, in their sigmas: the curvature comes from
 three tags or more; a second difference has sqrt(6) of their sigma, and the sagitta is an eighth of it."""
+
+MIN_SADDLE = 0.5
+"""Smallest contrast of a square's and a tag's ink to the gaps between them at a corner that was not found by itself,
+over that at those found: 1 where it is visible, 0 or less under a cover."""
 
 ROUGH_STEP_PX = 0.1
 """Last step of a round after which tags are fitted again: the remaining error is a tenth of it."""
@@ -98,7 +102,10 @@ def with_whole_tags(
     """
     # The blur of single corners is not reliable if the code is in their windows.
     blur = known_median(state.blur)
-    narrowest = NARROW_BLURS * blur * tags.codes.modules / tags.pattern.border
+    border = tags.pattern.border / tags.codes.modules
+    # Where there are squares between tags, windows end half way to their other corners.
+    thinnest = min(border, tags.pattern.spacing) if tags.pattern.corner_squares else border
+    narrowest = NARROW_BLURS * blur / thinnest
     if not (tag_heights(state.pixels)[1] < narrowest).any():
         return state
     smooth = map_of_state()
@@ -124,9 +131,8 @@ def with_whole_tags(
     )
     found = fit_tags(image, start, rules)
     moves = found[:, :8].reshape(-1, 4, 2)
-    furthest = np.sqrt((moves**2).sum(axis=2)).max(axis=1)
-    good = (found[:, 15] > 0.5) & (found[:, 13] > 0.0)
-    good &= furthest < np.maximum(VALID_MOVE_CELLS * longer[narrow], VALID_MOVE_PX)
+    good = np.sqrt((moves**2).sum(axis=2)).max(axis=1) < np.maximum(VALID_MOVE_CELLS * longer[narrow], VALID_MOVE_PX)
+    good &= (found[:, 15] > 0.5) & (found[:, 13] > 0.0)
     residual = found[:, 14] / np.maximum(found[:, 13], 1e-9)
     complete = ~partly[narrow]
     good &= complete | (residual < MAX_ADDED_RESIDUAL * known_median(residual[complete & good]))
@@ -136,10 +142,27 @@ def with_whole_tags(
     better = mine[0][good], mine[1][good]
     pixels[better], sigma_px[better] = corners[good] + moves[good], found[good, 8:12]
     blurs[better], contrast[better] = found[good, 12:13], found[good, 13:14] / step
-    # A predicted corner that was not found by itself is not reported.
+    # A predicted corner that was not found by itself is not reported, unless narrow gaps are the cause.
+    known = state.known
+    seen = known | _saddles(image, tags, places, smooth, known) if thinnest < border else known
     for values in (pixels, sigma_px, blurs, contrast):
-        values[~state.known] = np.nan
+        values[~seen] = np.nan
     return replace(state, pixels=pixels, sigma_px=sigma_px, blur=blurs, contrast=contrast)
+
+
+def _saddles(image: GreyImage, tags: TagBoard, places: FloatArray, smooth: SmoothMap, known: BoolArray) -> BoolArray:
+    """Return which corners (R, C) have a tag and a square on one diagonal and gaps on the other, as clearly as those
+    known have."""
+    around = 0.5 * tags.pattern.spacing * np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]])
+    pixels = smooth.at((places[..., None, :] + around).reshape(-1, 2)).pixels.reshape(*places.shape[:2], 4, 2)
+    inside = np.asarray(((pixels > 0.0) & (pixels < np.array(image.shape[::-1]) - 1.0)).all(axis=(2, 3)))
+    level = sample(image, np.where(inside[..., None, None], pixels, 0.0)).astype(np.float64)
+    one, other = level[..., :2], level[..., 2:]
+    # From the first corner of a tag the first diagonal leads into it.
+    into = np.add.outer(np.arange(known.shape[0]), np.arange(known.shape[1]))[..., None] % 2 == 0
+    saddle = np.where(into, other, one).min(axis=2) - np.where(into, one, other).max(axis=2)
+    clear: BoolArray = saddle > MIN_SADDLE * known_median(np.where(known & inside, saddle, np.nan))
+    return inside & clear
 
 
 def _predicted(state: BoardState, predicted: FloatArray, shape: tuple[int, ...]) -> tuple[FloatArray, BoolArray]:

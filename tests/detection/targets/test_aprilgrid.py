@@ -111,6 +111,22 @@ def test_tags_at_the_rim_of_a_fisheye_are_read_where_the_others_have_them(patter
     assert (np.abs(off) < 5.0 * found.sigma_px[:, None]).all()
 
 
+def test_tags_with_narrow_gaps_are_fitted_whole_and_covered_corners_are_none() -> None:
+    """Squares of 2.5 px between tags of 25 px: windows of single corners reach 1.3 px, and lost a third of them."""
+    scene = facing(replace(KALIBR, pattern=AprilGrid(0.1)), 25.0)
+    image = scene.render(blur_px=0.8, noise_levels=2.0, rng=np.random.default_rng(3))
+    (whole,) = detect_boards(image, [scene.boards[0].board])
+    truth = scene.truth()[0].lattice()
+    assert whole.complete
+    assert float(np.sqrt(np.mean(np.sum((whole.lattice() - truth) ** 2, axis=2)))) < 0.025
+    noisy = scene.render(blur_px=0.8, noise_levels=8.0, rng=np.random.default_rng(3)).copy()
+    for corner in (truth[1, 2], truth[5, 7]):
+        cv2.circle(noisy, np.round(corner).astype(int).tolist(), 4, (90,), -1)
+    (rest,) = detect_boards(noisy, [scene.boards[0].board])
+    seen = np.isfinite(rest.lattice()[..., 0])
+    assert seen.mean() > 0.8 and not seen[1, 2] and not seen[5, 7]
+
+
 def test_tags_alone_with_narrow_borders_are_completed() -> None:
     """Corners that no first look finds are foretold by those around them."""
     board, rng = replace(KALIBR, pattern=AprilGrid(0.3, corner_squares=False)), np.random.default_rng(1)
