@@ -26,6 +26,9 @@ from rigkit.io.disk.reading import about
 from rigkit.io.media.images import read_image
 from rigkit.io.media.video import Video, is_video
 
+_suggested: dict[frozenset[tuple[Path, int]], Board] = {}
+"""The last images of which the board was suggested, and that board."""
+
 ENOUGH_IMAGES = 12
 """Images that are searched, evenly spread: more of them show the same board."""
 
@@ -139,6 +142,9 @@ def why_not_detected(paths: Sequence[Path], boards: Sequence[Board], progress: P
     mirrored = _mirrored(paths, [board for board in boards if board.identified or _handed(board)])
     if mirrored is not None:
         return mirrored
+    stamps = _stamps(paths)
+    if any(stamps <= seen for seen, known in _suggested.items() if all(difference(known, b) is None for b in boards)):
+        return None
     guess, *_ = _guess(paths, _named(progress, "checking which board it is"))
     if guess is None or not guess.determined:
         return None
@@ -266,8 +272,11 @@ class Suggestion:
 
 
 def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion:
-    """Return the board that images show."""
+    """Return the board that images show, which `why_not_detected` then need not look for in these images."""
     guess, pictures, unreadable = _guess(paths, progress)
+    _suggested.clear()
+    if guess is not None and guess.determined and not guess.beside:
+        _suggested[_stamps(paths)] = guess.board
     if unreadable is not None and not pictures:
         return Suggestion(fault=str(unreadable))
     mirrored = _mirrored_where_doubtful(guess, pictures, progress)
@@ -315,6 +324,11 @@ def _partial_board_words(guess: BoardGuess) -> str:
         f"only parts of a chessboard, of at least {words} inner corners: none shows all of its sides; count them on "
         "the board"
     )
+
+
+def _stamps(paths: Sequence[Path]) -> frozenset[tuple[Path, int]]:
+    """Return the files with their times of change (0 if there is none), which differ where a file was replaced."""
+    return frozenset((path.absolute(), path.stat().st_mtime_ns if path.exists() else 0) for path in paths)
 
 
 def _guess(
