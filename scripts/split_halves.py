@@ -8,14 +8,14 @@ errors of all images). More splits narrow it little; the last line combines all 
 as well: other cameras, and slightly moved lenses, must be found.
 
     python scripts/split_halves.py [SET ...] [--data DIR] [--splits 6] [--images N] [--cache DIR] [--power]
-        [--model MODEL] [--without IMAGE ...] [--twins N] [--small N]
+        [--model MODEL] [--without IMAGE ...] [--twins N] [--small N] [--seed N]
 
 --images N: calibrate N images against all others, for the sigmas of small sessions. --without: leave the named images
 out, to see whether a ratio comes from one of them. --twins N: halves of N SIMULATED sessions like the real one, with
 equal errors of all images (`honesty.twins`): if these agree with their sigmas and the real one does not, one of its
 images has another error. --small N: N random draws of 3, 4, 5, 7 and 10 images against all others (`honesty.small`;
 with --twins of SIMULATED sessions), with the sigmas and verdicts of small sessions; --model auto is what a user gets.
-Sets of frames of several cameras are compared as rigs (`halves.rigs`).
+Sets of frames of several cameras are compared as rigs (`halves.rigs`). --seed N: other random splits, draws and twins.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 from halves.captures import CAPTURES, OTHERS, Loaded, load
-from halves.comparing import calibrated, in_words, own_scatter, two_parts
+from halves.comparing import calibrated, in_words, own_scatter, seeds_of, two_parts
 from halves.power import power
 from halves.rigs import RIGS, split_rig
 from honesty.small import Drawn, drawn_sessions, print_small, table
@@ -38,13 +38,14 @@ from rigkit.core.errors import RigkitError
 WITHIN_95 = 1.96
 
 
-def split(name: str, loaded: Loaded, splits: int, model: str, images: int | None) -> list[CalibrationComparison]:
-    """Print and return the comparisons of random halves of a set, or of so many `images` with all others."""
-    rng = np.random.default_rng(len(name))
+def split(name: str, loaded: Loaded, args: argparse.Namespace) -> list[CalibrationComparison]:
+    """Print and return the comparisons of random halves of a set, or of so many images with all others."""
+    rng = np.random.default_rng(seeds_of(name, args.seed))
     found = []
-    for k in range(splits):
+    for k in range(args.splits):
+        parts = two_parts(loaded[0], rng, args.images)
         try:
-            a, b = (calibrated(part, loaded[1], model) for part in two_parts(loaded[0], rng, images))
+            a, b = (calibrated(part, loaded[1], args.model) for part in parts)
             found.append(compare_calibrations(a, b))
         except RigkitError as error:
             print(f"{name} split {k}: {error}", flush=True)
@@ -57,12 +58,12 @@ def split(name: str, loaded: Loaded, splits: int, model: str, images: int | None
     return found
 
 
-def twins(name: str, loaded: Loaded, count: int, model: str) -> None:
+def twins(name: str, loaded: Loaded, count: int, model: str, seed: int) -> None:
     """Print what halves of so many SIMULATED sessions like the real one come to."""
     views, size = loaded
     found, ratios, other = calibrated(views, size, model), [], 0
-    for seed in range(count):
-        rng = np.random.default_rng([seed, len(name)])
+    for k in range(count):
+        rng = np.random.default_rng([k, *seeds_of(name, seed)])
         a, b = (calibrated(part, size, model) for part in two_parts(twin(found, views, rng), rng))
         compared = compare_calibrations(a, b)
         ratios.append(compared.ratio)
@@ -87,7 +88,7 @@ def summary(
     views, size = loaded
     likely, off = "", None
     if args.images is None:
-        low, typical, high = own_scatter(views, size, len(found), args.model, len(name)).tolist()
+        low, typical, high = own_scatter(views, size, len(found), args.model, seeds_of(name, args.seed)).tolist()
         likely = f" (if sigmas are true {typical:.2f}, 95 % from {low:.2f} to {high:.2f})"
         if not CAPTURES[name].rendered:
             off = float(np.log(ratio / typical)), float(np.log(high / low)) / (2.0 * WITHIN_95)
@@ -103,8 +104,12 @@ def small(name: str, loaded: Loaded, args: argparse.Namespace) -> dict[int, list
     """Print and return what small sessions of a set, or of its twins, come to, by how many images they have."""
     views, size = loaded
     whole = calibrated(views, size, args.model) if args.twins else None
-    seed, drawn = sum(map(ord, name)), lambda rng: views if whole is None else twin(whole, views, rng)
-    found = drawn_sessions(drawn, args.small, lambda part: calibrated(part, size, args.model), seed)
+    found = drawn_sessions(
+        lambda rng: views if whole is None else twin(whole, views, rng),
+        args.small,
+        lambda part: calibrated(part, size, args.model),
+        seeds_of(name, args.seed),
+    )
     print(f"{name} ({len(views)} images)\n{table(found)}", flush=True)
     return found
 
@@ -135,13 +140,14 @@ def main() -> None:
     parser.add_argument("--without", nargs="+", default=[], metavar="IMAGE", help="leave these images out")
     parser.add_argument("--twins", type=int, metavar="N", help="halves of so many simulated sessions like the real one")
     parser.add_argument("--small", type=int, metavar="N", help="so many draws of 3 to 10 images against all others")
+    parser.add_argument("--seed", type=int, default=0, help="of splits, draws and twins")
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
     if unknown := [name for name in args.sets if name not in CAPTURES and name not in RIGS]:
         print(f"no set is called '{unknown[0]}'; there are {', '.join([*CAPTURES, *RIGS])}", file=sys.stderr)
         sys.exit(2)
     for name in [name for name in args.sets if name in RIGS]:
-        split_rig(name, args.data, args.cache, args.splits, args.model)
+        split_rig(name, args.data, args.cache, args.splits, args.model, args.seed)
     if args.sets and not set(args.sets) & set(CAPTURES):
         return
     args.sets = [name for name in args.sets if name in CAPTURES]
@@ -158,9 +164,9 @@ def main() -> None:
         elif args.power:
             power(name, loaded, args.model)
         elif args.twins:
-            twins(name, loaded, args.twins, args.model)
+            twins(name, loaded, args.twins, args.model, args.seed)
         else:
-            everything[name] = loaded, split(name, loaded, args.splits, args.model, args.images)
+            everything[name] = loaded, split(name, loaded, args)
     there = {name for name in args.sets or CAPTURES if (args.data / CAPTURES[name].folder).is_dir()}
     for a, b in [pair for pair in OTHERS if args.power and set(pair) <= there]:
         first, second = (calibrated(*load(name, args.data, args.cache), args.model) for name in (a, b))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import zlib
+from collections.abc import Sequence
+
 import numpy as np
 
 from halves.captures import Views
@@ -18,6 +21,11 @@ from rigkit.cameras.compare import grid_pixels
 
 DRAWS = 4000
 """Sessions drawn anew, for the scatter of a ratio."""
+
+
+def seeds_of(name: str, seed: int) -> list[int]:
+    """Return the seeds of a set's random numbers: other ones for each name and each `seed`."""
+    return [seed, zlib.crc32(name.encode())]
 
 
 def two_parts(views: Views, rng: np.random.Generator, images: int | None = None) -> tuple[Views, Views]:
@@ -38,7 +46,7 @@ def in_words(what: str, found: CalibrationComparison) -> str:
     )
 
 
-def own_scatter(views: Views, size_px: tuple[int, int], splits: int, model: str, seed: int) -> np.ndarray:
+def own_scatter(views: Views, size_px: tuple[int, int], splits: int, model: str, seeds: Sequence[int]) -> np.ndarray:
     """Return the 2.5th, 50th and 97.5th percentile of the geometric mean ratio of these splits where sigmas are true.
 
     At first order: image i pulls the parameters by a score s_i of variance H_i, its information after its own pose.
@@ -65,7 +73,7 @@ def own_scatter(views: Views, size_px: tuple[int, int], splits: int, model: str,
     sigmas = np.maximum(found.parameter_sigmas, np.finfo(float).tiny)
     seen = (design[:, :p] - turn @ (turn.T @ design[:, :p])) * sigmas
     information = information * sigmas[:, None] * sigmas
-    rng, drawn = np.random.default_rng(seed), np.random.default_rng(0)
+    rng, drawn = np.random.default_rng(seeds), np.random.default_rng(0)
     values, axes = np.linalg.eigh(information)
     roots = axes * np.sqrt(np.maximum(values, 0.0))[:, None]
     scores = np.einsum("nij,njd->nid", roots, drawn.normal(size=(len(names), p, DRAWS)))

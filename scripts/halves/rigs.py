@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from halves.comparing import seeds_of
 from halves.lengths import Measured, both_see, measured, share
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.compare import compare_mounts
@@ -72,11 +73,11 @@ def load_rig(name: str, data: Path, cache: Path) -> tuple[RigViews, dict[str, tu
     return found
 
 
-def split_rig(name: str, data: Path, cache: Path, splits: int, model: str) -> None:
+def split_rig(name: str, data: Path, cache: Path, splits: int, model: str, seed: int) -> None:
     """Print how far apart the baselines and mounts of halves are, and how many of their lengths are within bounds."""
     views, sizes = load_rig(name, data, cache)
     frames = sorted({frame for own in views.values() for frame, _ in own}, key=natural_key)
-    half, rng = len(frames) // 2, np.random.default_rng(len(name))
+    half, rng = len(frames) // 2, np.random.default_rng(seeds_of(name, seed))
     parts = {"in time": (frames[:half], frames[half:]), "every second": (frames[::2], frames[1::2])}
     for k in range(splits):
         order = [frames[i] for i in rng.permutation(len(frames))]

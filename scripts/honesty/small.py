@@ -105,7 +105,7 @@ def drawn_sessions(
     views_of_draw: Callable[[np.random.Generator], Views],
     draws: int,
     calibrated: Callable[[Views], Calibration],
-    seed: int,
+    seeds: Sequence[int],
 ) -> dict[int, list[Drawn | str]]:
     """Return, by how many images they have, `draws` random small sessions against all others; of one that could not be
     calibrated why."""
@@ -113,8 +113,8 @@ def drawn_sessions(
     for size in SIZES:
         for draw in range(draws):
             # The first draws are the same, however many are asked for.
-            rng = np.random.default_rng([seed, size, draw])
-            views = views_of_draw(np.random.default_rng([seed, size, draw, 1]))
+            rng = np.random.default_rng([*seeds, size, draw])
+            views = views_of_draw(np.random.default_rng([*seeds, size, draw, 1]))
             if len(views) - size < MIN_OTHERS:
                 break
             names = rng.permutation(sorted(views)).tolist()
