@@ -208,7 +208,7 @@ def _report(
     if truth.baseline is not None:
         checks.append(compare_baseline("baseline", truth.baseline, baseline, coverage, len(cloud)))
     of_boards, unchecked = _checks_of_boards(measured, truth, angles, fitted, coverage)
-    held, undeclared = declaration_checks(reconstruction)
+    held, undeclared = declaration_checks(reconstruction, shifts)
     checks += [*of_boards, *held, *contradicted_boards(measured.boards, layout or {})]
     unchecked += undeclared
     against = normal_errors_against(reconstruction, fitted.constrained)

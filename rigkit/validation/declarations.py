@@ -1,23 +1,29 @@
 """Check the declarations of a pair against its corners: pose type, level, sizes and sides of the boards.
 
 Declarations enter the reconstruction as priors or identities. A wrong one can change the result without any trace in
-the measured lengths and angles. So pose type and level are always checked; sizes and sides are reported if
-contradicted.
+the measured lengths and angles. So pose type and level are always checked, with the calibrations' uncertainty where it
+is known; sizes and sides are reported if contradicted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.errors import DegenerateError
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rotation import exp_so3
 from rigkit.identification.board_ids import BOARD_SIDES
+from rigkit.reconstruction.calibration_shifts import CalibrationShifts
 from rigkit.reconstruction.geometry import PoseTypeDecision
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.relative_pose.refinement.select import CONTRADICTION_P, TypeEvidence
+from rigkit.relative_pose.refinement.level_frames import LevelFrames
+from rigkit.relative_pose.refinement.refine import refine_pose
+from rigkit.relative_pose.refinement.select import CONTRADICTION_P, TypeEvidence, level_parts
 from rigkit.validation.boards import BoardResult
 from rigkit.validation.check import Check, compare
 
@@ -85,10 +91,13 @@ def _sides(boards: Mapping[str, BoardResult], layout: Mapping[str, str]) -> dict
     return {side: np.asarray(turn @ to) for side, to in sides.items()}
 
 
-def declaration_checks(reconstruction: Reconstruction) -> tuple[tuple[Check, ...], tuple[str, ...]]:
+def declaration_checks(
+    reconstruction: Reconstruction, shifts: CalibrationShifts | None = None
+) -> tuple[tuple[Check, ...], tuple[str, ...]]:
     """Return the checks of the declared pose type and level, and messages about what could not be checked.
 
-    Both are empty for the general type and "auto", which declare nothing.
+    What noise and level do not explain the calibrations may (`shifts`). Both are empty for the general type and "auto",
+    which declare nothing.
     """
     if reconstruction.geometry is None:
         return (), ()
@@ -105,8 +114,28 @@ def declaration_checks(reconstruction: Reconstruction) -> tuple[tuple[Check, ...
         if found is None:
             unchecked.append(f"{name}: no pose of that type puts the points in front of both cameras")
         else:
+            if shifts is not None and found.deviations is not None and found.p_value < CONTRADICTION_P:
+                with suppress(DegenerateError):
+                    of_cameras = _of_calibrations(shifts, found.pose_type, decision.level_frames)
+                    found = replace(found, p_value=found.deviations.p_value(of_cameras))
             checks.append(_check(kind, name, found, decision, count))
     return tuple(checks), tuple(unchecked)
+
+
+def _of_calibrations(shifts: CalibrationShifts, kind: PoseType, frames: LevelFrames | None) -> FloatArray:
+    """Return the covariance (K, K) of the deviations from a pose type that comes from the calibrations: those of the
+    general pose, estimated again with each of the moved cameras."""
+    base, *moved = (_deviations(r, shifts.known, kind, frames) for r in (shifts.base, *shifts.moved))
+    changes = np.array(moved).reshape(-1, len(base)) - base
+    return np.asarray(changes.T @ changes)
+
+
+def _deviations(r: Reconstruction, seen: BoolArray, kind: PoseType, frames: LevelFrames | None) -> FloatArray:
+    captured = replace(r.matches.select(seen), pixels1=r.pixels1[seen], pixels2=r.pixels2[seen])
+    matches, pose = captured.with_cameras(r.camera1, r.camera2), r.cam2_from_cam1
+    if frames is not None:
+        matches, pose = frames.matches(matches), frames.level_pose(pose)
+    return level_parts(refine_pose(matches, pose), kind)[0]
 
 
 def _check(kind: str, name: str, found: TypeEvidence, decision: PoseTypeDecision, count: int) -> Check:

@@ -11,11 +11,13 @@ import pytest
 from helpers.board_scenes import noisy_pair, regular_camera
 from helpers.reconstructions import BOARDS
 
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredAngle, PairTruth
 from rigkit.geometry.rotation import exp_so3
 from rigkit.identification.board_ids import BOARD_SIDES
+from rigkit.reconstruction.calibration_shifts import calibration_shifts
 from rigkit.reconstruction.geometry import PoseTypeDecision
 from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
 from rigkit.relative_pose.refinement.select import PoseTypeEvidence, TypeEvidence
@@ -81,6 +83,22 @@ def test_an_exact_level_that_was_off_by_tenths_of_a_degree_fails_and_bends_nothi
     report = validate(declared(pose_type, pose_type, rng, level_deg=0.4, declared_level_deg=0.0), TRUTH)
     assert not report.check(f"pose type {pose_type}").passed
     assert all(check.passed for check in report.checks if check.kind == "angle")
+
+
+@pytest.mark.parametrize(("axis_px", "passes"), [(0.1, False), (10.0, True)])
+def test_a_pose_type_is_not_called_wrong_where_the_calibration_is(
+    rng: np.random.Generator, axis_px: float, passes: bool
+) -> None:
+    """A principal point that is 10 px too low lets a level baseline rise by 0.4 degrees."""
+    true = regular_camera()
+    off = true.with_parameters(true.parameters + np.array([0.0, 0.0, 0.0, 10.0]))
+    scene = trihedral_pair(BOARDS, true, PoseType.PLANAR, rng, level_sigma_deg=0.0, distance=(0.9, 1.3), walls=False)
+    pair = noisy_pair(scene, BOARDS, rng, 0.03, known_as=off)
+    found = reconstruct_pair(pair, pose_type=PoseType.PLANAR, level_sigma_rad=0.0)
+    known = UncertainCamera(off, np.diag([0.1, 0.1, axis_px, axis_px]) ** 2)
+    without, report = (validate(found, TRUTH, shifts=s) for s in (None, calibration_shifts(found, known)))
+    assert not without.check("pose type planar").passed
+    assert report.check("pose type planar").passed == passes
 
 
 def test_a_type_whose_pose_sees_nothing_in_front_is_not_checked(rng: np.random.Generator) -> None:

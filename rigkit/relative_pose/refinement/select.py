@@ -38,6 +38,22 @@ SELECTED_TYPES = (PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Deviations:
+    """Deviations (K,) of the general fit from a pose type, rad, as of `level_terms`, and their covariance (K, K) due to
+    noise and level."""
+
+    values: FloatArray
+    covariance: FloatArray
+
+    def p_value(self, of_cameras: FloatArray | float = 0.0) -> float:
+        """Return the probability of deviations at least this large, with a further covariance (K, K)."""
+        from scipy.special import gammaincc
+
+        distance2 = float(self.values @ np.linalg.solve(self.covariance + of_cameras, self.values))
+        return float(gammaincc(0.5 * len(self.values), 0.5 * distance2))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class TypeEvidence:
     """Evidence of the matches for one pose type.
 
@@ -47,6 +63,7 @@ class TypeEvidence:
     probability : posterior probability for equal prior probabilities of the four types.
     deviation_rad : deviation of the general fit from the type, see `type_deviation_rad`. Zero for the general type.
     p_value : probability of deviations at least this large, due to noise and level, under the type.
+    deviations : what it is of; None for the general type.
     """
 
     pose_type: PoseType
@@ -54,6 +71,7 @@ class TypeEvidence:
     probability: float
     deviation_rad: float
     p_value: float
+    deviations: Deviations | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -115,9 +133,12 @@ def pose_type_evidence(matches: Matches, level_sigma_rad: float | None = None) -
     total = sum(np.exp(value - top) for value in raw.values())
     entries = []
     for kind, value in sorted(raw.items(), key=lambda item: -item[1]):
-        deviation, p = _deviation(general, kind, level, noise2)
         probability = float(np.exp(value - top) / total)
-        entries.append(TypeEvidence(kind, value - top, probability, deviation_rad=deviation, p_value=p))
+        entry = TypeEvidence(kind, value - top, probability, deviation_rad=0.0, p_value=1.0)
+        if general is not None and kind != PoseType.GENERAL:
+            off, own = type_deviation_rad(general.cam2_from_cam1, kind), _deviations(general, kind, level, noise2)
+            entry = replace(entry, deviation_rad=off, p_value=own.p_value(), deviations=own)
+        entries.append(entry)
     return PoseTypeEvidence(tuple(entries), level)
 
 
@@ -144,7 +165,7 @@ def _fits(matches: Matches, level: float) -> dict[PoseType, RefinedPose]:
     return fits
 
 
-def _level_parts(fit: RefinedPose, kind: PoseType) -> tuple[FloatArray, FloatArray, FloatArray]:
+def level_parts(fit: RefinedPose, kind: PoseType) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return deviations (K,), their Jacobian (K, 5), and the covariance (5, 5) of the pose."""
     pose = fit.cam2_from_cam1
     to_five = pose_directions(pose.translation_mm)
@@ -153,12 +174,12 @@ def _level_parts(fit: RefinedPose, kind: PoseType) -> tuple[FloatArray, FloatArr
 
 
 def _prior_cost(fit: RefinedPose, kind: PoseType, level: float) -> float:
-    return float(np.sum((_level_parts(fit, kind)[0] / level) ** 2))
+    return float(np.sum((level_parts(fit, kind)[0] / level) ** 2))
 
 
 def _log_evidence(fit: RefinedPose, kind: PoseType, level: float, noise2: float) -> float:
     """Return the log marginal likelihood by Laplace's approximation, up to a constant that all types share."""
-    values, jacobian, covariance = _level_parts(fit, kind)
+    values, jacobian, covariance = level_parts(fit, kind)
     prior, prior_cost = jacobian.T @ jacobian / level**2, np.sum((values / level) ** 2)
     # The refinement assumed the stated sigmas; the variance factor scales the data's part of the curvature only.
     curvature = (np.linalg.inv(covariance) - prior) / noise2 + prior
@@ -170,16 +191,9 @@ def _log_evidence(fit: RefinedPose, kind: PoseType, level: float, noise2: float)
     return float(log - free - len(values) * 0.5 * np.log(2.0 * np.pi * level**2))
 
 
-def _deviation(general: RefinedPose | None, kind: PoseType, level: float, noise2: float) -> tuple[float, float]:
-    """Return the deviation of the general fit from the type, rad, and its p-value under the type."""
-    from scipy.special import gammaincc
-
-    if general is None or kind == PoseType.GENERAL:
-        return 0.0, 1.0
-    values, jacobian, covariance = _level_parts(general, kind)
-    spread = noise2 * jacobian @ covariance @ jacobian.T + level**2 * np.eye(len(values))
-    distance2 = float(values @ np.linalg.solve(spread, values))
-    return type_deviation_rad(general.cam2_from_cam1, kind), float(gammaincc(0.5 * len(values), 0.5 * distance2))
+def _deviations(general: RefinedPose, kind: PoseType, level: float, noise2: float) -> Deviations:
+    values, jacobian, covariance = level_parts(general, kind)
+    return Deviations(values, noise2 * jacobian @ covariance @ jacobian.T + level**2 * np.eye(len(values)))
 
 
 def type_deviation_rad(pose: Rigid3, kind: PoseType) -> float:
