@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, principal_axes
+from rigkit.core.errors import InputError
 from rigkit.geometry.relative_pose import relative_pose, relative_pose_jacobian
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
+
+Moved = TypeVar("Moved")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -28,7 +31,7 @@ class UncertainCamera:
         """Return the camera changed by one standard deviation along each principal axis of the covariance. The axes are
         independent: the variance of a quantity is the sum of its squared changes."""
         camera = self.camera
-        return [camera.with_parameters(camera.parameters + axis) for axis in principal_axes(self.covariance)]
+        return _either_way(lambda axis: camera.with_parameters(camera.parameters + axis), self.covariance)
 
 
 class PosedPair(NamedTuple):
@@ -52,14 +55,14 @@ class UncertainPair:
         one, two, pose = self.posed
         end1 = one.parameters.size
         end2 = end1 + two.parameters.size
-        return [
-            PosedPair(
+        return _either_way(
+            lambda axis: PosedPair(
                 one.with_parameters(one.parameters + axis[:end1]),
                 two.with_parameters(two.parameters + axis[end1:end2]),
                 Rigid3(exp_so3(axis[end2 : end2 + 3]) @ pose.rotation, pose.translation_mm + axis[end2 + 3 :]),
-            )
-            for axis in principal_axes(self.covariance)
-        ]
+            ),
+            self.covariance,
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -94,3 +97,15 @@ class UncertainRig:
         longer = self.scale_sigma * pose.translation_mm
         covariance[-3:, -3:] += np.outer(longer, longer)
         return UncertainPair(PosedPair(self.cameras[first], self.cameras[second], pose), covariance)
+
+
+def _either_way(moved: Callable[[FloatArray], Moved], covariance: FloatArray) -> list[Moved]:
+    """Return what is `moved` along each principal axis, or against it where that leaves the range of a parameter: the
+    square of a change is the same."""
+    out = []
+    for axis in principal_axes(covariance):
+        try:
+            out.append(moved(axis))
+        except InputError:
+            out.append(moved(-axis))
+    return out

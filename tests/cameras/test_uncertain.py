@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rigkit.cameras.eucm import EUCM
 from rigkit.cameras.pinhole import Pinhole
-from rigkit.cameras.uncertain import UncertainRig
+from rigkit.cameras.uncertain import PosedPair, UncertainCamera, UncertainPair, UncertainRig
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
@@ -60,3 +61,15 @@ def test_the_scale_uncertainty_is_in_the_baseline() -> None:
     np.testing.assert_allclose(moved.cam2_from_cam1.rotation, here.rotation, atol=1e-12)
     longer = np.linalg.norm(moved.cam2_from_cam1.translation_mm) / np.linalg.norm(here.translation_mm)
     assert abs(longer - 1.0) == pytest.approx(1e-3)
+
+
+def test_a_parameter_near_the_end_of_its_range_moves_the_other_way() -> None:
+    """One sigma more than alpha = 0.98 would be no camera."""
+    lens = EUCM((300, 225), np.array([262.5, 262.5, 149.5, 112.0, 0.98, 0.8]))
+    known = UncertainCamera(lens, np.diag([0.0, 0.0, 0.0, 0.0, 0.05, 0.0]) ** 2)
+    (moved,) = known.moved()
+    assert np.abs(moved.parameters - lens.parameters)[4] == pytest.approx(0.05)
+    both = np.zeros((18, 18))
+    both[:6, :6] = known.covariance
+    (pair,) = UncertainPair(PosedPair(lens, lens, POSES[1]), both).moved()
+    assert np.abs(pair.camera1.parameters - lens.parameters)[4] == pytest.approx(0.05)
