@@ -52,3 +52,13 @@ def test_pictures_and_lines_of_a_screen_stay_as_they_are() -> None:
     assert of_one_moment(board) is board
     tiny = board[:20, :20]
     assert of_one_moment(tiny) is tiny
+
+
+@pytest.mark.parametrize("period_px", [1.95, 2.1, 2.5])
+def test_lines_as_fine_as_pixels_beside_a_board_are_no_fields(period_px: float) -> None:
+    # Blinds and fabrics: every second line shows them with a period so long that the others match it elsewhere.
+    image, _ = interlaced((0.0, 0.0))
+    down, across = np.indices(image.shape)
+    lines = 120.0 + 30.0 * np.sin(2.0 * np.pi * (down + 0.02 * across) / period_px)
+    image[:, -160:] = lines[:, -160:]
+    assert of_one_moment(image) is image
