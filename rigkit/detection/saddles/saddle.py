@@ -93,7 +93,7 @@ class Saddles:
 def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple[Corners, Saddles]:
     """Return the chessboard corners of all levels, each once (the finest level wins), and all saddles.
 
-    `finer` : corners of finer levels, if `levels` are only coarser ones.
+    `finer` : corners of finer levels, if `levels` are only coarser ones; narrow images have none of these.
     """
     kept = [] if finer is None else [finer]
     own: list[Corners] = []
@@ -105,7 +105,8 @@ def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple
         own.append(Corners(found.pixels, found.angles, found.contrast, np.full(len(found.pixels), level.scale)))
         smeared.append(found.smeared)
         kept.append(own[-1].of(~(found.smeared | found.repeated)))
-    return joined(kept), Saddles(np.concatenate(saddles), tuple(own), tuple(smeared), tuple(kept))
+    every = np.concatenate([np.empty((0, 2)), *saddles])
+    return joined(kept), Saddles(every, tuple(own), tuple(smeared), tuple(kept))
 
 
 def each_once(by_level: Iterable[Corners]) -> Corners:

@@ -285,3 +285,7 @@ def test_tags_of_twelve_pixels_are_found(lens: str) -> None:
     (found,) = detect_boards(scene.render(optics=Optics(0.6), noise_levels=2.0, rng=rng), [KALIBR])
     assert len(found.grid) > 0.9 * KALIBR.corner_count
     assert np.abs(errors_by_place(found, scene.truth()[0])).max() < 0.25
+
+
+def test_strips_too_narrow_for_coarser_levels_show_none() -> None:
+    assert not detect_boards(np.zeros((200, 16), np.uint8), [KALIBR])
