@@ -41,6 +41,11 @@ further off, by the above but of CORNER_SIGMAS: light that ends with the board, 
 of REAL boards, up to the rims of fisheyes, good ones are at most 6.9 times the median off, in heat images bad ones 12
 to 20 times, and 3.7 to 8.6 sigmas."""
 
+BEND_SHARE = 0.75
+"""Smallest ratio of the distances from both predictions of such an outlier: a corner that is displaced is as far from
+either, and the bend of a strong lens follows the flexible one. In heat images it is 0.9 and more; of 9 good corners of
+REAL fisheye images that were outliers otherwise, 0.01 at five (distorted further), 0.6 at one, 0.9 to 1.1 at three."""
+
 COVERED_NOISE, COVERED_FACTOR = 0.06, 6.0
 COVERED_OFF = 3.5
 """A corner is partly covered if its noise over contrast exceeds COVERED_NOISE and COVERED_FACTOR times the median of
@@ -109,7 +114,7 @@ def without_inconsistent(item: RefinedLattice, parts: Sequence[tuple[slice, slic
     flexible = _Contradiction.of(item)
     # Predictions from a few corners on one side are not reliable.
     judged = flexible.reliable & (flexible.gain < MAX_GAIN_OF_DROP)
-    ends = _displaced_ends(item, flexible.reliable & ~judged & (flexible.cells > DISPLACED_CELLS), parts)
+    ends = _displaced_ends(item, flexible, flexible.reliable & ~judged & (flexible.cells > DISPLACED_CELLS), parts)
     if ends.any():
         # They spoil the predictions of their neighbours.
         return without_inconsistent(item.without(ends), parts)
@@ -136,7 +141,9 @@ def without_inconsistent(item: RefinedLattice, parts: Sequence[tuple[slice, slic
     return item.without(drop) if drop.any() else item
 
 
-def _displaced_ends(item: RefinedLattice, ends: BoolArray, parts: Sequence[tuple[slice, slice]]) -> BoolArray:
+def _displaced_ends(
+    item: RefinedLattice, flexible: _Contradiction, ends: BoolArray, parts: Sequence[tuple[slice, slice]]
+) -> BoolArray:
     """Return which of the `ends` of rows (R, C) are outliers of stiff predictions; mostly there are no `ends`."""
     out = np.zeros_like(ends)
     if not ends.any():
@@ -147,7 +154,8 @@ def _displaced_ends(item: RefinedLattice, ends: BoolArray, parts: Sequence[tuple
         known = item.lattice.known[part]
         if known.sum() >= MIN_CHECKED:
             out[part] = relative[part] > DISPLACED_SIGMAS * upper_median(relative[part][known])
-    return out & ends & stiff.reliable & (stiff.cells > DISPLACED_CELLS) & (stiff.excess > CORNER_SIGMAS)
+    alike = flexible.cells > BEND_SHARE * stiff.cells
+    return out & ends & alike & stiff.reliable & (stiff.cells > DISPLACED_CELLS) & (stiff.excess > CORNER_SIGMAS)
 
 
 class _Contradiction(NamedTuple):

@@ -44,3 +44,14 @@ def test_the_last_corner_of_two_rows_is_in_line_with_them(bent: float) -> None:
     assert kept(0.0, 0.1)
     assert kept(0.6, 0.3)
     assert not kept(4.0, 0.5)
+
+
+def test_the_bend_of_a_strong_lens_displaces_no_corner() -> None:
+    v, u = np.mgrid[:6, :8].astype(float)
+    # At the rim of a fisheye squares shrink ever faster.
+    bend = 15.0 * np.exp(-0.5 * (u + v))
+    pixels = np.stack([20.0 * u + bend, 20.0 * v + bend], axis=-1)
+    pixels += np.random.default_rng(0).normal(0.0, 0.02, pixels.shape)
+    every = np.ones((6, 8))
+    item = RefinedLattice(Lattice(pixels, 100.0 * every, True), 0.05 * every, every, every, every)
+    assert without_inconsistent(item, [(slice(None), slice(None))]) is item
