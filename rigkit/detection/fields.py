@@ -19,8 +19,9 @@ FIELDS_MARGIN_PX = 6
 MAX_LINES = 1088
 """No interlaced format has more lines: larger images are not checked."""
 
-GROUPS, TILES = 60, 8
-"""Groups of four lines that are looked at, and tiles across and down the image: a moving board may be a small part."""
+GROUPS, TILES, MIN_TILES = 60, 8, 2
+"""Groups of four lines that are looked at, tiles across and down the image (a moving board may be a small part), and
+the fewest tiles of two moments: what one tile shows, some tens of pixels, matches elsewhere by chance."""
 
 LINE_STEP, MIN_ALTERNATING, LINE_SHARE = 32.0, 3.0, 0.02
 """A tile is of two moments if more places, by MIN_ALTERNATING and LINE_SHARE of all, have differences within four lines
@@ -63,7 +64,10 @@ def of_one_moment(grey: GreyImage) -> GreyImage:
     Closer fields are left: corners halfway between them have twice the lines, and the fit knows their blur.
     """
     height, width = grey.shape
-    if not 4 * TILES <= height <= MAX_LINES or width < TILES or not (tiles := _alternating_tiles(grey)).any():
+    if not 4 * TILES <= height <= MAX_LINES or width < TILES:
+        return grey
+    tiles = _alternating_tiles(grey)
+    if np.count_nonzero(tiles) < MIN_TILES:
         return grey
     (top, bottom), (left, right) = (
         (int(at[0]) * side // TILES, (int(at[-1]) + 1) * side // TILES)
