@@ -37,9 +37,9 @@ of the board, and DISPLACED_SIGMAS times its expected standard deviation: a fing
 MAX_GAIN_OF_DROP, CORNER_SIGMAS = 1.5, 3.0
 """Largest gain of a prediction that is judged by the above. At the corners of a board it is 2.7; there a stiffer
 prediction, whose gain is 1.4, is compared with the stiff ones of the whole board, and the corner is an outlier if it is
-further off, by the above but of CORNER_SIGMAS: light that ends with the board, or heat, moves such corners. In 13 sets
-of REAL boards, up to the rims of fisheyes, good ones are at most 6.9 times the median off, in heat images bad ones 12
-to 20 times, and 3.7 to 8.6 sigmas."""
+further off, by the above but of CORNER_SIGMAS: light that ends with the board, or heat, moves such corners. In heat
+images bad ones are 8.4 to 20 times the median off, and 3.7 to 8.6 sigmas; in 13 sets of REAL boards good ones at most
+6.9 times, but up to 11.3 times in images of fisheyes that were distorted further (see BEND_SHARE)."""
 
 BEND_SHARE = 0.75
 """Smallest ratio of the distances from both predictions of such an outlier: a corner that is displaced is as far from
