@@ -186,7 +186,7 @@ def test_images_without_common_names_are_refused_before_the_search(
 ) -> None:
     searched: list[object] = []
     monkeypatch.setattr("rigkit.workflows.calibration.calibrate.corners_of", searched.append)
-    for name in ("reg_a", "wide_b"):
+    for name in ("reg_a", "reg_b", "wide_c", "wide_d"):
         (session.parent / f"{name}.png").write_bytes(b"")
     assert main(["calibrate", str(session)]) == 2
     assert "same name or number" in capsys.readouterr().err and not searched
