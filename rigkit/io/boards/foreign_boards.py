@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rigkit.core.errors import InputError
+from rigkit.core.errors import InputError, printable
 from rigkit.interop.opencv_storage import parse_storage
 from rigkit.io.disk.reading import read_text
 
@@ -177,7 +177,7 @@ def _yes(value: Any) -> bool:
 def _name_unused(values: Mapping[str, Any], source: Path) -> None:
     """Log the keys of a target of Kalibr's that no reader uses: forks have more of them."""
     # Keys in lower case come first, of which the file has the other.
-    unused = {key.lower(): key for key in values if key.lower() not in KALIBR_KEYS}
+    unused = {key.lower(): printable(key) for key in map(str, values) if key.lower() not in KALIBR_KEYS}
     if unused:
         _log.warning("'%s': not used: %s; look whether they describe another board", source, ", ".join(unused.values()))
 

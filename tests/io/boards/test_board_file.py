@@ -118,10 +118,10 @@ def test_keys_of_other_tools_that_are_not_used_are_named(tmp_path: Path, caplog:
     path.write_text(KALIBR)
     load_board(path)
     assert not caplog.messages
-    path.write_text(KALIBR + "tagFamily: 16h5\nblackBorder: 1\n")
+    path.write_text(KALIBR + 'tagFamily: 16h5\n5: 1\n"\\uD800": 1\n')
     load_board(path)
     (words,) = caplog.messages
-    assert "not used: tagFamily, blackBorder;" in words
+    assert "not used: tagFamily, 5, \\ud800;" in words
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
