@@ -67,8 +67,8 @@ def test_lines_as_fine_as_pixels_beside_a_board_are_no_fields(period_px: float) 
 def test_one_tile_of_two_moments_is_chance() -> None:
     image, _ = interlaced((0.0, 0.0))
     texture = np.random.default_rng(3).integers(0, 256, (480, 640)).astype(np.uint8)
-    texture = cv2.GaussianBlur(texture, (0, 0), 2.0)
-    texture = cv2.normalize(texture, texture, 0, 255, cv2.NORM_MINMAX)
+    cv2.GaussianBlur(texture, (0, 0), 2.0, dst=texture)
+    cv2.normalize(texture, texture, 0, 255, cv2.NORM_MINMAX)
     texture[1::2] = np.roll(texture, 8, axis=1)[1::2]
     height, width = image.shape
     one = (slice(0, height // 8), slice(0, width // 8))
