@@ -42,4 +42,5 @@ def _mentions(message: str, words: Sequence[str]) -> bool:
     # Pairs and cameras are called after their files.
     stems = [f"'{stem}'" for stem in (PurePath(word).stem for word in words) if stem]
     shown = [name for word in words for name in (word, ascii(word)[1:-1], PurePath(word).name) if name]
-    return any(name[:40] in message for name in (*stems, *shown))
+    empty = ["''"] if "" in words else []
+    return any(name[:40] in message for name in (*stems, *shown, *empty))
