@@ -8,7 +8,7 @@ joint least squares fit of all their corners gives its chi square.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +16,8 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, IntArray, Points
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError
-from rigkit.identification.board_matches import BoardMatch, ImageObservations
-from rigkit.identification.joint_pose import JointPose, refine_joint
-from rigkit.identification.placements import BoardKind
+from rigkit.identification.board_matches import BoardMatch, ImagePair
+from rigkit.identification.joint_pose import BoardCorners, JointPose, refine_joint
 
 SEED_GATE = 2.0
 """Largest rms error, in squares, of a board predicted from one other board, whose tilt is uncertain."""
@@ -39,49 +38,50 @@ class Assignment:
     ----------
     matches : the boards seen in both images.
     pose : the joint fit, boards in the order of `matches`.
-    chi2_1, chi2_2 : chi2 of every detection in image 1 and 2, at most `chi2_of_leaving_out`.
+    chi2_of : chi2 of every detection in image 1 and in image 2, at most `chi2_of_leaving_out`.
     """
 
     matches: tuple[BoardMatch, ...]
     pose: JointPose
-    chi2_1: FloatArray
-    chi2_2: FloatArray
+    chi2_of: tuple[FloatArray, FloatArray]
 
     @property
     def chi2(self) -> float:
-        return float(self.chi2_1.sum() + self.chi2_2.sum())
+        return float(self.chi2_of[0].sum() + self.chi2_of[1].sum())
 
     def differs_from(self, other: Assignment) -> bool:
         """Return whether a detection has another partner or position in the other assignment."""
-        mine = {("1", s.first): (s.second, s.key) for s in self.matches} | {
-            ("2", s.second): s.first for s in self.matches
-        }
         return any(
-            mine.get(("1", s.first), (s.second, s.key)) != (s.second, s.key)
-            or mine.get(("2", s.second), s.first) != s.first
-            for s in other.matches
+            (mine.index, mine.key) != (its.index, its.key)
+            for mine in self.matches
+            for its in other.matches
+            if mine.index[0] == its.index[0] or mine.index[1] == its.index[1]
         )
 
 
-def ranked_assignments(
-    matches: Sequence[BoardMatch], view1: ImageObservations, view2: ImageObservations, kinds: Sequence[BoardKind]
-) -> list[Assignment]:
+Name = frozenset[tuple[tuple[int, int], tuple[int, ...]]]
+"""What an assignment assigns: the detections and key of each match."""
+
+
+def _name(matches: Iterable[BoardMatch]) -> Name:
+    return frozenset((match.index, match.key) for match in matches)
+
+
+def ranked_assignments(pair: ImagePair) -> list[Assignment]:
     """Return distinct assignments with their joint fits, best first; raises DegenerateError if there is none."""
-    predictor = _Predictor.build(matches, view2, kinds)
+    matches, predictor = pair.matches, _Predictor.build(pair)
     # Whole boards first: a part of a board has many possible positions, most of them wrong.
-    open_places = Counter((s.first, s.second) for s in matches)
-    seeds = np.array(
-        sorted(range(len(matches)), key=lambda n: open_places[matches[n].first, matches[n].second])[:MAX_SEEDS]
-    )
+    open_places = Counter(match.index for match in matches)
+    seeds = np.array(sorted(range(len(matches)), key=lambda n: open_places[matches[n].index])[:MAX_SEEDS])
     motions = predictor.cam2_from_board[seeds] @ np.linalg.inv(predictor.cam1_from_board[seeds])
     misses = predictor.misses(motions)
-    starts: dict[frozenset[tuple[int, tuple[int, ...]]], tuple[float, FloatArray, list[int]]] = {}
+    starts: dict[Name, tuple[float, FloatArray, list[int]]] = {}
     for motion, miss in zip(motions, misses, strict=True):
-        chosen = _choose(miss, SEED_GATE, matches, kinds)
+        chosen = _choose(pair, miss, SEED_GATE)
         if not chosen:
             continue
         total = sum(min(float(miss[n]), SEED_GATE) ** 2 for n in chosen) - SEED_GATE**2 * len(chosen)
-        name = frozenset((matches[n].first, (matches[n].second, *matches[n].key)) for n in chosen)
+        name = _name(matches[n] for n in chosen)
         if name not in starts or total < starts[name][0]:
             starts[name] = (total, motion, chosen)
     if not starts:
@@ -89,10 +89,10 @@ def ranked_assignments(
             "pair: no place of the cameras explains a single board in both images; check the sizes of the squares, and "
             "which calibration belongs to which image"
         )
-    found: dict[frozenset[tuple[int, tuple[int, ...]]], Assignment] = {}
+    found: dict[Name, Assignment] = {}
     for _, motion, chosen in sorted(starts.values(), key=lambda s: s[0])[:MAX_ASSIGNMENTS]:
-        assignment = _settle(motion, chosen, matches, predictor, view1, view2, kinds)
-        name = frozenset((s.first, (s.second, *s.key)) for s in assignment.matches)
+        assignment = _settle(pair, predictor, motion, chosen)
+        name = _name(assignment.matches)
         if name not in found or assignment.chi2 < found[name].chi2:
             found[name] = assignment
     return sorted(found.values(), key=lambda s: s.chi2)
@@ -110,22 +110,21 @@ class _Predictor:
     spacing_px: FloatArray
 
     @classmethod
-    def build(cls, matches: Sequence[BoardMatch], view2: ImageObservations, kinds: Sequence[BoardKind]) -> _Predictor:
-        in_cam1, rays, bases = [], [], []
-        for match in matches:
-            detection, observation = view2.detections[match.second], view2.observations[match.second]
-            outer = _outermost(detection)
-            points = kinds[match.kind].board.points(match.placement2.grid_of(detection)[outer])
-            in_cam1.append(points @ match.cam1_from_board[:3, :3].T + match.cam1_from_board[:3, 3])
-            rays.append(observation.rays[outer])
-            bases.append(observation.bases[outer])
+    def build(cls, pair: ImagePair) -> _Predictor:
+        in_cam1, rays, bases, view2 = [], [], [], pair.views[1]
+        for match in pair.matches:
+            second, cam1_from_board = match.index[1], match.cam_from_board[0]
+            outer = _outermost(view2.detections[second])
+            in_cam1.append(pair.points(match, 1)[outer] @ cam1_from_board[:3, :3].T + cam1_from_board[:3, 3])
+            rays.append(view2.observations[second].rays[outer])
+            bases.append(view2.observations[second].bases[outer])
         return cls(
-            np.stack([s.cam1_from_board for s in matches]),
-            np.stack([s.cam2_from_board for s in matches]),
+            np.stack([match.cam_from_board[0] for match in pair.matches]),
+            np.stack([match.cam_from_board[1] for match in pair.matches]),
             np.stack(in_cam1),
             np.stack(rays),
             np.stack(bases),
-            view2.spacing_px[[s.second for s in matches]],
+            view2.spacing_px[[match.index[1] for match in pair.matches]],
         )
 
     def misses(self, motions: FloatArray) -> FloatArray:
@@ -143,38 +142,30 @@ def _outermost(detection: BoardDetection) -> IntArray:
     return np.array([np.argmin(total), np.argmax(difference), np.argmax(total), np.argmin(difference)])
 
 
-def _choose(miss: FloatArray, gate: float, matches: Sequence[BoardMatch], kinds: Sequence[BoardKind]) -> list[int]:
+def _choose(pair: ImagePair, miss: FloatArray, gate: float) -> list[int]:
     """Return the matches chosen greedily by increasing error: each detection once, no kind more often than listed."""
     chosen: list[int] = []
-    first, second, used = set(), set(), [0] * len(kinds)
+    taken, used = set[tuple[int, int]](), [0] * len(pair.kinds)
     order = np.argsort(miss, kind="stable")
     for n in order[miss[order] < gate]:
-        match = matches[n]
-        if match.first in first or match.second in second or used[match.kind] == len(kinds[match.kind].boards):
+        match = pair.matches[n]
+        both = set(enumerate(match.index))
+        if both & taken or used[match.kind] == len(pair.kinds[match.kind].boards):
             continue
-        first.add(match.first)
-        second.add(match.second)
+        taken |= both
         used[match.kind] += 1
         chosen.append(int(n))
     return sorted(chosen)
 
 
-def _settle(
-    motion: FloatArray,
-    chosen: list[int],
-    matches: Sequence[BoardMatch],
-    predictor: _Predictor,
-    view1: ImageObservations,
-    view2: ImageObservations,
-    kinds: Sequence[BoardKind],
-) -> Assignment:
+def _settle(pair: ImagePair, predictor: _Predictor, motion: FloatArray, chosen: list[int]) -> Assignment:
     """Return the assignment after repeatedly refining it, dropping boards that do not fit and adding those that do."""
 
     def fit(candidates: list[int], start: FloatArray) -> tuple[float, JointPose]:
         """Return the error of the worst board in units of the gate, and the joint fit."""
-        some = [matches[n] for n in candidates]
-        pose = _fit(start, some, view1, view2, kinds, SEARCH_TOLERANCE)
-        return _worst(pose, some, view1, view2), pose
+        some = [pair.matches[n] for n in candidates]
+        pose = _fit(pair, start, some, SEARCH_TOLERANCE)
+        return _worst(pair, pose, some), pose
 
     seen: set[tuple[int, ...]] = set()
     for _ in range(MAX_SETTLE_ROUNDS):
@@ -187,42 +178,35 @@ def _settle(
             k = min(range(len(parts)), key=lambda k: fits[k][0])
             chosen, (worst, pose) = parts[k], fits[k]
         motion = pose.cam2_from_cam1
-        wider = _choose(predictor.misses(motion[None])[0], REJOIN_GATE, matches, kinds)
+        wider = _choose(pair, predictor.misses(motion[None])[0], REJOIN_GATE)
         if len(wider) < len(chosen) or tuple(wider) in seen:
             break
         chosen = wider
-    kept = tuple(matches[n] for n in chosen)
-    pose = _fit(motion, kept, view1, view2, kinds)
-    chi2_1, chi2_2 = view1.chi2_of_leaving_out(), view2.chi2_of_leaving_out()
-    for match, (one, two) in zip(kept, pose.chi2, strict=True):
-        chi2_1[match.first] = min(one, chi2_1[match.first])
-        chi2_2[match.second] = min(two, chi2_2[match.second])
-    return Assignment(kept, pose, chi2_1, chi2_2)
+    kept = tuple(pair.matches[n] for n in chosen)
+    pose = _fit(pair, motion, kept)
+    chi2_of = pair.views[0].chi2_of_leaving_out(), pair.views[1].chi2_of_leaving_out()
+    for match, own in zip(kept, pose.chi2, strict=True):
+        for chi2, index, value in zip(chi2_of, match.index, own, strict=True):
+            chi2[index] = min(value, chi2[index])
+    return Assignment(kept, pose, chi2_of)
 
 
-def _fit(
-    motion: FloatArray,
-    matches: Sequence[BoardMatch],
-    view1: ImageObservations,
-    view2: ImageObservations,
-    kinds: Sequence[BoardKind],
-    tolerance: float = 1e-9,
-) -> JointPose:
-    return refine_joint(
-        motion,
-        np.stack([s.cam1_from_board for s in matches]),
-        [view1.observations[s.first] for s in matches],
-        [kinds[s.kind].board.points(s.placement1.grid_of(view1.detections[s.first])) for s in matches],
-        [view2.observations[s.second] for s in matches],
-        [kinds[s.kind].board.points(s.placement2.grid_of(view2.detections[s.second])) for s in matches],
-        tolerance=tolerance,
+def _fit(pair: ImagePair, motion: FloatArray, matches: Sequence[BoardMatch], tolerance: float = 1e-9) -> JointPose:
+    first, second = (
+        BoardCorners.stack(
+            [view.observations[match.index[v]] for match in matches], [pair.points(match, v) for match in matches]
+        )
+        for v, view in enumerate(pair.views)
     )
+    start = np.stack([match.cam_from_board[0] for match in matches])
+    return refine_joint(motion, start, (first, second), tolerance=tolerance)
 
 
-def _worst(pose: JointPose, matches: Sequence[BoardMatch], view1: ImageObservations, view2: ImageObservations) -> float:
+def _worst(pair: ImagePair, pose: JointPose, matches: Sequence[BoardMatch]) -> float:
     """Return the largest rms distance of a board in one of the images, in units of the gate."""
-    gates = []
-    for match, squared in zip(matches, pose.squared_px, strict=True):
-        counts = [len(view1.observations[match.first].rays), len(view2.observations[match.second].rays)]
-        gates += [*(np.sqrt(squared / counts) / [view1.gate_px[match.first], view2.gate_px[match.second]])]
+    gates = [
+        np.sqrt(squared / len(view.observations[k].rays)) / view.gate_px[k]
+        for match, own in zip(matches, pose.squared_px, strict=True)
+        for view, k, squared in zip(pair.views, match.index, own, strict=True)
+    ]
     return float(max(gates))

@@ -1,16 +1,22 @@
-"""Ids and first corners of boards that look alike, by a rule on their positions as seen from camera 1."""
+"""Ids and first corners of boards that look alike, by a rule on their positions as seen from camera 1, or by measured
+angles between them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import permutations, product
 
 import numpy as np
 
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
-from rigkit.identification.placements import BoardKind
+from rigkit.core.truth import MeasuredAngle
+from rigkit.geometry.board_pose import facing_normal
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import angle_between
+from rigkit.identification.placements import BoardKind, board_kinds
 
 BOARD_SIDES: Mapping[str, tuple[float, float, float]] = {
     "left": (1.0, 0.0, 0.0),
@@ -24,6 +30,14 @@ THREE = ("right", "floor", "left")
 """Default sides of three boards of one kind in the order listed, clockwise in a corner of a room."""
 LEVEL_COSINE = float(np.sqrt(0.5))
 """Boards within 45 degrees of level are on the floor or the ceiling."""
+POSED_SIGMA_DEG = 0.3
+"""Upper bound of the standard deviation of the angle between two boards from their poses in a pair."""
+ANGLE_ODDS = 2.0 * np.log(1000.0)
+"""Difference of chi2 at which angles decide between ids, equal to the odds in `rigkit.identification.identify`."""
+MAX_ANGLE_SIGMAS = 4.0
+"""Largest residual of an angle, in sigmas, under the ids chosen."""
+MAX_ALIKE = 6
+"""Largest number of boards of one kind whose permutations are tried."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -177,3 +191,49 @@ def _by_shape(
     first = [n for n in order if n in lying]
     rest = [n for n in order if n not in lying]
     return [*zip(alike, first, strict=False), *zip(swapped, rest, strict=False)]
+
+
+def ids_by_angles(
+    cam1_from_board: Mapping[str, Rigid3], boards: Sequence[Board], angles: Sequence[MeasuredAngle]
+) -> list[dict[str, str]]:
+    """Return permuted ids of those of `boards` that look alike, if the angles clearly favour them; else an empty list.
+
+    Parameters
+    ----------
+    cam1_from_board : poses of the boards of a pair, as identified without the angles.
+    boards : the boards whose ids may be permuted.
+    angles : measured between boards.
+
+    Returns
+    -------
+    Each entry maps present to new ids. If the angles favour several equally, all are returned, fewest changes first.
+    """
+    faces = {board_id: facing_normal(pose) for board_id, pose in cam1_from_board.items()}
+    known = [a for a in angles if a.a in faces and a.b in faces]
+    choices = list(_exchanged_ids([b for b in boards if b.board_id in faces])) if known else []
+    if not choices:
+        return []
+
+    def deviations(names: Mapping[str, str]) -> FloatArray:
+        """Return the residuals of the angles, in sigmas, if the board with id k is `names[k]`."""
+        face_of = {names.get(k, k): face for k, face in faces.items()}
+        ours = [180.0 - np.rad2deg(angle_between(face_of[a.a], face_of[a.b])) for a in known]
+        sigma = np.hypot([a.sigma_deg for a in known], POSED_SIGMA_DEG)
+        return np.asarray((np.array(ours) - [a.value_deg for a in known]) / sigma)
+
+    own, *others = (deviations(names) for names in ({}, *choices))
+    chi2 = np.sum(np.square(others), axis=1)
+    enough = min(float(chi2.min()) + ANGLE_ODDS, float(own @ own) - ANGLE_ODDS)
+    fitting = [n for n, off in enumerate(others) if chi2[n] <= enough and np.abs(off).max() <= MAX_ANGLE_SIGMAS]
+    # Right angles favour several permutations equally: the one with the fewest changes comes first.
+    renamed = [{k: other for k, other in choices[n].items() if k != other} for n in fitting]
+    return sorted(renamed, key=len)
+
+
+def _exchanged_ids(boards: Sequence[Board]) -> Iterator[dict[str, str]]:
+    """Yield every permutation of ids among boards that look alike, except the identity."""
+    alike = [kind.ids for kind in board_kinds(boards) if 1 < len(kind.ids) <= MAX_ALIKE]
+    for orders in product(*(permutations(ids) for ids in alike)):
+        names = {a: b for ids, order in zip(alike, orders, strict=True) for a, b in zip(ids, order, strict=True)}
+        if any(a != b for a, b in names.items()):
+            yield names

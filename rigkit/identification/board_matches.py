@@ -29,25 +29,23 @@ TILT_RMS_PX = 0.5
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class BoardMatch:
-    """The hypothesis that detection `first` of image 1 and `second` of image 2 are one board of a kind.
+    """The hypothesis that a detection of image 1 and one of image 2 are one board of a kind.
 
     Attributes
     ----------
+    index : of both detections.
     key : equal for all placements and poses with the same correspondence of corners.
-    placement1, placement2 : grids of the detections to the grid of the board.
-    cam1_from_board, cam2_from_board : (4, 4)
+    placement : grids of both detections to the grid of the board.
+    cam_from_board : (4, 4) of both cameras.
     against_colour : whether the two differ by a rotation of 90 degrees that contradicts the colours of the squares, on
         a square board with an odd number of corners per side.
     """
 
-    first: int
-    second: int
+    index: tuple[int, int]
     kind: int
     key: tuple[int, ...]
-    placement1: Placement
-    placement2: Placement
-    cam1_from_board: FloatArray
-    cam2_from_board: FloatArray
+    placement: tuple[Placement, Placement]
+    cam_from_board: tuple[FloatArray, FloatArray]
     against_colour: bool
 
 
@@ -144,6 +142,14 @@ class GridPoses:
         grid_from_board = np.linalg.inv(placement.board_from_grid(detection, board))
         return [(pose @ grid_from_board, chi2) for pose, chi2 in self.known[index, steps]]
 
+    def best_chi2(self) -> FloatArray:
+        """Return the smallest chi2 (D,) of each detection among the known poses, NaN without one."""
+        best = np.full(len(self.view.detections), np.nan)
+        for (index, _), found in self.known.items():
+            for _, chi2 in found:
+                best[index] = np.fmin(best[index], chi2)
+        return best
+
     def _tilts(self, index: int, points: Points) -> Tilts:
         """Return the poses of a detection with its corners at `points` (N, 3) mm."""
         observation = self.view.observations[index]
@@ -162,26 +168,49 @@ class GridPoses:
         return out
 
 
-def matches_between(
-    view1: ImageObservations, view2: ImageObservations, kinds: Sequence[BoardKind]
-) -> tuple[list[BoardMatch], FloatArray, FloatArray]:
-    """Return all candidate matches, and the chi2 of each detection's own best pose in image 1 and 2 (NaN without)."""
-    poses1, poses2 = GridPoses(view1), GridPoses(view2)
-    matches: list[BoardMatch] = []
-    for i, detection1 in enumerate(view1.detections):
-        for j, detection2 in enumerate(view2.detections):
-            if len({detection1.board_id, detection2.board_id} - {None}) > 1:
-                continue
-            for k in sorted(set(view1.kinds[i]) & set(view2.kinds[j])):
-                matches += _matches_of_pair(i, j, k, kinds[k], poses1, poses2)
-    free = []
-    for view, poses in ((view1, poses1), (view2, poses2)):
-        best = np.full(len(view.detections), np.nan)
-        for (index, _), found in poses.known.items():
-            for _, chi2 in found:
-                best[index] = np.fmin(best[index], chi2)
-        free.append(best)
-    return matches, free[0], free[1]
+@dataclass(frozen=True, eq=False, slots=True)
+class ImagePair:
+    """Two images of some boards.
+
+    Attributes
+    ----------
+    views : the detections of both images.
+    kinds : of the boards that may be visible.
+    matches : all candidate matches.
+    free : chi2 (D,) of each detection's own best pose, in both images; NaN without one.
+    """
+
+    views: tuple[ImageObservations, ImageObservations]
+    kinds: Sequence[BoardKind]
+    matches: Sequence[BoardMatch]
+    free: tuple[FloatArray, FloatArray]
+
+    @classmethod
+    def of(
+        cls,
+        detections: tuple[Sequence[BoardDetection], Sequence[BoardDetection]],
+        kinds: Sequence[BoardKind],
+        cameras: tuple[Camera, Camera],
+    ) -> ImagePair:
+        """Build with all candidate matches; raises InputError if an id occurs twice in an image."""
+        view1, view2 = (
+            ImageObservations.of(own, kinds, camera, image)
+            for own, camera, image in zip(detections, cameras, ("image 1", "image 2"), strict=True)
+        )
+        poses1, poses2 = GridPoses(view1), GridPoses(view2)
+        matches: list[BoardMatch] = []
+        for i, detection1 in enumerate(view1.detections):
+            for j, detection2 in enumerate(view2.detections):
+                if len({detection1.board_id, detection2.board_id} - {None}) > 1:
+                    continue
+                for k in sorted(set(view1.kinds[i]) & set(view2.kinds[j])):
+                    matches += _matches_of_pair(i, j, k, kinds[k], poses1, poses2)
+        return cls((view1, view2), kinds, matches, (poses1.best_chi2(), poses2.best_chi2()))
+
+    def points(self, match: BoardMatch, v: int) -> Points:
+        """Return the corners that image `v` (0 or 1) shows of a match, (N, 3) mm in the frame of the board."""
+        detection = self.views[v].detections[match.index[v]]
+        return self.kinds[match.kind].board.points(match.placement[v].grid_of(detection))
 
 
 def _matches_of_pair(i: int, j: int, k: int, kind: BoardKind, poses1: GridPoses, poses2: GridPoses) -> list[BoardMatch]:
@@ -199,14 +228,11 @@ def _matches_of_pair(i: int, j: int, k: int, kind: BoardKind, poses1: GridPoses,
             against = square and kind.board.columns % 2 == 1 and odd
             matches += [
                 BoardMatch(
-                    first=i,
-                    second=j,
+                    index=(i, j),
                     kind=k,
                     key=key,
-                    placement1=placement1,
-                    placement2=placement2,
-                    cam1_from_board=pose1,
-                    cam2_from_board=pose2,
+                    placement=(placement1, placement2),
+                    cam_from_board=(pose1, pose2),
                     against_colour=against,
                 )
                 for pose1, _ in poses1.placed(i, kind, placement1)

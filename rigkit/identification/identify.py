@@ -20,17 +20,47 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.truth import MeasuredAngle
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.identification.assignments import Assignment, ranked_assignments
-from rigkit.identification.board_ids import LocatedBoard, assign_board_ids, first_corner_turn
-from rigkit.identification.board_matches import GridPoses, ImageObservations, matches_between
-from rigkit.identification.joint_pose import BoardObservation, JointPose, refine_joint
-from rigkit.identification.measured_angles import ids_by_angles
-from rigkit.identification.pair_identity import PairIdentity
+from rigkit.identification.board_ids import LocatedBoard, assign_board_ids, first_corner_turn, ids_by_angles
+from rigkit.identification.board_matches import GridPoses, ImageObservations, ImagePair
+from rigkit.identification.joint_pose import BoardCorners, BoardObservation, refine_joint
 from rigkit.identification.placements import BoardKind, Placement, board_kinds, describe, placements
 
 LOG_ODDS = float(np.log(1000.0))
 """Log odds of a thousand to one, below which two assignments are tied."""
 RESIDUAL_FLOOR_PX = 0.01
 """Lower bound of the residuals due to imperfect calibrations and boards."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class PairIdentity:
+    """Boards of two images, with ids and orientations such that a corner has the same grid index in both.
+
+    Attributes
+    ----------
+    detections1, detections2 : the identified boards of each image: first those seen in both, in the same order, that of
+        the boards listed; then those seen in that image only.
+    cam2_from_cam1 : metric relative pose, refined over all corners of the boards seen in both images.
+    cam1_from_board : pose of every identified board, from both images if both see it.
+    residual_px : rms reprojection error (2-D per corner, both images).
+    ambiguous : whether geometry alone does not distinguish the result from another assignment; it is then the one with
+        the smallest roll between the cameras, and `notes` says so.
+    missing : why a listed board is not in both lists, by board id.
+    notes : assumptions, and detections or corners that were left out, in words.
+    """
+
+    detections1: tuple[BoardDetection, ...]
+    detections2: tuple[BoardDetection, ...]
+    cam2_from_cam1: Rigid3
+    cam1_from_board: Mapping[str, Rigid3]
+    residual_px: float
+    ambiguous: bool
+    missing: Mapping[str, str]
+    notes: tuple[str, ...] = ()
+
+    def pairs(self) -> tuple[tuple[BoardDetection, BoardDetection], ...]:
+        """Return (detection in image 1, detection in image 2) of every board seen in both."""
+        second = {d.board_id: d for d in self.detections2}
+        return tuple((d, second[d.board_id]) for d in self.detections1 if d.board_id in second)
 
 
 def identify_pair(
@@ -66,27 +96,23 @@ def identify_pair(
     by the smallest roll between the cameras, and reported.
     """
     kinds = _checked_kinds(boards)
-    views = (
-        ImageObservations.of(detections1, kinds, camera1, "image 1"),
-        ImageObservations.of(detections2, kinds, camera2, "image 2"),
-    )
-    matches, free1, free2 = matches_between(*views, kinds)
-    if not matches:
-        raise DegenerateError(_nothing_shared(views, kinds))
-    ranked = ranked_assignments(matches, *views, kinds)
+    pair = ImagePair.of((detections1, detections2), kinds, (camera1, camera2))
+    if not pair.matches:
+        raise DegenerateError(_nothing_shared(pair))
+    ranked = ranked_assignments(pair)
     best = ranked[0]
-    tied = [s for s in ranked if s is best or _log_odds(best, s, free1, free2, views) < LOG_ODDS]
+    tied = [s for s in ranked if s is best or _log_odds(pair, best, s) < LOG_ODDS]
     winner = min(tied, key=lambda s: (-len(s.matches), sum(x.against_colour for x in s.matches), _roll_rad(s)))
-    identity = _result(winner, tied, views, kinds, boards, layout)
+    identity = _result(pair, winner, tied, boards, layout)
     given = {d.board_id for d in (*detections1, *detections2)} | set(layout or ())
-    fitting = ids_by_angles(identity, [b for b in boards if b.board_id not in given], angles)
+    fitting = ids_by_angles(identity.cam1_from_board, [b for b in boards if b.board_id not in given], angles)
     if not fitting:
         return identity
     message = f"boards {', '.join(sorted(fitting[0]))} look alike and were identified by the measured angles"
     if len(fitting) > 1:
         message += f", which {len(fitting)} orders of the names fit: the one with the fewest changes was taken"
     notes = (*identity.notes, f"{message}; give a layout to identify them for certain")
-    return replace(_result(winner, tied, views, kinds, boards, layout, fitting[0]), notes=notes)
+    return replace(_result(pair, winner, tied, boards, layout, fitting[0]), notes=notes)
 
 
 def _checked_kinds(boards: Sequence[Board]) -> tuple[BoardKind, ...]:
@@ -98,9 +124,9 @@ def _checked_kinds(boards: Sequence[Board]) -> tuple[BoardKind, ...]:
     return board_kinds(boards)
 
 
-def _nothing_shared(views: tuple[ImageObservations, ImageObservations], kinds: Sequence[BoardKind]) -> str:
-    counts = [sum(bool(k) for k in view.kinds) for view in views]
-    listed = ", ".join(f"{i} ({k.board.columns}x{k.board.rows})" for k in kinds for i in k.ids)
+def _nothing_shared(pair: ImagePair) -> str:
+    counts = [sum(bool(k) for k in view.kinds) for view in pair.views]
+    listed = ", ".join(f"{i} ({k.board.columns}x{k.board.rows})" for k in pair.kinds for i in k.ids)
     return (
         f"no listed board is seen in both images (listed boards in image 1: {counts[0]}, in image 2: {counts[1]}; "
         f"listed: {listed}); check the board sizes and that both images show the same boards"
@@ -113,23 +139,17 @@ def _roll_rad(assignment: Assignment) -> float:
     return abs(float(np.arctan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1])))
 
 
-def _log_odds(
-    best: Assignment,
-    other: Assignment,
-    free1: FloatArray,
-    free2: FloatArray,
-    views: tuple[ImageObservations, ImageObservations],
-) -> float:
+def _log_odds(pair: ImagePair, best: Assignment, other: Assignment) -> float:
     """Return the log odds of the best assignment against another (see the notes of `identify_pair`)."""
-    first, second = [s.first for s in best.matches], [s.second for s in best.matches]
-    free = float(free1[first].sum() + free2[second].sum())
-    counts = [len(views[0].observations[i].rays) for i in first] + [len(views[1].observations[j].rays) for j in second]
-    sigma2 = [np.mean(views[0].observations[i].sigma_px ** -2.0) for i in first]
-    sigma2 += [np.mean(views[1].observations[j].sigma_px ** -2.0) for j in second]
+    index = [[match.index[v] for match in best.matches] for v in (0, 1)]
+    free = sum(float(chi2[own].sum()) for chi2, own in zip(pair.free, index, strict=True))
+    joint = sum(float(chi2[own].sum()) for chi2, own in zip(best.chi2_of, index, strict=True))
+    seen = [view.observations[k] for view, own in zip(pair.views, index, strict=True) for k in own]
+    sigma2 = [np.mean(observation.sigma_px**-2.0) for observation in seen]
     constraints = 6 * (len(best.matches) - 1)
-    noise = free / max(2 * sum(counts) - 6 * len(counts), 1)
+    noise = free / max(2 * sum(len(observation.rays) for observation in seen) - 6 * len(seen), 1)
     floor = max(constraints, 1) * max(noise, RESIDUAL_FLOOR_PX**2 * float(np.mean(sigma2)))
-    excess = max(float(best.chi2_1[first].sum() + best.chi2_2[second].sum()) - free, floor)
+    excess = max(joint - free, floor)
     return 0.5 * constraints * float(np.log((excess + max(other.chi2 - best.chi2, 0.0)) / excess))
 
 
@@ -153,21 +173,16 @@ class _MatchedBoard:
     placement: tuple[Placement, Placement]
 
 
-def _identified_boards(
-    winner: Assignment, views: tuple[ImageObservations, ImageObservations], kinds: Sequence[BoardKind]
-) -> tuple[list[_MatchedBoard], list[tuple[int, int]]]:
+def _identified_boards(pair: ImagePair, winner: Assignment) -> tuple[list[_MatchedBoard], list[tuple[int, int]]]:
     """Return the boards of the winner and listed boards in one image only, and the other detections.
 
     The other detections are (image 0 or 1, index).
     """
-    out = []
+    out, views, kinds = [], pair.views, pair.kinds
     for match, pose in zip(winner.matches, winner.pose.cam1_from_board, strict=True):
-        name = views[0].detections[match.first].board_id or views[1].detections[match.second].board_id
-        out.append(
-            _MatchedBoard(
-                LocatedBoard(match.kind, pose, name), (match.first, match.second), (match.placement1, match.placement2)
-            )
-        )
+        names = [view.detections[k].board_id for view, k in zip(views, match.index, strict=True)]
+        located = LocatedBoard(match.kind, pose, names[0] or names[1])
+        out.append(_MatchedBoard(located, match.index, match.placement))
     vacant = [len(kind.boards) - sum(s.located.kind == k for s in out) for k, kind in enumerate(kinds)]
     left_over = []
     cam1_from_cam = (np.eye(4), np.linalg.inv(winner.pose.cam2_from_cam1))
@@ -190,10 +205,9 @@ def _identified_boards(
 
 
 def _result(
+    pair: ImagePair,
     winner: Assignment,
     tied: Sequence[Assignment],
-    views: tuple[ImageObservations, ImageObservations],
-    kinds: Sequence[BoardKind],
     boards: Sequence[Board],
     layout: Mapping[str, str] | None,
     renamed: Mapping[str, str] | None = None,
@@ -202,7 +216,8 @@ def _result(
 
     `renamed` maps ids from `assign_board_ids` to the final ones.
     """
-    seen, left_over = _identified_boards(winner, views, kinds)
+    views, kinds = pair.views, pair.kinds
+    seen, left_over = _identified_boards(pair, winner)
     names, notes = assign_board_ids([s.located for s in seen], kinds, layout)
     names = [(renamed or {}).get(name, name) for name in names]
     by_id = {b.board_id: b for b in boards}
@@ -221,7 +236,14 @@ def _result(
         whole = BoardDetection(None, *kind.board.size, np.zeros((0, 2), int), np.zeros((0, 2)), np.zeros(0))
         start[name] = item.located.cam1_from_board @ np.linalg.inv(Placement(turn).board_from_grid(whole, board))
     both = [b.board_id for b in boards if b.board_id in detections[0] and b.board_id in detections[1]]
-    pose = _refined(winner.pose.cam2_from_cam1, start, both, detections, by_id, views)
+    first, second = (
+        BoardCorners.stack(
+            [BoardObservation.of(view.camera, own[i].pixels, own[i].sigma_px, i) for i in both],
+            [by_id[i].points(own[i].grid) for i in both],
+        )
+        for view, own in zip(views, detections, strict=True)
+    )
+    pose = refine_joint(winner.pose.cam2_from_cam1, np.stack([start[i] for i in both]), (first, second))
     for k, board_id in enumerate(both):
         start[board_id] = pose.cam1_from_board[k]
     corners = np.array([[len(d[i].grid) for d in detections] for i in both])
@@ -239,23 +261,6 @@ def _result(
         missing=_missing(boards, detections),
         notes=(*views[0].notes, *views[1].notes, *notes, *lost, *ties),
     )
-
-
-def _refined(
-    cam2_from_cam1: FloatArray,
-    cam1_from_board: Mapping[str, FloatArray],
-    both: Sequence[str],
-    detections: tuple[Mapping[str, BoardDetection], Mapping[str, BoardDetection]],
-    boards: Mapping[str, Board],
-    views: tuple[ImageObservations, ImageObservations],
-) -> JointPose:
-    observations1, observations2 = (
-        [BoardObservation.of(view.camera, d[i].pixels, d[i].sigma_px, i) for i in both]
-        for view, d in zip(views, detections, strict=True)
-    )
-    points1, points2 = ([boards[i].points(d[i].grid) for i in both] for d in detections)
-    start = np.stack([cam1_from_board[i] for i in both])
-    return refine_joint(cam2_from_cam1, start, observations1, points1, observations2, points2)
 
 
 def _why_left_over(image: int, view: ImageObservations, index: int) -> str:

@@ -92,10 +92,7 @@ class BoardCorners:
 def refine_joint(
     cam2_from_cam1: FloatArray,
     cam1_from_board: FloatArray,
-    observations1: Sequence[BoardObservation],
-    points1: Sequence[Points],
-    observations2: Sequence[BoardObservation],
-    points2: Sequence[Points],
+    images: tuple[BoardCorners, BoardCorners],
     *,
     tolerance: float = 1e-9,
 ) -> JointPose:
@@ -104,11 +101,9 @@ def refine_joint(
     Parameters
     ----------
     cam2_from_cam1, cam1_from_board : (4, 4) and (B, 4, 4) initial poses.
-    observations1, observations2 : of B boards in image 1 and 2.
-    points1, points2 : their corners in the frame of the board, mm; the images may show different corners.
+    images : corners of the B boards in image 1 and 2, which may show different ones.
     tolerance : relative decrease of the cost below which the minimisation stops.
     """
-    images = BoardCorners.stack(observations1, points1), BoardCorners.stack(observations2, points2)
 
     def linearise(poses: tuple[FloatArray, FloatArray]) -> DenseProblem:
         return DenseProblem(*joint_residuals(images, *poses))

@@ -7,7 +7,7 @@ relative pose of the cameras, and the scale of a board that both images show is 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.board_pose import point_residuals
 from rigkit.identification.assignments import ranked_assignments
-from rigkit.identification.board_matches import BoardMatch, ImageObservations, matches_between
+from rigkit.identification.board_matches import BoardMatch, ImagePair
 from rigkit.identification.placements import SAME_SQUARE_REL, BoardKind, board_kinds, describe
 
 
@@ -50,60 +50,48 @@ def fitting_squares(
     Of two boards either may be the wrong one. The result is empty if the others do not fit each other, or if the
     remaining detections fit at no size, or at about the declared one.
     """
-    kinds = board_kinds(boards)
-    view1 = ImageObservations.of(detections1, kinds, camera1, "image 1")
-    view2 = ImageObservations.of(detections2, kinds, camera2, "image 2")
-    matches, _, _ = matches_between(view1, view2, kinds)
+    pair = ImagePair.of((detections1, detections2), board_kinds(boards), (camera1, camera2))
     out = []
-    for k, kind in enumerate(kinds):
+    for k, kind in enumerate(pair.kinds):
         sized = [
-            (*_sized(match, view2, kind.board, pose), match.first)
-            for pose, free in _poses_by_others(k, matches, view1, view2, kinds)
-            for match in free
+            (*_sized(pair, match, pose), match.index[0]) for pose, free in _poses_by_others(pair, k) for match in free
         ]
         off, factor, first = min(sized, default=(np.inf, 1.0, 0))
         # A difference within the tolerance of one kind does not explain why a board was not identified.
         if off <= 1.0 and abs(factor - 1.0) > SAME_SQUARE_REL:
-            out.append(FittingSquares(kind.boards, factor, describe(view1.detections[first])))
+            out.append(FittingSquares(kind.boards, factor, describe(pair.views[0].detections[first])))
     return tuple(out)
 
 
-def _poses_by_others(
-    k: int,
-    matches: Sequence[BoardMatch],
-    view1: ImageObservations,
-    view2: ImageObservations,
-    kinds: Sequence[BoardKind],
-) -> Iterator[tuple[FloatArray, list[BoardMatch]]]:
+def _poses_by_others(pair: ImagePair, k: int) -> Iterator[tuple[FloatArray, list[BoardMatch]]]:
     """Yield each cam2_from_cam1 (4, 4) at which all boards but one of kind `k` fit, with the matches of that kind among
     the remaining detections."""
+    kinds = pair.kinds
     one_less = [BoardKind(kind.boards[:-1] or kind.boards) if j == k else kind for j, kind in enumerate(kinds)]
-    of_others = [match for match in matches if match.kind != k or len(kinds[k].boards) > 1]
+    of_others = [match for match in pair.matches if match.kind != k or len(kinds[k].boards) > 1]
     if not of_others:
         return
     try:
-        ranked = ranked_assignments(of_others, view1, view2, one_less)
+        ranked = ranked_assignments(replace(pair, kinds=one_less, matches=of_others))
     except DegenerateError:
         return
     for assignment in ranked:
         if len(assignment.matches) == sum(len(kind.boards) for kind in kinds) - 1:
-            first, second = ({getattr(m, side) for m in assignment.matches} for side in ("first", "second"))
-            free = [m for m in matches if m.kind == k and m.first not in first and m.second not in second]
+            taken = {at for match in assignment.matches for at in enumerate(match.index)}
+            free = [match for match in pair.matches if match.kind == k and not taken & set(enumerate(match.index))]
             yield assignment.pose.cam2_from_cam1, free
 
 
-def _sized(
-    match: BoardMatch, view2: ImageObservations, board: Board, cam2_from_cam1: FloatArray
-) -> tuple[float, float]:
+def _sized(pair: ImagePair, match: BoardMatch, cam2_from_cam1: FloatArray) -> tuple[float, float]:
     """Return the rms residual in image 2, in units of the gate, of a board posed in image 1 at its best size, and the
     factor f of that size.
 
     A board of f times the size is f times as far away, with corners at f X. Image 2 sees them along rays r with
     r x (f R X + t) = 0, which is linear in f.
     """
-    observed = view2.observations[match.second]
-    points = board.points(match.placement2.grid_of(view2.detections[match.second]))
-    placed = points @ match.cam1_from_board[:3, :3].T + match.cam1_from_board[:3, 3]
+    second, cam1_from_board = match.index[1], match.cam_from_board[0]
+    observed = pair.views[1].observations[second]
+    placed = pair.points(match, 1) @ cam1_from_board[:3, :3].T + cam1_from_board[:3, 3]
     turned = placed @ cam2_from_cam1[:3, :3].T
     scaled_part = np.cross(observed.rays, turned)
     constant_part = np.cross(observed.rays, np.broadcast_to(cam2_from_cam1[:3, 3], turned.shape))
@@ -111,4 +99,4 @@ def _sized(
     if factor <= 0.0:
         return np.inf, factor
     off, _ = point_residuals(observed.rays, observed.bases, factor * turned + cam2_from_cam1[:3, 3])
-    return float(np.sqrt((off**2).sum(axis=1).mean()) / view2.gate_px[match.second]), factor
+    return float(np.sqrt((off**2).sum(axis=1).mean()) / pair.views[1].gate_px[second]), factor

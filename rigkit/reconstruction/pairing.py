@@ -24,8 +24,7 @@ from rigkit.core.matches import DirectionPairs, Matches
 from rigkit.core.patterns.base import Pattern
 from rigkit.core.printing import brief
 from rigkit.core.truth import MeasuredAngle
-from rigkit.identification.identify import identify_pair
-from rigkit.identification.pair_identity import PairIdentity
+from rigkit.identification.identify import PairIdentity, identify_pair
 
 Chain = Literal["raw", "rectified"]
 

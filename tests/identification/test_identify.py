@@ -28,8 +28,7 @@ from rigkit.core.detections import BoardDetection, common_corners
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle
-from rigkit.identification.identify import identify_pair
-from rigkit.identification.pair_identity import PairIdentity
+from rigkit.identification.identify import PairIdentity, identify_pair
 
 POSE_RAD = 2e-3
 """0.05 px at 1356 px over three boards gives about 1e-4 rad; a wrong assignment is off by tens of degrees."""
