@@ -6,9 +6,9 @@ from rigkit.affine.homography import affines_from_homography as affines_from_hom
 from rigkit.affine.homography import homography_from_affines as homography_from_affines
 from rigkit.affine.homography import homography_from_plane as homography_from_plane
 from rigkit.affine.mixed import affines_from_mixed_directions as affines_from_mixed_directions
+from rigkit.affine.normal import affines_from_normals as affines_from_normals
 from rigkit.affine.normal import normals_from_affines as normals_from_affines
 from rigkit.affine.registry import affines_from_directions as affines_from_directions
-from rigkit.affine.surface import affines_from_normals as affines_from_normals
 from rigkit.calibration.calibrate import calibrate as calibrate
 from rigkit.calibration.hand_eye import HandEye as HandEye
 from rigkit.calibration.hand_eye import hand_eye as hand_eye

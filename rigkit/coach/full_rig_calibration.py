@@ -22,10 +22,9 @@ from rigkit.coach.guide import GuideOptions, relative_gain
 from rigkit.core.arrays import Pixels
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.planning.goal import RemainingError, Requirement, projection_goal
+from rigkit.planning.goal import RemainingError, Requirement, projection_goal, rig_goal
 from rigkit.planning.instructions import placement
 from rigkit.planning.plan import Plan, covariance_of
-from rigkit.planning.rig_goal import rig_goal
 from rigkit.validation.monitoring.evidence import Monitored, board_information
 from rigkit.validation.monitoring.frames import Frames
 from rigkit.validation.monitoring.watch import monitored_rig

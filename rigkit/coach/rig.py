@@ -34,9 +34,8 @@ from rigkit.core.errors import DegenerateError
 from rigkit.core.processes import SerialExecutor
 from rigkit.planning.candidates import board_poses_in_view, outline_mm
 from rigkit.planning.goal import RemainingError
-from rigkit.planning.information import BoardPoses
+from rigkit.planning.information import BoardPoses, SharedViews, median_motion, mount_error_px, mount_information
 from rigkit.planning.instructions import placement
-from rigkit.planning.mounts import SharedViews, median_motion, mount_error_px, mount_information
 
 SHARED_FRAMES = 5
 """With fewer boards seen by two cameras at once, their disagreement cannot be estimated."""

@@ -18,7 +18,7 @@ from rigkit.geometry.rotation import angle_between, skew
 from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
-from rigkit.relative_pose.refinement.noise_level import variance_factor
+from rigkit.relative_pose.refinement.refine import variance_factor
 
 MIN_CORNERS_OF_BOARD = 8
 """Fewer corners in a view do not determine the board's pose well enough."""

@@ -18,8 +18,7 @@ from rigkit.core.printing import brief
 from rigkit.reconstruction.metric import MetricPose, TriangulatedPoints, metric_pose, triangulate_matches
 from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
-from rigkit.relative_pose.refinement.noise_level import POSE_FREEDOM, variance_factor
-from rigkit.relative_pose.refinement.refine import RefinedPose, refine_pose, rules_out
+from rigkit.relative_pose.refinement.refine import POSE_FREEDOM, RefinedPose, refine_pose, rules_out, variance_factor
 from rigkit.relative_pose.refinement.select import (
     DEFAULT_LEVEL_RAD,
     EXACT_LEVEL_RAD,

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.affine.affinities import Affinities, EpipolarNormals
-from rigkit.affine.geometry_noise import geometry_covariance
-from rigkit.affine.normal import estimate_normals
+from rigkit.affine.normal import estimate_normals, geometry_covariance
 from rigkit.affine.registry import affines_from_directions, needs_epipolar
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera

@@ -17,7 +17,7 @@ from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL, MEDIAN_OF_RAYLEIGH
 from rigkit.reconstruction.geometry import decide_pose_type
 from rigkit.reconstruction.moved_cameras import visible_in_all
-from rigkit.relative_pose.refinement.marginal import QUANTILE, marginal_quality
+from rigkit.relative_pose.refinement.local import QUANTILE, marginal_quality
 from rigkit.relative_pose.refinement.pose_problem import cauchy_weights
 from rigkit.relative_pose.refinement.refine import RefinedPose, refine_pose
 from rigkit.relative_pose.robust.a_contrario import log_false_alarms

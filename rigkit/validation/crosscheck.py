@@ -24,7 +24,7 @@ from rigkit.geometry.rotation import angle_between, log_so3, rotation_angle, uni
 from rigkit.interop.colmap import colmap_pair, solve_pair
 from rigkit.reconstruction.calibration_shifts import CalibrationShifts
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.relative_pose.refinement.noise_level import POSE_FREEDOM
+from rigkit.relative_pose.refinement.refine import POSE_FREEDOM
 from rigkit.validation.check import Check, compare
 from rigkit.validation.colmap_method import colmap_reconstruction
 from rigkit.validation.measure import Measured, measure

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.affine.surface import affines_from_normals
+from rigkit.affine.normal import affines_from_normals
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.matches import Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians

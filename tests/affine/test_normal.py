@@ -7,9 +7,8 @@ import pytest
 from helpers.affine_scenes import FISHEYE, REGULAR, Corners, angles_deg, general_pairs, see, special_boards, turned
 
 from rigkit.affine.affinities import DirectionNoise
-from rigkit.affine.normal import estimate_normals, normals_from_affines
+from rigkit.affine.normal import affines_from_normals, estimate_normals, normals_from_affines
 from rigkit.affine.registry import affines_from_directions
-from rigkit.affine.surface import affines_from_normals
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.rigid3 import Rigid3

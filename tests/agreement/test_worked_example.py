@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from rigkit.affine.affinities import EpipolarNormals
-from rigkit.affine.normal import normals_from_affines
+from rigkit.affine.normal import affines_from_normals, normals_from_affines
 from rigkit.affine.registry import affines_from_directions
-from rigkit.affine.surface import affines_from_normals
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.matches import DirectionPairs, Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians

@@ -41,8 +41,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, log_so3, unit
 from rigkit.io.manifests.rig_session import load_rig_session
 from rigkit.planning.candidates import board_poses_in_view
-from rigkit.planning.information import CornerError
-from rigkit.planning.mounts import SharedViews, median_motion, mount_error_px, mount_information
+from rigkit.planning.information import CornerError, SharedViews, median_motion, mount_error_px, mount_information
 from rigkit.workflows.capture.coach import open_coach
 from rigkit.workflows.options.coach import CoachOptions
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from rigkit.affine.affinities import EpipolarNormals
-from rigkit.affine.surface import affines_from_normals
+from rigkit.affine.normal import affines_from_normals
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole

@@ -16,8 +16,7 @@ from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.kernels.pose import five_rows, six_rows
-from rigkit.relative_pose.refinement.local import SampsonRows
-from rigkit.relative_pose.refinement.marginal import MarginalLoss
+from rigkit.relative_pose.refinement.local import MarginalLoss, SampsonRows
 from rigkit.relative_pose.refinement.pose_problem import PoseProblem, RobustWeights, cauchy_weights
 from rigkit.relative_pose.refinement.refine import refine_pose
 from rigkit.relative_pose.robust import robust

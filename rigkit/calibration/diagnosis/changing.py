@@ -4,6 +4,10 @@ The model has one lens and one board for all images. For each kind of change, th
 pose) are regressed on it: another focal length, a shift of the image, a motion during readout, another bend of the
 board. An error of the lens or board model that is common to all images explains a little of each kind; a real change
 explains far more by one kind than by all others.
+
+A focal length that drifts over a session (a zoom or focus that is turned little by little, a lens that warms up) is a
+trend over time of these amounts. An error of the model gives amounts that differ with the board's distance, place and
+tilt: the trend is tested beside these.
 """
 
 from __future__ import annotations
@@ -14,13 +18,13 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.assemble import with_solution
-from rigkit.calibration.diagnosis.drift import drifting
 from rigkit.calibration.diagnosis.flipped import flipped_images
 from rigkit.calibration.diagnosis.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.solver import solve
 from rigkit.calibration.views.observations import Observations
+from rigkit.cameras.base import image_center
 from rigkit.core.arrays import IntArray
 from rigkit.core.findings import Finding
 
@@ -90,6 +94,11 @@ is an error of the lens or board model."""
 MIN_SHARE_MOVED = 0.9
 """Part of the squares that a motion explains in that case: 0.97 and more where SIMULATED boards in hand move by
 pixels."""
+CHANCE_OF_DRIFT = 0.001
+"""Largest p-value of the trend."""
+MIN_FOCUS_RATIO = 6.0
+"""Variance that the focal lengths of single images explain, for each degree of freedom, over that of the rest."""
+MIN_IMAGES_OF_TREND = 10
 
 
 def changing(
@@ -200,3 +209,48 @@ def _solved_for(
         squares = ((residuals.px**2).sum(axis=-1) * weight**2).sum(axis=1)
         left = min(left, float(squares.sum() / before.sum()))
     return ViewChange.of(left, freedom, directions) if left < at_first.left else at_first
+
+
+def drifting(calibration: Calibration, evidence: ViewEvidence) -> Finding | None:
+    """Return a finding where the focal length changes with the order of the images."""
+    # Imported here: scipy is slow to import, and most calibrations need no test.
+    from scipy.special import stdtr
+
+    columns = columns_of(evidence.own.shape[1])["focus"]
+    if evidence.changes()["focus"].ratio < MIN_FOCUS_RATIO:
+        return None
+    views = [calibration.views[k] for k in evidence.views]
+    amounts = evidence.explained(columns)[2][:, 0]
+    images = {name: k for k, name in enumerate(dict.fromkeys(view.image for view in calibration.views))}
+    shown, number = np.unique([images[view.image] for view in views], return_inverse=True)
+    freedom = len(shown) - 5
+    if len(shown) < MIN_IMAGES_OF_TREND:
+        return None
+    centre = image_center(calibration.camera.size_px)
+    places = np.array(
+        [
+            (
+                np.linalg.norm(view.pixels.mean(axis=0) - centre),
+                np.linalg.norm(view.cam_from_board.translation_mm),
+                view.cam_from_board.rotation[2, 2],
+            )
+            for view in views
+        ]
+    )
+    rows = np.column_stack([np.ones(len(views)), shown[number] / (len(images) - 1.0), places, amounts])
+    each = np.stack([np.bincount(number, column) for column in rows.T], axis=1) / np.bincount(number)[:, None]
+    system, amount = each[:, :-1], each[:, -1]
+    system[:, 2:] /= np.maximum(np.abs(system[:, 2:]).max(axis=0), np.finfo(float).tiny)
+    step, _, rank, _ = np.linalg.lstsq(system, amount, rcond=None)
+    if rank < system.shape[1]:
+        return None
+    variance = float(((amount - system @ step) ** 2).sum()) / freedom
+    sigma = float(np.sqrt(variance * np.linalg.inv(system.T @ system)[1, 1]))
+    chance = 2.0 * float(stdtr(freedom, -abs(step[1]) / max(sigma, np.finfo(float).tiny)))
+    if chance > CHANCE_OF_DRIFT:
+        return None
+    return Finding.bad(
+        f"the focal length drifts over the session, by {100.0 * abs(step[1]):.1f} % from the first image to the last "
+        f"(p = {chance:.1g}): zoom, focus or temperature; the stated uncertainties are invalid",
+        "fix zoom and focus, let the camera warm up, and retake all images",
+    )

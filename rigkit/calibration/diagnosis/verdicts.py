@@ -26,13 +26,13 @@ from rigkit.calibration.diagnosis.captured import (
     few_repeated,
     hardly_tilted,
     stretched_images,
+    undistorted,
 )
 from rigkit.calibration.diagnosis.changing import CHANGES, changing
 from rigkit.calibration.diagnosis.mixed import two_cameras
 from rigkit.calibration.diagnosis.moved import moment
 from rigkit.calibration.diagnosis.pupil import modelled_pupil, moving_pupil
 from rigkit.calibration.diagnosis.two_kinds import KINDS_REMEDY, listed, min_of_a_kind
-from rigkit.calibration.diagnosis.undistorted import undistorted
 from rigkit.calibration.diagnosis.view_evidence import neighbour_correlation
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.solving.fit import Fit

@@ -18,10 +18,10 @@ from rigkit.calibration.rig.certainty.frame_covariance import frame_covariance
 from rigkit.calibration.rig.certainty.readouts import readout_error
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
-from rigkit.calibration.rig.solving.flatness import shape_error
 from rigkit.calibration.rig.solving.lags import lags_of
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.calibration.rig.solving.pose_jacobians import pose_jacobians
+from rigkit.calibration.rig.solving.shape import shape_error
 from rigkit.calibration.rig.solving.shutters import readouts_of
 from rigkit.calibration.rig.solving.state import RigState
 from rigkit.calibration.solving.clustered import Clustered, effective_freedom, widening

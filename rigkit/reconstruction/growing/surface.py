@@ -2,7 +2,7 @@
 
 For a plane n . X = d the inverse range 1 / r = m . f, with m = n / d, is exactly linear in the ray f for any central
 camera; so is its gradient by the pixel, m . B with B the ray Jacobian. A pair measures both: the range by its position
-on the epipolar line, the gradient by its affinity (A = G - h y^T, gradient y / r^2; `affine.surface`). The plane at a
+on the epipolar line, the gradient by its affinity (A = G - h y^T, gradient y / r^2; `affine.normal`). The plane at a
 node is fitted to the measurements of the pairs around it, with the covariances of their patches. A robust loss
 downweights neighbours on another surface.
 """
@@ -15,9 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rigkit.affine.curvature import curvature_shift, window_variance
-from rigkit.affine.refine_patches import FLOOR_PX, WINDOW_OF_PATCH, levels_of_larger
-from rigkit.affine.surface import linear_gauge
+from rigkit.affine.normal import linear_gauge
+from rigkit.affine.refine_patches import FLOOR_PX, WINDOW_OF_PATCH, curvature_shift, levels_of_larger, window_variance
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Normals, Points
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
@@ -283,7 +282,7 @@ def _inverse(normal: FloatArray) -> FloatArray:
 
 def correct_curvature(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3) -> GrownPatches:
     """Return the pairs, at their nodes or `centred`, with their pixels in image 2 corrected for the curvature of the
-    surface in their alignment windows (`affine.curvature`)."""
+    surface in their alignment windows (`curvature_shift`)."""
     planes = PairRays.of(grown, camera1, camera2).planes(cam2_from_cam1)
     at = grown.valid & np.isfinite(planes[..., 0])
     place = grown.pixels1[at]

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.affine.surface import linear_gauge
+from rigkit.affine.normal import linear_gauge
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3

@@ -2,6 +2,10 @@
 
 The local optimisation is Levenberg-Marquardt on rotation and direction under the marginalised loss, with the sigma of
 each Sampson distance fixed during a step. It serves to choose among hypotheses; `refine_pose` follows.
+
+The loss is marginalised over an unknown noise level, without an inlier threshold: the quality of a residual r, in
+sigmas, is the mean of max(0, 1 - (r / (k s))^2) over the noise levels s between 1 and `max_noise`, with k the 99 %
+quantile. Reference: Barath, Noskova, Matas ("MAGSAC++").
 """
 
 from __future__ import annotations
@@ -20,6 +24,8 @@ from rigkit.relative_pose.solvers.pose import free_directions, rotations_and_dir
 MAX_LOCAL_STEPS = 15
 LOCAL_SETTLED_RAD = 1e-5
 """The optimisation ends at a shorter step, which changes no residual by a tenth of its sigma."""
+QUANTILE = 2.576
+"""99 % quantile of |r| for a standard normal r. As in kernels/pose.c."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -78,3 +84,27 @@ def _split_essential(E21: Mat3, kind: str) -> tuple[FloatArray, FloatArray]:
     if kind == PoseType.PLANAR:
         R = np.where((other[:, 1, 1] > R[:, 1, 1])[:, None, None], other, R)
     return R, t
+
+
+def marginal_quality(r: FloatArray, max_noise: FloatArray | float) -> FloatArray:
+    """Return the quality (0 to 1) of residuals in sigmas; `max_noise` > 1 may be an array that broadcasts with `r`."""
+    rho = np.abs(r) / QUANTILE
+    far = (max_noise - np.minimum(rho, max_noise)) ** 2 / (max_noise * (max_noise - 1.0))
+    return np.asarray(np.where(rho <= 1.0, 1.0 - rho**2 / max_noise, far))
+
+
+def marginal_weights(r: FloatArray, max_noise: FloatArray | float) -> FloatArray:
+    """Return the weights -q'(r) / r up to a factor: 1 for small residuals, 0 beyond the highest noise level."""
+    low = np.clip(np.abs(r) / QUANTILE, 1.0, max_noise)
+    return np.asarray((max_noise - low) / ((max_noise - 1.0) * low))
+
+
+@dataclass(frozen=True, slots=True)
+class MarginalLoss:
+    """The marginal weights at one noise level, for `refine_pose`."""
+
+    max_noise: float
+
+    def __call__(self, r: FloatArray) -> FloatArray:
+        """Return the weights of residuals in sigmas."""
+        return marginal_weights(r, self.max_noise)

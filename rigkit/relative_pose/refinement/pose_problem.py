@@ -15,8 +15,7 @@ from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.kernels import pose as kernel
 from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, minimise
-from rigkit.relative_pose.refinement.local import SampsonRows
-from rigkit.relative_pose.refinement.marginal import MarginalLoss
+from rigkit.relative_pose.refinement.local import MarginalLoss, SampsonRows
 from rigkit.relative_pose.refinement.residuals import affinity_terms, level_terms, point_terms, whitened_affinities
 from rigkit.relative_pose.solvers.pose import free_directions, translation_basis
 

@@ -19,8 +19,13 @@ from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType, axis_of
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import rotation_angle, unit
-from rigkit.relative_pose.refinement.noise_level import POSE_FREEDOM, variance_factor
-from rigkit.relative_pose.refinement.refine import RefinedPose, estimate_pose, refine_pose
+from rigkit.relative_pose.refinement.refine import (
+    POSE_FREEDOM,
+    RefinedPose,
+    estimate_pose,
+    refine_pose,
+    variance_factor,
+)
 from rigkit.relative_pose.refinement.residuals import level_terms
 from rigkit.relative_pose.solvers.pose import pose_directions
 

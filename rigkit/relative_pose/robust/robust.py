@@ -1,6 +1,6 @@
 """Robust relative pose from matches with outliers: minimal samples, a marginalised threshold, local optimisation.
 
-There is no inlier threshold: hypotheses are ranked, optimised and refined under the marginalised loss (marginal.py).
+There is no inlier threshold: hypotheses are ranked, optimised and refined under the marginalised loss (local.py).
 Several local optima, ranked with cheirality, are kept until the noise of the matches is estimated. Deterministic for a
 seeded generator. References: Fischler and Bolles; Chum, Matas, Kittler ("Locally optimized RANSAC"); Barath, Noskova,
 Matas ("MAGSAC++").
@@ -20,8 +20,7 @@ from rigkit.core.posetype import PoseType, axis_of
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.pose import five_rows, six_rows
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
-from rigkit.relative_pose.refinement.local import SampsonRows
-from rigkit.relative_pose.refinement.marginal import QUANTILE, MarginalLoss, marginal_quality
+from rigkit.relative_pose.refinement.local import QUANTILE, MarginalLoss, SampsonRows, marginal_quality
 from rigkit.relative_pose.refinement.refine import SIGNIFICANT, RefinedPose, refine_pose
 from rigkit.relative_pose.solvers.planar import planar_from_two_rows, solve_planar_batch
 from rigkit.relative_pose.solvers.planar_ambiguity import compare_poses, other_ambiguous_poses

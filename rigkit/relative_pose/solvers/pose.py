@@ -11,7 +11,6 @@ from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import cross, log_so3, skew
 from rigkit.geometry.triangulation import ray_ranges
-from rigkit.relative_pose.solvers.eight_point import essential_nearest
 from rigkit.relative_pose.solvers.weights import px_angles
 
 
@@ -25,6 +24,12 @@ def essential_from_pose(cam2_from_cam1: Rigid3) -> Mat3:
             "places"
         )
     return np.asarray(E21 / size)
+
+
+def essential_nearest(matrix: FloatArray) -> Mat3:
+    """Return the essential matrices (..., 3, 3) of unit Frobenius norm nearest to the given ones."""
+    u, _, vt = np.linalg.svd(matrix)
+    return np.asarray((u[..., :, :2] @ vt[..., :2, :]) * np.sqrt(0.5))
 
 
 def rotations_and_direction(E21: Mat3) -> tuple[Mat3, Mat3, FloatArray]:

@@ -17,8 +17,8 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, Mat3, RayJacobians, Rays
 from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
-from rigkit.relative_pose.solvers.eight_point import essential_nearest
 from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseline, check_count, finish, reweighted
+from rigkit.relative_pose.solvers.pose import essential_nearest
 from rigkit.relative_pose.solvers.rows import right_singular
 from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
 

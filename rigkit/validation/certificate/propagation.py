@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigkit.calibration.rig.projection import RigProjection
+from rigkit.calibration.rig.certainty.uncertainty import RigProjection
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays, scaled_pinv

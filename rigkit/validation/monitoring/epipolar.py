@@ -18,10 +18,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rigkit.affine.correspondences import Correspondences
-from rigkit.affine.curvature import curvature_shift, window_variance
 from rigkit.affine.features import match_affine_features
 from rigkit.affine.normal import normals_from_affines
-from rigkit.affine.refine_patches import HALF_WIDTH_OF_FEATURE, levels_of_larger
+from rigkit.affine.refine_patches import HALF_WIDTH_OF_FEATURE, curvature_shift, levels_of_larger, window_variance
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, RayJacobians, Rays
 from rigkit.core.errors import DegenerateError

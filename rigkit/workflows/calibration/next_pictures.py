@@ -17,10 +17,9 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.measurement_task import Quantity, Task
 from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.planning.goal import Goal, projection_goal
+from rigkit.planning.goal import Goal, projection_goal, rig_goal
 from rigkit.planning.information import Knowledge
 from rigkit.planning.plan import Plan, plan_views
-from rigkit.planning.rig_goal import rig_goal
 from rigkit.validation.certificate.propagation import MAP_CELLS, gradients, measured_points
 from rigkit.validation.monitoring.evidence import Monitored
 from rigkit.validation.monitoring.frames import Frames

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
-from rigkit.affine.features import TILTS, match_affine_features
-from rigkit.affine.from_points import need_alignment, with_affinities
+from rigkit.affine.features import TILTS, match_affine_features, need_alignment, with_affinities
 from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import NearCamera, far_camera

@@ -10,8 +10,7 @@ import pytest
 from helpers.textured_scene import Corner
 
 from rigkit.affine.correspondences import Correspondences
-from rigkit.affine.features import match_affine_features
-from rigkit.affine.from_points import need_alignment, with_affinities
+from rigkit.affine.features import match_affine_features, need_alignment, with_affinities
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3

@@ -6,8 +6,14 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray, Mat3
 from rigkit.geometry.rotation import cross, exp_so3, skew
-from rigkit.relative_pose.refinement.local import LOCAL_SETTLED_RAD, MAX_LOCAL_STEPS, SampsonRows, _split_essential
-from rigkit.relative_pose.refinement.marginal import marginal_quality, marginal_weights
+from rigkit.relative_pose.refinement.local import (
+    LOCAL_SETTLED_RAD,
+    MAX_LOCAL_STEPS,
+    SampsonRows,
+    _split_essential,
+    marginal_quality,
+    marginal_weights,
+)
 from rigkit.relative_pose.solvers.pose import free_directions, rotations_and_direction, translation_basis
 
 

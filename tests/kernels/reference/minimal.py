@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, Mat3
-from rigkit.relative_pose.solvers.eight_point import essential_nearest
+from rigkit.relative_pose.solvers.pose import essential_nearest
 
 REAL = 1e-8
 """An eigenvalue with a larger imaginary part (relative) is complex."""

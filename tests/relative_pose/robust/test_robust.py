@@ -13,8 +13,7 @@ from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.sampson import sampson_distances
-from rigkit.relative_pose.refinement.local import SampsonRows
-from rigkit.relative_pose.refinement.marginal import marginal_quality, marginal_weights
+from rigkit.relative_pose.refinement.local import SampsonRows, marginal_quality, marginal_weights
 from rigkit.relative_pose.refinement.refine import refine_pose
 from rigkit.relative_pose.robust.robust import robust_pose
 from rigkit.relative_pose.solvers.planar_ambiguity import other_ambiguous_poses

@@ -19,8 +19,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.measurement_task import Quantity, Task
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.planning.goal import GOAL_GRID
-from rigkit.planning.rig_goal import rig_goal
+from rigkit.planning.goal import GOAL_GRID, rig_goal
 from rigkit.validation.monitoring.evidence import Monitored
 from rigkit.workflows.calibration.next_pictures import next_frames
 

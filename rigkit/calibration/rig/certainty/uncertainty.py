@@ -6,7 +6,7 @@ and with the mounts; in camera 2
     dq2 = dq2/dk2 dk2 + dq2/dx2 (dM2 + R21 (dx1 - dM1)),      dx1 = -(dq1/dx1)+ dq1/dk1 dk1,
 
 where dM = w x (x - t) + dt is the motion of a point in the camera by a perturbation of its mount, and + is the inverse
-perpendicular to the ray.
+perpendicular to the ray. `RigProjection` has the derivatives.
 """
 
 from __future__ import annotations
@@ -16,10 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.certainty.uncertainty import worst_direction
-from rigkit.calibration.rig.projection import RigProjection
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.layout import Layout
+from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Points
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import skew
 
 TRANSFER_POINTS = 40
 """Number of corners, spread over all views, at which the transfer is evaluated."""
@@ -74,3 +76,28 @@ def transfer_covariance(rig: RigCalibration, a: str, b: str, points: Points) -> 
         held[:, 2, mount] = -np.concatenate([np.cross(lever, rays), rays], axis=-1)
     design = second.d_pixels_d_globals + second.d_pixels_d_point @ np.linalg.solve(system, held)
     return design @ known @ np.swapaxes(design, -1, -2), first.valid & second.seen
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RigProjection:
+    """Pixels of points in a camera of a rig: which are `valid` (...,), and which of these are `seen` in its image; and
+    the derivatives by the points in the rig's frame (..., 2, 3) and by the G globals of a layout (..., 2, G)."""
+
+    valid: BoolArray
+    seen: BoolArray
+    d_pixels_d_point: FloatArray
+    d_pixels_d_globals: FloatArray
+
+    @classmethod
+    def of(cls, camera: Camera, cam_from_rig: Rigid3, points: Points, layout: Layout, k: int) -> RigProjection:
+        """Return that of `points` (..., 3) mm in the rig's frame into its camera `k`."""
+        in_cam = cam_from_rig.apply(points)
+        pixels, valid, d_pixels_d_x, d_pixels_d_parameters = camera.project_with_jacobians(in_cam)
+        d_pixels_d_globals = np.zeros((*points.shape[:-1], 2, layout.count))
+        d_pixels_d_globals[..., layout.cameras[k]] = d_pixels_d_parameters
+        if (mount := layout.mounts[k]) is not None:
+            # x = exp(w) R X + t + v.
+            by_turn = d_pixels_d_x @ -skew(in_cam - cam_from_rig.translation_mm)
+            d_pixels_d_globals[..., mount] = np.concatenate([by_turn, d_pixels_d_x], axis=-1)
+        d_pixels_d_point = d_pixels_d_x @ cam_from_rig.rotation
+        return cls(valid, valid & camera.on_image(pixels), d_pixels_d_point, d_pixels_d_globals)

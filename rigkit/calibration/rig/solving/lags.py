@@ -22,8 +22,8 @@ import numpy as np
 
 from rigkit.calibration.rig.certainty.frame_covariance import frame_covariance, residual_sigma
 from rigkit.calibration.rig.solving.exposure_times import POINTS, ExposureTimes, Lag, trajectories_through
-from rigkit.calibration.rig.solving.flatness import STEP_DAMPING
 from rigkit.calibration.rig.solving.pose_jacobians import pose_jacobians_at_exposure
+from rigkit.calibration.rig.solving.shape import STEP_DAMPING
 from rigkit.calibration.rig.solving.shutters import readout_steps, with_longer_readouts
 from rigkit.calibration.rig.solving.solver import rig_normal, solve_rig
 from rigkit.calibration.rig.solving.state import Key, RigObservations, RigState

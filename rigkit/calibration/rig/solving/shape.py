@@ -1,4 +1,5 @@
-"""The boards' shape in a rig, common to all cameras, with initial values from the cameras alone."""
+"""The boards' shape in a rig, common to all cameras, with initial values from the cameras alone, and the error that it
+leaves, which is common to all frames and so not in their scatter."""
 
 from __future__ import annotations
 
@@ -8,10 +9,15 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.solving.evidence import MIN_SIZE
+from rigkit.calibration.rig.solving.solver import rig_normal
+from rigkit.calibration.rig.solving.state import RigObservations, RigState
+from rigkit.calibration.solving.evidence import MIN_SIZE, chance_limit
 from rigkit.calibration.solving.shape import SHAPES, ShapeModel, released_groups, shape_model, warp_groups
 from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import FloatArray, Points
+
+STEP_DAMPING = 1e-12
+"""Damping of the step: undetermined unknowns are not changed."""
 
 
 def common_shape(observations: Observations, single: Sequence[Calibration]) -> tuple[ShapeModel, FloatArray]:
@@ -58,3 +64,28 @@ def _found(observations: Observations, shape: ShapeModel, unknowns: FloatArray) 
         found = float(np.sqrt((unknowns[group] ** 2).mean()))
         sizes[group] = max(found, MIN_SIZE * float(sizes[group].max()))
     return sizes
+
+
+def shape_error(observations: RigObservations, state: RigState, sigma_px: float) -> FloatArray:
+    """Return the change of the globals except the shape, (G,), by the richest board shape that is significant against
+    the one before it; zero if none is. One step of the solver with a richer shape gives it, and it is taken as the
+    error of cameras and mounts.
+
+    `sigma_px` is the standard deviation of a corner, overdispersion of the frames included.
+    """
+    count = state.layout(observations).shape.start
+    found = np.zeros(count)
+    if not sigma_px > 0.0:
+        return found
+    # A board's views in all cameras count together for whether its shape is determined.
+    boards = np.concatenate([own.board for own in observations.cameras])
+    everything = replace(observations.cameras[0], board=boards)
+    for kind in SHAPES[SHAPES.index(observations.shape.kind) + 1 :]:
+        shape, unknowns = observations.shape.richer(kind, everything, state.unknowns)
+        normal = rig_normal(replace(observations, shape=shape), replace(state, unknowns=unknowns), sigma_px)
+        step = normal.step(STEP_DAMPING)
+        more = shape.count - observations.shape.count
+        if step is None or step.predicted < sigma_px**2 * chance_limit(more):
+            break
+        found = step.globals[:count]
+    return found

@@ -9,7 +9,7 @@ from helpers.rig_scenes import MODELS, Views, mounts, rig_views, sizes
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.rig.solving.flatness import shape_error
+from rigkit.calibration.rig.solving.shape import shape_error
 from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.core.arrays import FloatArray
 

@@ -9,8 +9,7 @@ import pytest
 from helpers.affine_scenes import FISHEYE, REGULAR, Corners, angles_deg, see
 
 from rigkit.affine.affinities import EpipolarNormals
-from rigkit.affine.geometry_noise import geometry_covariance
-from rigkit.affine.normal import estimate_normals, normals_from_affines
+from rigkit.affine.normal import estimate_normals, geometry_covariance, normals_from_affines
 from rigkit.affine.registry import affines_from_directions
 from rigkit.cameras.base import Camera
 from rigkit.core.matches import Matches

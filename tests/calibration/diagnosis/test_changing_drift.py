@@ -10,7 +10,7 @@ import pytest
 from helpers.calibration_scenes import SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.diagnosis.drift import drifting
+from rigkit.calibration.diagnosis.changing import drifting
 from rigkit.calibration.diagnosis.view_evidence import view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import image_center

@@ -8,7 +8,7 @@ from helpers.affine_scenes import FISHEYE, REGULAR, Corners, see
 from helpers.tolerances import EXACT_REL, ROUNDING
 
 from rigkit.affine.affinities import EpipolarNormals
-from rigkit.affine.surface import affines_from_normals, linear_gauge
+from rigkit.affine.normal import affines_from_normals, linear_gauge
 from rigkit.cameras.base import Camera
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
