@@ -37,7 +37,7 @@ from rigkit.geometry.rotation import angle_between, rotation_angle
 from rigkit.geometry.triangulation import correct_lindstrom, triangulate_rays
 from rigkit.kernels.pose import five_rows, six_rows
 from rigkit.relative_pose.refinement.refine import estimate_pose, refine_pose
-from rigkit.relative_pose.robust.robust import robust_pose
+from rigkit.relative_pose.robust import robust_pose
 from rigkit.relative_pose.solvers.planar import solve_planar_batch
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.registry import fundamental_for

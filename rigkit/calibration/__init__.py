@@ -1,13 +1,12 @@
 """Calibration of a camera or a rig from views of boards. `calibrate.py` runs these steps in order:
 
-- `views`: the usable views (`usable`) as arrays (`observations`), and the folds of the cross-validation (`folds`,
-  with near-duplicate images in one fold: `repeats`)
+- `views`: the usable views (`usable`) as arrays (`observations`), and the folds of the cross-validation, with
+  near-duplicate images in one fold (`repeats`)
 - `solving`: initial values (`radial_alignment`, `initialise`, `poses`), then least squares for one camera model
   (`state`, `shape`, `camera_prior`, `evidence`, `linearise`, `normal_equations`, `solver`, `outliers`, `fit`) with a
   cluster-robust covariance (`clustered`)
-- `choosing`: model selection by held-out error (`choice`, `models_tried`, `lens_choice`, `one_model`), the
-  uncertainty that it leaves (`between_models`), boards numbered from the other end (`board_orientation`), and what a
-  rig takes over from its cameras (`candidate_fits`)
+- `choosing`: model selection by held-out error (`choice`, `models_tried`, `candidate_fits`), the uncertainty that it
+  leaves (`between_models`), and boards numbered from the other end (`board_orientation`)
 - `certainty`: uncertainty of parameters and projection (`covariance`, `uncertainty`), model inadequacy (`departures`,
   `series`, `displaced`), and which part of the image the boards covered (`coverage`)
 - `diagnosis`: of images, residuals and result (`captured`, `moved`, `changing`, `mixed`, `flipped`, `two_kinds`,
@@ -21,9 +20,9 @@ Classes, in the order in which a calibration makes them::
     camera model of one size, to be fitted                  CandidateModel     choosing/models_tried
     least-squares solution                                  Fit                solving/fit
     fitted model with its held-out error                    FittedModel        choosing/choice
-    best size and board shape of one camera model           ModelOutcome       choosing/one_model
+    best size and board shape of one camera model           ModelOutcome       choosing/models_tried
     camera with all its models fitted, none chosen yet      CandidateFits      choosing/candidate_fits
-    model chosen, alone or together with like cameras       ModelChoice        choosing/lens_choice
+    model chosen, alone or together with like cameras       ModelChoice        choosing/candidate_fits
     other model that the images support about as well       RivalFit           choosing/between_models
     result                                                  Calibration        result
     summary of a FittedModel in the result                  Candidate          result

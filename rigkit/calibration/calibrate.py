@@ -21,11 +21,17 @@ from rigkit.calibration.choosing.between_models import (
     with_other_lens,
     with_rivals,
 )
-from rigkit.calibration.choosing.candidate_fits import CandidateFits, camera_named_in_errors, fit_candidates
+from rigkit.calibration.choosing.candidate_fits import (
+    CandidateFits,
+    ModelChoice,
+    best_sizes,
+    camera_named_in_errors,
+    choose_lenses,
+    fit_candidates,
+    like_cameras,
+)
 from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut, choose, described, models_of
-from rigkit.calibration.choosing.lens_choice import ModelChoice, best_sizes, choose_lenses, like_cameras
-from rigkit.calibration.choosing.models_tried import Request
-from rigkit.calibration.choosing.one_model import ModelOutcome, on_same_images
+from rigkit.calibration.choosing.models_tried import ModelOutcome, Request, on_same_images
 from rigkit.calibration.diagnosis.moved import moved_lens, two_groups
 from rigkit.calibration.diagnosis.pupil import may_move, pupil_is_significant, solved_again
 from rigkit.calibration.diagnosis.verdicts import diagnose

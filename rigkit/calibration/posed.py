@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from rigkit.calibration.assemble import with_covariance
 from rigkit.calibration.calibrate import FOLDS
 from rigkit.calibration.choosing.choice import FittedModel, heldout_squares
-from rigkit.calibration.choosing.models_tried import Request, enough_agree
-from rigkit.calibration.choosing.one_model import with_board_shape
+from rigkit.calibration.choosing.models_tried import Request, enough_agree, with_board_shape
 from rigkit.calibration.diagnosis.verdicts import diagnose
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.solving.fit import Fit, fit_kept, posed

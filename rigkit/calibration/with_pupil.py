@@ -15,8 +15,15 @@ import numpy as np
 
 from rigkit.calibration.choosing.between_models import MIN_LIKELY, RivalFit
 from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut, choose, described
-from rigkit.calibration.choosing.models_tried import Request, cross_validated, enough_agree, reweighted
-from rigkit.calibration.choosing.one_model import ModelOutcome, chosen_of_sizes, on_same_images
+from rigkit.calibration.choosing.models_tried import (
+    ModelOutcome,
+    Request,
+    chosen_of_sizes,
+    cross_validated,
+    enough_agree,
+    on_same_images,
+    reweighted,
+)
 from rigkit.calibration.result import Candidate, Rival
 from rigkit.calibration.solving.fit import fit_kept, fit_other_lens, identifiable, posed, robust_sigma
 from rigkit.calibration.solving.outliers import inliers

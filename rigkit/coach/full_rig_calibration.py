@@ -22,8 +22,8 @@ from rigkit.coach.guide import GuideOptions, relative_gain
 from rigkit.core.arrays import Pixels
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.planning.candidates import placement
 from rigkit.planning.goal import RemainingError, Requirement, projection_goal, rig_goal
-from rigkit.planning.instructions import placement
 from rigkit.planning.plan import Plan, covariance_of
 from rigkit.validation.monitoring.evidence import Monitored, board_information
 from rigkit.validation.monitoring.frames import Frames

@@ -32,10 +32,9 @@ from rigkit.coach.look import FrameObservation
 from rigkit.core.arrays import Pixels
 from rigkit.core.errors import DegenerateError
 from rigkit.core.processes import SerialExecutor
-from rigkit.planning.candidates import board_poses_in_view, outline_mm
+from rigkit.planning.candidates import board_poses_in_view, outline_mm, placement
 from rigkit.planning.goal import RemainingError
 from rigkit.planning.information import BoardPoses, SharedViews, median_motion, mount_error_px, mount_information
-from rigkit.planning.instructions import placement
 
 SHARED_FRAMES = 5
 """With fewer boards seen by two cameras at once, their disagreement cannot be estimated."""

@@ -20,8 +20,7 @@ from rigkit.reconstruction.moved_cameras import visible_in_all
 from rigkit.relative_pose.refinement.local import QUANTILE, marginal_quality
 from rigkit.relative_pose.refinement.pose_problem import cauchy_weights
 from rigkit.relative_pose.refinement.refine import RefinedPose, refine_pose
-from rigkit.relative_pose.robust.a_contrario import log_false_alarms
-from rigkit.relative_pose.robust.robust import RobustPose, Sample, robust_pose
+from rigkit.relative_pose.robust import RobustPose, Sample, log_false_alarms, robust_pose
 from rigkit.relative_pose.solvers.estimate import check_baseline
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.registry import fundamental_for

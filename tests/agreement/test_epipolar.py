@@ -10,7 +10,7 @@ from helpers.epipolar_scenes import REGULAR, pair, pixel_fundamental, pose_error
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.triangulation import triangulate_pixels
 from rigkit.relative_pose.refinement.refine import estimate_pose
-from rigkit.relative_pose.robust.robust import robust_pose
+from rigkit.relative_pose.robust import robust_pose
 from rigkit.relative_pose.solvers.pose import choose_pose, decompose_essential
 from rigkit.relative_pose.solvers.registry import fundamental_for
 

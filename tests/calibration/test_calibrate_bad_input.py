@@ -12,10 +12,9 @@ from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration import assemble
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.choosing.candidate_fits import CandidateFits
+from rigkit.calibration.choosing.candidate_fits import CandidateFits, ModelChoice, choose_lenses
 from rigkit.calibration.choosing.choice import FittedModel
-from rigkit.calibration.choosing.lens_choice import ModelChoice, choose_lenses
-from rigkit.calibration.choosing.one_model import ModelOutcome
+from rigkit.calibration.choosing.models_tried import ModelOutcome
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.shape import shape_model
 from rigkit.calibration.views.observations import Observations

@@ -16,11 +16,11 @@ from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.kernels.pose import five_rows, six_rows
+from rigkit.relative_pose import robust
 from rigkit.relative_pose.refinement.local import MarginalLoss, SampsonRows
 from rigkit.relative_pose.refinement.pose_problem import PoseProblem, RobustWeights, cauchy_weights
 from rigkit.relative_pose.refinement.refine import refine_pose
-from rigkit.relative_pose.robust import robust
-from rigkit.relative_pose.robust.robust import robust_pose
+from rigkit.relative_pose.robust import robust_pose
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.rows import affinity_rows, point_rows
 

@@ -12,10 +12,9 @@ from rigkit.calibration.certainty.covariance import GlobalCovariance
 from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.pupil import SolvedPupil, without_pupil
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
-from rigkit.calibration.rig.certainty.between_models import between_rig_models
 from rigkit.calibration.rig.certainty.displaced import lens_modes
 from rigkit.calibration.rig.certainty.frame_covariance import frame_covariance
-from rigkit.calibration.rig.certainty.readouts import readout_error
+from rigkit.calibration.rig.certainty.solved_again import between_rig_models, readout_error
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
 from rigkit.calibration.rig.solving.lags import lags_of

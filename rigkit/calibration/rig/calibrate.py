@@ -29,9 +29,14 @@ from rigkit.calibration.rig.solving.lags import TIMINGS
 from rigkit.calibration.rig.verdicts import diagnose_rig
 from rigkit.calibration.rig.views.board_places import board_places
 from rigkit.calibration.rig.views.copies import with_copies_matched
-from rigkit.calibration.rig.views.mispaired import duplicate_images, mixup_of_all_frames, mixups_of_frames
+from rigkit.calibration.rig.views.mispaired import (
+    MIN_FRAMES_OF_PART,
+    duplicate_images,
+    mixup_of_all_frames,
+    mixups_of_frames,
+    slipped_camera,
+)
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews, frame_observations
-from rigkit.calibration.rig.views.slipped import MIN_FRAMES_OF_PART, slipped_camera
 from rigkit.calibration.with_pupil import require_known
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView

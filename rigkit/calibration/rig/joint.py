@@ -39,9 +39,8 @@ from rigkit.calibration.rig.views.frames import (
 from rigkit.calibration.rig.views.mispaired import mixup_of_all_frames, typical_px
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews
 from rigkit.calibration.solving.solver import Solution
-from rigkit.calibration.views.folds import folds_of
 from rigkit.calibration.views.observations import Observations
-from rigkit.calibration.views.repeats import cluster_numbers
+from rigkit.calibration.views.repeats import cluster_numbers, folds_of
 from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity

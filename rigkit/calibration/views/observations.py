@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rigkit.calibration.views.folds import folds_of
-from rigkit.calibration.views.repeats import cluster_numbers
+from rigkit.calibration.views.repeats import cluster_numbers, folds_of
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points, median_of
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView

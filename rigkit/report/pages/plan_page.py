@@ -12,7 +12,7 @@ from rigkit.core.arrays import Pixels, sampling_step, without_nan
 from rigkit.core.boards import Board
 from rigkit.core.tables import Column, Table, cells
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.planning.instructions import placement
+from rigkit.planning.candidates import placement
 from rigkit.planning.plan import Plan
 from rigkit.report import svg
 from rigkit.report.pages.page_facts import PageFacts

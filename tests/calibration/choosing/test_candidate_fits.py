@@ -43,8 +43,8 @@ def test_a_rig_reuses_the_calibration_of_a_camera_alone(
     for step in (
         "candidate_fits.fit_all",
         "candidate_fits.solved",
-        "lens_choice.fit_other_lens",
-        "lens_choice.heldout_squares",
+        "candidate_fits.fit_other_lens",
+        "candidate_fits.heldout_squares",
     ):
         monkeypatch.setattr(f"rigkit.calibration.choosing.{step}", again)
     (found,) = calibrate_together(in_rig, known=[known])

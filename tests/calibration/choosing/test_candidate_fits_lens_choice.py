@@ -19,10 +19,9 @@ from rigkit.calibration.certainty.uncertainty import (
     worst_direction,
 )
 from rigkit.calibration.choosing.between_models import rival_fits, rival_shapes
+from rigkit.calibration.choosing.candidate_fits import choose_lenses, like_cameras
 from rigkit.calibration.choosing.choice import FittedModel, HeldOut, choose, converged_ones, described
-from rigkit.calibration.choosing.lens_choice import choose_lenses, like_cameras
-from rigkit.calibration.choosing.models_tried import Request
-from rigkit.calibration.choosing.one_model import ModelOutcome
+from rigkit.calibration.choosing.models_tried import ModelOutcome, Request
 from rigkit.calibration.result import Rival
 from rigkit.calibration.solving.fit import Fit, fit_model
 from rigkit.calibration.solving.solver import Convergence

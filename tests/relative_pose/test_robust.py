@@ -15,7 +15,7 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.relative_pose.refinement.local import SampsonRows, marginal_quality, marginal_weights
 from rigkit.relative_pose.refinement.refine import refine_pose
-from rigkit.relative_pose.robust.robust import robust_pose
+from rigkit.relative_pose.robust import robust_pose
 from rigkit.relative_pose.solvers.planar_ambiguity import other_ambiguous_poses
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 

@@ -13,7 +13,7 @@ from helpers.rig_scenes import MODELS, calibrated_rig, rig_views, sizes
 from rigkit.calibration.result import Rival
 from rigkit.calibration.rig import assemble
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.certainty.between_models import between_rig_models
+from rigkit.calibration.rig.certainty.solved_again import between_rig_models
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.exposure_times import Lag

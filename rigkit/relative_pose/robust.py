@@ -2,13 +2,15 @@
 
 There is no inlier threshold: hypotheses are ranked, optimised and refined under the marginalised loss (local.py).
 Several local optima, ranked with cheirality, are kept until the noise of the matches is estimated. Deterministic for a
-seeded generator. References: Fischler and Bolles; Chum, Matas, Kittler ("Locally optimized RANSAC"); Barath, Noskova,
+seeded generator. Boards and facades partly fit many poses: `log_false_alarms` tells whether more matches fit than by
+chance. References: Fischler and Bolles; Chum, Matas, Kittler ("Locally optimized RANSAC"); Barath, Noskova,
 Matas ("MAGSAC++").
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf, lgamma
 from typing import Literal
 
 import numpy as np
@@ -18,6 +20,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType, axis_of
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.kernels.pose import five_rows, six_rows
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
 from rigkit.relative_pose.refinement.local import QUANTILE, MarginalLoss, SampsonRows, marginal_quality
@@ -59,6 +62,8 @@ NOISE_ITERATIONS = 3
 """Iterations of the noise estimate, each over the inliers at the noise level of the one before."""
 GOOD_AFFINE = 0.1
 """Share of outlier-free samples with an affinity that lead to the optimum (measured: a third for sigma_A = 0.05)."""
+SHIFTS = 40
+"""Random wrong partners tried per point, so that the probability of a chance fit is known to a few per cent."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -319,3 +324,55 @@ def _hypotheses(m: Matches, index: IntArray, kind: str, sample: Sample) -> Mat3:
         found = five_rows(rows) if sample == "points" else six_rows(rows)
     flat = found.reshape(-1, 3, 3)
     return np.asarray(flat[np.isfinite(flat[:, 0, 0])])
+
+
+def log_false_alarms(
+    matches: Matches, pose: Rigid3, inliers: BoolArray, affinity_fits: BoolArray, freedom: int, gate: float
+) -> float:
+    """Return the log number of false alarms: the expected number of poses with as many inliers among wrong matches.
+
+    Infinite if there are fewer inliers than degrees of freedom.
+
+    Parameters
+    ----------
+    matches : all N.
+    pose : found by sampling; the length of its translation is ignored.
+    inliers : (N,) matches that fit it, by point and by affinity.
+    affinity_fits : (N,) whether the affinity fits; True without an affinity.
+    freedom : degrees of freedom of the pose.
+    gate : largest Sampson distance of a point that fits, in sigmas.
+
+    Notes
+    -----
+    N C(N, k) C(k, freedom) p^(k - freedom) with k inliers (Moisan and Stival, "A probabilistic criterion to detect
+    rigid point matches between two images and estimate the fundamental matrix"). The probability p that a wrong match
+    fits is estimated from the points with wrong partners, and from the affinities of the points that do not fit.
+    """
+    n, k = len(matches), int(inliers.sum())
+    if k < freedom:
+        return inf
+    fitting = total = 0
+    for shift in range(1, min(n, SHIFTS + 1)):
+        other = np.roll(np.arange(n), shift)
+        wrong = replace(
+            matches,
+            pixels2=matches.pixels2[other],
+            rays2=matches.rays2[other],
+            jacobians2=matches.jacobians2[other],
+            sigma2_px=matches.sigma2_px[other],
+        )
+        fitting += int(_fits(wrong, pose, gate).sum())
+        total += n
+    by_point = (fitting + 1.0) / (total + 1.0)
+    outlying = ~_fits(matches, pose, gate)
+    by_affinity = (affinity_fits[outlying].sum() + 1.0) / (outlying.sum() + 1.0)
+    log_chance = float(np.log(by_point * by_affinity))
+    return float(np.log(n)) + _log_choose(n, k) + _log_choose(k, freedom) + (k - freedom) * log_chance
+
+
+def _fits(m: Matches, pose: Rigid3, gate: float) -> BoolArray:
+    return np.asarray(np.abs(sampson_of_matches(essential_from_pose(pose), m, in_sigmas=True)) < gate)
+
+
+def _log_choose(n: int, k: int) -> float:
+    return lgamma(n + 1.0) - lgamma(k + 1.0) - lgamma(n - k + 1.0)

@@ -10,7 +10,7 @@ import pytest
 from helpers.epipolar_scenes import pair
 
 from rigkit.geometry.sampson import sampson_of_matches
-from rigkit.relative_pose.robust.a_contrario import log_false_alarms
+from rigkit.relative_pose.robust import log_false_alarms
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 
 GATE = 3.3
