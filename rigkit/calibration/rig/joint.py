@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig.solving.departing import cost_with_departures
 from rigkit.calibration.rig.solving.known import KnownCameras
 from rigkit.calibration.rig.solving.lags import Timing, times_of, with_lags
 from rigkit.calibration.rig.solving.shape import common_shape
@@ -20,6 +19,7 @@ from rigkit.calibration.rig.views.disagree import (
     DISAGREES,
     MIN_PX,
     cost_of_sharing,
+    cost_with_departures,
     outlier_may_be_hidden,
     outlier_targets,
     reason_left_out,

@@ -5,20 +5,31 @@ noise, and 2200 with boards bumpy by 0.15 mm that count as flat. There the cost 
 noise and 3.5 times by bumps, the distance before the joint solve 7.8 times the typical one. If a board was moved by
 1 mm between two exposures, at 0.2 px of noise, sharing costs 4 to 8 times sigma with ten frames; moved by 10 mm its
 distance is more than 22 times the typical one.
+
+A view alone follows the departures of its lens from its model with the pose of its board, each in its own way. So views
+that share a pose may disagree as if the images of a frame were not taken at one moment. But a few numbers of each lens,
+the same in all images, explain that (`cost_with_departures`).
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from rigkit.calibration.certainty.departures import LARGEST_PX
+from rigkit.calibration.certainty.displaced import with_amounts
+from rigkit.calibration.rig.solving.solver import solve_rig
 from rigkit.calibration.rig.solving.state import Key, RigObservations, RigState
 from rigkit.calibration.rig.views.observations import FrameObservations
 from rigkit.calibration.solving.solver import Solution
+from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import far_camera, with_pupil_of
 from rigkit.core.arrays import FloatArray
 from rigkit.core.printing import digits
+from rigkit.kernels.departures import DISPLACEMENTS, POSE
 
 MAX_DISTANCE_RATIO = 12.0
 """Distance over the typical distance, before the joint solve, from which a board has moved: its pose in one image may
@@ -128,3 +139,61 @@ def separate_views(seen: Sequence[FrameObservations], key: Key) -> None:
         for place, entry in own.items():
             if entry.key == key:
                 own[place] = entry.alone(k)
+
+
+def cost_with_departures(
+    observations: RigObservations, solution: Solution[RigState], sigma_px: float
+) -> dict[Key, float] | None:
+    """Return `cost_of_sharing` where lenses may depart from their models, with poses shared and without: the amounts of
+    all displacements are solved for as well, a priori with a standard deviation of LARGEST_PX. Boards keep their shape.
+
+    None where it would say nothing: there are as many amounts as constraints from shared poses, or lags of cameras,
+    which explain disagreement as well.
+    """
+    state = solution.state
+    layout, views = state.layout(observations), sum(len(frame) for frame in observations.frame)
+    places = sum(run is not None for run in (*layout.mounts, *layout.boards))
+    constraints = POSE * (views - len(observations.keys) - places)
+    if state.exposures is not None or constraints <= DISPLACEMENTS * len(state.cameras):
+        return None
+    cameras, priors = zip(*(_departing(camera, sigma_px) for camera in state.cameras), strict=True)
+    held = replace(observations, shape=observations.shape.held(state.unknowns), held=priors)
+    state = replace(state, cameras=cameras, unknowns=np.zeros(0))
+    shared = solve_rig(held, state, sigma_px).normal.costs
+    alone = np.zeros(len(shared))
+    for c, frame in enumerate(observations.frame):
+        np.add.at(alone, frame, solve_rig(*_separate(held, state, c), sigma_px).normal.costs)
+    return excess_cost(observations, shared, alone)
+
+
+def _departing(camera: Camera, sigma_px: float) -> tuple[Camera, tuple[FloatArray, FloatArray]]:
+    """Return a camera with the amounts of its departures, and the prior mean and information of its parameters."""
+    lens = with_amounts(far_camera(camera), np.eye(DISPLACEMENTS))
+    moving = with_pupil_of(lens, camera)
+    information = np.zeros(moving.parameters.size)
+    information[lens.parameters.size - DISPLACEMENTS : lens.parameters.size] = (sigma_px / LARGEST_PX) ** 2
+    return moving, (moving.parameters, np.diag(information))
+
+
+def _separate(observations: RigObservations, state: RigState, c: int) -> tuple[RigObservations, RigState]:
+    """Return the observations and the state of camera `c` alone, every view with a pose of its own."""
+    alone, count = state.of_camera(c, observations), len(observations.frame[c])
+    own = replace(
+        observations,
+        cameras=observations.cameras[c : c + 1],
+        weights=observations.weights[c : c + 1],
+        frame=(np.arange(count),),
+        keys=tuple((str(k), "") for k in range(count)),
+        places=(False,) * len(observations.places),
+        held=observations.held[c : c + 1],
+    )
+    return own, RigState(
+        cameras=state.cameras[c : c + 1],
+        mount_rotation=np.eye(3)[None],
+        mount_mm=np.zeros((1, 3)),
+        frame_rotation=alone.rotation,
+        frame_mm=alone.translation_mm,
+        board_rotation=state.board_rotation,
+        board_mm=state.board_mm,
+        unknowns=state.unknowns,
+    )
