@@ -173,7 +173,6 @@ class _Solution:
             result,
             [*moved, *_largest_size_chosen(outcome.beyond, result, in_force)],
             far=far,
-            clusters=observations.clusters(),
             in_force=in_force,
             solved=(observations, fit),
             order=self.fits.observations.images,

@@ -13,6 +13,7 @@ from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.pupil import SolvedPupil, require_of_frame
 from rigkit.calibration.solving.clustered import effective_freedom, widening
 from rigkit.calibration.solving.solver import Convergence
+from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import NearCamera, far_camera, pupil_shift_of_rays_mm
 from rigkit.core.arrays import (
@@ -157,7 +158,7 @@ class Rival:
     likely: float
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationCorners:
     """All corners of the views of a calibration, outliers too, view by view.
 
@@ -190,6 +191,23 @@ class CalibrationCorners:
         view = self.view[chosen]
         turned = np.einsum("nij,nj->ni", self.rotation[view], self.points_mm[chosen])
         return np.asarray(turned + self.translation_mm[view])
+
+    @cached_property
+    def neighbour_correlation(self) -> float:
+        """Correlation of the residuals of kept corners that are neighbours on their board, 0 if there are none: zero
+        for noise, positive for errors of the lens or board model."""
+        (columns, rows), kept = (self.grid.max(axis=0) + 1).tolist(), self.kept
+        places = len(self.count) * rows * columns
+        lattice, there = np.zeros((places, 2)), np.zeros(places)
+        place = ((self.view * rows + self.grid[:, 1]) * columns + self.grid[:, 0])[kept]
+        lattice[place], there[place] = self.residuals_px[kept], 1.0
+        lattice, there = lattice.reshape(-1, rows, columns, 2), there.reshape(-1, rows, columns)
+        squared = lattice[..., 0] ** 2 + lattice[..., 1] ** 2
+        products, power = 0.0, 0.0
+        for one, other in ((np.s_[:, :, 1:], np.s_[:, :, :-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+            products += float((lattice[one] * lattice[other]).sum())
+            power += 0.5 * float((squared[one] * there[other] + squared[other] * there[one]).sum())
+        return products / power if power > 0.0 else 0.0
 
     @classmethod
     def of(cls, views: Sequence[ViewResult], boards: Sequence[BoardShape]) -> Self:
@@ -290,6 +308,12 @@ class Calibration:
     def corners(self) -> CalibrationCorners:
         """All corners of all views."""
         return CalibrationCorners.of(self.views, self.boards)
+
+    @cached_property
+    def clusters(self) -> IntArray:
+        """Number of the cluster of each view's image, (V,): near-duplicate images have the same (`cluster_numbers`)."""
+        names = [view.image for view in self.views], [view.board_id for view in self.views]
+        return cluster_numbers(*names, [view.pixels for view in self.views])
 
     @cached_property
     def near(self) -> Camera:

@@ -17,7 +17,7 @@ from rigkit.calibration.certainty.uncertainty import FarProjection, worst_direct
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import image_center
 from rigkit.cameras.compare import grid_pixels
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Rays, quantiles_of
+from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Rays, quantiles_of
 from rigkit.core.findings import Finding, Severity, worst
 from rigkit.core.printing import digits
 
@@ -100,11 +100,9 @@ class Extent:
         )
 
 
-def diagnose_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]:
-    """Return findings about how the images were taken, the most severe first; `clusters` (V,) are the cluster numbers
-    of the views' images, equal for near-duplicates."""
-    images = [view.image for view in calibration.views]
-    number = clusters.tolist()
+def diagnose_capture(calibration: Calibration) -> list[Finding]:
+    """Return findings about how the images were taken, the most severe first."""
+    images, number = [view.image for view in calibration.views], calibration.clusters.tolist()
     few = list(_too_few(images, number))
     # Seven images in place of eight matter less than how they were taken.
     far_too_few = worst(few) is Severity.BAD
@@ -122,9 +120,9 @@ def hardly_tilted(c: Calibration) -> list[Finding]:
     return [*_tilts(c), *_parallel(c)]
 
 
-def few_repeated(calibration: Calibration, clusters: IntArray) -> Iterator[Finding]:
+def few_repeated(calibration: Calibration) -> Iterator[Finding]:
     """Yield a finding about near-duplicate images where enough others are left."""
-    images, number = [view.image for view in calibration.views], clusters.tolist()
+    images, number = [view.image for view in calibration.views], calibration.clusters.tolist()
     if not _few_different(images, number):
         yield from _repeated(images, number)
 

@@ -25,7 +25,6 @@ from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.solver import solve
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import image_center
-from rigkit.core.arrays import IntArray
 from rigkit.core.findings import Finding
 
 MIN_VARIANCE_RATIO = 6.0
@@ -102,37 +101,25 @@ MIN_IMAGES_OF_TREND = 10
 
 
 def changing(
-    calibration: Calibration,
-    correlation: float,
-    solved: tuple[Observations, Fit] | None = None,
-    but: Collection[str] = (),
-    clusters: IntArray | None = None,
+    calibration: Calibration, solved: tuple[Observations, Fit] | None = None, but: Collection[str] = ()
 ) -> list[Finding]:
-    """Return a finding where something changes between images that the calibration assumes constant.
-
-    Parameters
-    ----------
-    correlation : `neighbour_correlation` of the residuals.
-    solved : observations and fit of the calibration, if known: a change of the lens is then solved for, not only tested
-        at first order.
-    but : kinds of change that are not reported.
-    clusters : as for `view_evidence`.
-    """
-    evidence = view_evidence(calibration, clusters) if correlation > MIN_NEIGHBOUR_CORRELATION else None
+    """Return a finding where something changes between images that the calibration assumes constant, unless it is in
+    `but`. With `solved`, observations and fit of the calibration, a change of the lens is solved for, not only tested
+    at first order."""
+    smooth = calibration.corners.neighbour_correlation > MIN_NEIGHBOUR_CORRELATION
+    evidence = view_evidence(calibration) if smooth else None
     changes = evidence.changes() if evidence is not None else {}
     if evidence is None or not changes:
         return []
     if solved is not None:
         shifted = changes["shift"].ratio >= MIN_VARIANCE_RATIO
-        flipped = flipped_images(calibration, evidence, *solved, clusters, shifted=shifted)
+        flipped = flipped_images(calibration, evidence, *solved, shifted=shifted)
         if flipped is not None:
             return [flipped]
     if not but and (drift := drifting(calibration, evidence)):
         return [drift]
     if solved is not None and changes["lens"].ratio >= MIN_VARIANCE_RATIO and changes["lens"].share >= MIN_SHARE_TRIED:
-        changes |= {
-            kind: _solved_for(kind, evidence, calibration, *solved, changes[kind], clusters) for kind in OF_LENS
-        }
+        changes |= {kind: _solved_for(kind, evidence, calibration, *solved, changes[kind]) for kind in OF_LENS}
     best = min(changes, key=lambda kind: changes[kind].criterion)
     if best in OF_LENS and _leads(changes, best, but=OF_LENS):
         # A zoom about another centre is both; if one of them explains nearly as much, it is that one.
@@ -183,7 +170,6 @@ def _solved_for(
     observations: Observations,
     fit: Fit,
     at_first: ViewChange,
-    clusters: IntArray | None,
 ) -> ViewChange:
     """Return what a change of the lens explains when everything is solved with it, or `at_first` (order) if that is
     more."""
@@ -193,7 +179,7 @@ def _solved_for(
     _, directions, amounts = evidence.explained(columns)
     for rounds in range(LENS_ROUNDS):
         if rounds:
-            now = view_evidence(with_solution(calibration, observations, start, residuals, fit.kept), clusters)
+            now = evidence.again(with_solution(calibration, observations, start, residuals, fit.kept))
             if now is None:
                 return at_first
             evidence, (_, _, amounts) = now, now.explained(columns)

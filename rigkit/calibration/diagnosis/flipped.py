@@ -19,7 +19,7 @@ import numpy as np
 from rigkit.calibration.assemble import with_solution
 from rigkit.calibration.choosing.board_orientation import with_boards_renumbered
 from rigkit.calibration.diagnosis.two_kinds import SIGMAS_DO_NOT_HOLD, ImageScores
-from rigkit.calibration.diagnosis.view_evidence import ViewEvidence, columns_of, view_evidence
+from rigkit.calibration.diagnosis.view_evidence import ViewEvidence, columns_of
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.poses import START_TOLERANCE, refine_poses
@@ -71,13 +71,12 @@ def flipped_images(
     evidence: ViewEvidence,
     observations: Observations,
     fit: Fit,
-    clusters: IntArray | None = None,
     *,
     shifted: bool = True,
 ) -> Finding | None:
     """Return a finding where some of the images were rotated by 180 degrees or mirrored, else None.
 
-    `evidence` is the `view_evidence` of the calibration with these `clusters`; `shifted` says whether two clusters of
+    `evidence` is the `view_evidence` of the calibration; `shifted` says whether two clusters of
     principal points are possible.
     """
     before = float(weighted_squares(fit.state, observations, fit.weight(observations)).sum())
@@ -91,7 +90,7 @@ def flipped_images(
     back = min(tried, key=lambda one: one.squares)
     residuals = evaluate(back.state, back.observations)
     solved = with_solution(calibration, back.observations, back.state, residuals, fit.kept)
-    now = view_evidence(solved, clusters)
+    now = evidence.again(solved)
     return None if now is None else _finding_of(back, before, now)
 
 

@@ -29,7 +29,6 @@ from rigkit.calibration.diagnosis.view_evidence import (
     CHANGE_COLUMNS,
     MIN_INFORMATIVE_CORNERS,
     columns_of,
-    neighbour_correlation,
     points_of,
     products_of,
     rows_of,
@@ -217,10 +216,9 @@ def _regression(gram: FloatArray, rows: IntArray, what: int) -> FloatArray:
     return np.asarray(np.linalg.lstsq(gram[np.ix_(rows, rows)], gram[rows, what], rcond=NOT_FOLLOWED)[0])
 
 
-def moving_pupil(calibration: Calibration, correlation: float, far: FarProjection) -> Iterator[Finding]:
-    """Yield a finding where the pupil moves significantly and by a relevant amount; `correlation` is the
-    `neighbour_correlation` of the residuals."""
-    asked = calibration.pupil is None and correlation > MIN_NEIGHBOUR_CORRELATION
+def moving_pupil(calibration: Calibration, far: FarProjection) -> Iterator[Finding]:
+    """Yield a finding where the pupil moves significantly and by a relevant amount."""
+    asked = calibration.pupil is None and calibration.corners.neighbour_correlation > MIN_NEIGHBOUR_CORRELATION
     pupil = MovingPupil.of(calibration) if asked else None
     if pupil is None or pupil.chance > PUPIL_SIGNIFICANCE:
         return
@@ -254,7 +252,7 @@ def modelled_pupil(calibration: Calibration) -> Iterator[Finding]:
 def may_move(calibration: Calibration) -> bool:
     """Return whether a moving pupil should be solved for: its first-order estimate is significant at ASKED_AT, or the
     lens is wide, and far points may be displaced by a relevant amount. The fit decides then."""
-    if neighbour_correlation(calibration) <= MIN_NEIGHBOUR_CORRELATION:
+    if calibration.corners.neighbour_correlation <= MIN_NEIGHBOUR_CORRELATION:
         return False
     pupil = MovingPupil.of(calibration)
     if pupil is None:

@@ -33,11 +33,9 @@ from rigkit.calibration.diagnosis.mixed import two_cameras
 from rigkit.calibration.diagnosis.moved import moment
 from rigkit.calibration.diagnosis.pupil import modelled_pupil, moving_pupil
 from rigkit.calibration.diagnosis.two_kinds import KINDS_REMEDY, listed, min_of_a_kind
-from rigkit.calibration.diagnosis.view_evidence import neighbour_correlation
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.views.observations import Observations
-from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.calibration.views.usable import OTHER_GRIDS
 from rigkit.cameras.base import image_center
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
@@ -86,7 +84,6 @@ def diagnose(
     also: Sequence[Finding] = (),
     *,
     far: FarProjection | None = None,
-    clusters: IntArray | None = None,
     in_force: Collection[str] = (),
     solved: tuple[Observations, Fit] | None = None,
     order: Sequence[str] = (),
@@ -96,19 +93,18 @@ def diagnose(
     Parameters
     ----------
     also : findings from elsewhere.
-    far, clusters : results of `FarProjection.of` and `cluster_numbers` (V,), if known.
+    far : result of `FarProjection.of`, if known.
     in_force : those of "model" and "board_shape" that were "auto", so that this is no remedy.
     solved, order : observations and fit of the calibration, if known, and the names of all images in the order given.
     """
     far = FarProjection.of(calibration) if far is None else far
-    clusters = _clusters(calibration.views) if clusters is None else clusters
     upright = list(boards_never_rotated(calibration))
     stretched = list(stretched_images(calibration, upright=bool(upright)))
-    extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
-    mixed, change = _residuals(calibration, correlation, far, also, clusters, solved)
+    extent = Extent.of(calibration)
+    mixed, change = _residuals(calibration, far, also, solved)
     # With the images of two cameras mixed, residuals are not informative about views, boards and model.
     unlike, unclear = ([], []) if mixed else _views(calibration)
-    pattern = [] if mixed else list(_pattern(calibration, correlation, in_force, bool(change)))
+    pattern = [] if mixed else list(_pattern(calibration, in_force, bool(change)))
     effects = list(_uncertain(calibration, far))
     # Images that contradict each other make the lens uncertain: where some were turned, they look stretched. A cause
     # found already explains a later other lens, too.
@@ -122,13 +118,13 @@ def diagnose(
         *cropped_images(calibration),
         *([] if contradicting else stretched),
         *unlike,
-        *diagnose_capture(calibration, clusters),
+        *diagnose_capture(calibration),
         *([*pattern, *stretched] if contradicting else []),
         *upright,
         *extrapolated(calibration, extent, far),
         *(finding for finding in also if finding.severity is Severity.BAD and not named),
     ]
-    found = _about_images(calibration, also, clusters)
+    found = _about_images(calibration, also)
     if not mixed:
         found += [
             *unclear,
@@ -141,35 +137,29 @@ def diagnose(
     return (*with_headline(calibration, causes, effects, extent.where), *modelled_pupil(calibration), *found)
 
 
-def _about_images(c: Calibration, also: Sequence[Finding], clusters: IntArray) -> list[Finding]:
+def _about_images(c: Calibration, also: Sequence[Finding]) -> list[Finding]:
     """Return findings that are no causes, of images left out, repeated or missing, after those of `also`."""
     minor = [finding for finding in also if finding.severity is not Severity.BAD]
-    return [*minor, *_left_out(c.dropped, c.views), *few_repeated(c, clusters), *_coverage(c)]
-
-
-def _clusters(views: Sequence[ViewResult]) -> IntArray:
-    return cluster_numbers([v.image for v in views], [v.board_id for v in views], [v.pixels for v in views])
+    return [*minor, *_left_out(c.dropped, c.views), *few_repeated(c), *_coverage(c)]
 
 
 def _residuals(
     c: Calibration,
-    correlation: float,
     far: FarProjection,
     also: Sequence[Finding],
-    clusters: IntArray,
     solved: tuple[Observations, Fit] | None,
 ) -> tuple[list[Finding], list[Finding]]:
     """Return findings on two cameras mixed, and on other causes of the residuals."""
-    if mixed := list(two_cameras(c, clusters)):
+    if mixed := list(two_cameras(c, c.clusters)):
         return mixed, []
     # If the lens changed at some image, the residuals of a common lens are no evidence for another change.
     but = CHANGES if worst(also) is Severity.BAD else ()
-    change = changing(c, correlation, solved, but, clusters)
+    change = changing(c, solved, but)
     if hardly_tilted(c):
         # Such boards do not determine the lens, and its errors look like shears and zooms that differ between images.
         change = [finding for finding in change if finding.severity is Severity.BAD]
     # A moving pupil looks a little like a zoom in every image, but no change between images looks like a pupil.
-    return [], change if worst(change) is Severity.BAD else list(moving_pupil(c, correlation, far)) or change
+    return [], change if worst(change) is Severity.BAD else list(moving_pupil(c, far)) or change
 
 
 def diagnose_session(
@@ -329,9 +319,10 @@ def _medians(values: FloatArray, count: IntArray) -> FloatArray:
     return np.asarray(0.5 * (padded[row, (count - 1) // 2] + padded[row, count // 2]))
 
 
-def _pattern(c: Calibration, correlation: float, in_force: Collection[str], named: bool) -> Iterator[Finding]:
+def _pattern(c: Calibration, in_force: Collection[str], named: bool) -> Iterator[Finding]:
     """Yield a finding where residuals of neighbours are correlated: an error of the lens or board model, unless a
     cause is `named` already."""
+    correlation = c.corners.neighbour_correlation
     if correlation < PATTERN:
         return
     what = f"residuals of neighbouring corners are correlated ({correlation:.2f}): "

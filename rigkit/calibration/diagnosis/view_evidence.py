@@ -66,13 +66,15 @@ class ViewEvidence:
 
     Attributes
     ----------
-    views : indices of the views in the calibration.
+    clusters : (W,) `Calibration.clusters`.
+    views : indices of the V views among all W.
     own, length : (V, K, K) products of the rows, and (V, K) lengths of the rows before eliminating poses.
     along : (V, K) products of the rows with the residuals, after fitting the common rows.
     gram, scale : (C, C) products of the common rows, scaled to a unit diagonal, and (C,) their scales.
     total, freedom : sum of squares of the residuals, and its degrees of freedom.
     """
 
+    clusters: IntArray
     views: list[int]
     own: FloatArray
     length: FloatArray
@@ -102,6 +104,10 @@ class ViewEvidence:
         squares = float((amount**2).sum()) + float((turned**2 / values[followed]).sum())
         return squares, int(known.sum()), (np.swapaxes(back, -1, -2) @ (amount - shared @ step)[..., None])[..., 0]
 
+    def again(self, calibration: Calibration) -> ViewEvidence | None:
+        """Return the evidence of another solution for the same images."""
+        return _evidence(calibration, self.clusters)
+
     def changes(self) -> dict[str, ViewChange]:
         """Return what each kind of change explains; empty with too few degrees of freedom."""
         out = {}
@@ -113,18 +119,19 @@ class ViewEvidence:
         return out
 
 
-def view_evidence(calibration: Calibration, clusters: IntArray | None = None) -> ViewEvidence | None:
-    """Return the evidence of the residuals; None with too few views.
+def view_evidence(calibration: Calibration) -> ViewEvidence | None:
+    """Return the evidence of the residuals; None with too few views. Of near-duplicate images only the first is
+    used."""
+    return _evidence(calibration, calibration.clusters)
 
-    `clusters` (V,) are the `cluster_numbers` of the views; of near-duplicate images only the first is used.
-    """
+
+def _evidence(calibration: Calibration, clusters: IntArray) -> ViewEvidence | None:
     informative = [
         k for k, view in enumerate(calibration.views) if np.count_nonzero(view.kept) >= MIN_INFORMATIVE_CORNERS
     ]
-    if clusters is not None:
-        images = [view.image for view in calibration.views]
-        first = dict(zip(clusters[::-1].tolist(), images[::-1], strict=True))
-        informative = [k for k in informative if images[k] == first[int(clusters[k])]]
+    images = [view.image for view in calibration.views]
+    first = dict(zip(clusters[::-1].tolist(), images[::-1], strict=True))
+    informative = [k for k in informative if images[k] == first[int(clusters[k])]]
     if len(informative) < MIN_INFORMATIVE_VIEWS:
         return None
     products = products_of([calibration.views[k] for k in informative], lambda views: rows_of(calibration, views))
@@ -147,6 +154,7 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
         # The model lacks a bow common to all images: the residuals are not those of a minimum.
         return None
     return ViewEvidence(
+        clusters=clusters,
         views=[k for k, is_finite in zip(informative, finite, strict=True) if is_finite],
         own=own,
         length=length,
@@ -235,21 +243,3 @@ def without_pose(products: FloatArray, length: FloatArray) -> FloatArray:
     whitened = np.where(sizes > MIN_OWN_PART**2, sizes, np.inf) ** -0.5
     back = np.swapaxes(axes * whitened[:, None], -1, -2) @ (products[:, :6] / pose[:, :, None])
     return np.asarray(products - np.swapaxes(back, -1, -2) @ back)
-
-
-def neighbour_correlation(c: Calibration) -> float:
-    """Return the correlation of the residuals of inliers that are neighbours on their board, 0 if there are none: zero
-    for noise, positive for errors of the lens or board model."""
-    corners = c.corners
-    kept, grid = corners.kept, corners.grid
-    columns, rows = (grid.max(axis=0) + 1).tolist()
-    lattice, there = np.zeros((len(c.views) * rows * columns, 2)), np.zeros(len(c.views) * rows * columns)
-    place = ((corners.view * rows + grid[:, 1]) * columns + grid[:, 0])[kept]
-    lattice[place], there[place] = corners.residuals_px[kept], 1.0
-    lattice, there = lattice.reshape(-1, rows, columns, 2), there.reshape(-1, rows, columns)
-    squared = lattice[..., 0] ** 2 + lattice[..., 1] ** 2
-    products, power = 0.0, 0.0
-    for one, other in ((np.s_[:, :, 1:], np.s_[:, :, :-1]), (np.s_[:, 1:], np.s_[:, :-1])):
-        products += float((lattice[one] * lattice[other]).sum())
-        power += 0.5 * float((squared[one] * there[other] + squared[other] * there[one]).sum())
-    return products / power if power > 0.0 else 0.0

@@ -14,7 +14,7 @@ from helpers.session_scenes import NOISE_PX, poses, seen
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.diagnosis.changing import CHANGES, MIN_NEIGHBOUR_CORRELATION, changing
 from rigkit.calibration.diagnosis.verdicts import diagnose
-from rigkit.calibration.diagnosis.view_evidence import neighbour_correlation, view_evidence
+from rigkit.calibration.diagnosis.view_evidence import view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.compare import compare_cameras
@@ -32,7 +32,7 @@ def first(result: Calibration) -> str:
 
 
 def changing_in(result: Calibration) -> list[Finding]:
-    return changing(result, neighbour_correlation(result))
+    return changing(result)
 
 
 def prefixed(views: list[BoardView], prefix: str) -> list[BoardView]:
@@ -357,10 +357,10 @@ def test_a_zoom_is_not_taken_for_a_motion(again: str, rng: np.random.Generator) 
 @pytest.mark.parametrize("way", ["focus", "shift", "rows", "bend"])
 def test_what_changes_is_far_above_the_correlation_that_is_looked_at(way: str, rng: np.random.Generator) -> None:
     result = calibrate(changed_views(way, rng), SIZE, model="brown", board="flat")
-    assert neighbour_correlation(result) > 3.0 * MIN_NEIGHBOUR_CORRELATION
+    assert result.corners.neighbour_correlation > 3.0 * MIN_NEIGHBOUR_CORRELATION
     # Mere noise is not looked at: nothing would be found there.
     noise = calibrate(changed_views("nothing", rng), SIZE, model="brown", board="flat")
-    assert neighbour_correlation(noise) < MIN_NEIGHBOUR_CORRELATION
+    assert noise.corners.neighbour_correlation < MIN_NEIGHBOUR_CORRELATION
     evidence = view_evidence(noise)
     assert evidence is not None
     assert max(change.share for change in evidence.changes().values()) < 0.1
