@@ -9,7 +9,7 @@
   leaves (`between_models`), and boards numbered from the other end (`board_orientation`)
 - `certainty`: uncertainty of parameters and projection (`covariance`, `uncertainty`), model inadequacy (`departures`,
   `series`, `displaced`), and which part of the image the boards covered (`coverage`)
-- `diagnosis`: of images, residuals and result (`captured`, `moved`, `changing`, `mixed`, `flipped`, `two_kinds`,
+- `diagnosis`: of images, residuals and result (`captured`, `moved`, `changing`, `flipped`, `two_kinds`,
   `pupil`, with `view_evidence`), summarised by `verdicts`
 - the result: `assemble`, `result` (with `board_shape`, `pupil`)
 - a second calibration with a moving entrance pupil, where the residuals indicate one: `with_pupil`

@@ -27,8 +27,7 @@ from rigkit.core.reach import Reach
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import placement
 from rigkit.planning.goal import Goal, RemainingError, Requirement, projection_goal, px_words, rotation_free_jacobian
-from rigkit.planning.guess import guessed_camera
-from rigkit.planning.information import BoardPoses, CornerError, Knowledge
+from rigkit.planning.information import BoardPoses, CornerError, Knowledge, guessed_camera
 from rigkit.planning.plan import Plan, Proposal, covariance_of, plan_views
 
 FIRST_FRAMES = 4

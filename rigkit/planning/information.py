@@ -8,6 +8,8 @@ A board that cameras a and b see at once has the poses a_from_board and b_from_b
 board_from_a has the errors of both: its information about the mount, for known lenses. Frames are independent, so their
 information adds up.
 
+Before the first view a camera is guessed from nothing but the approximate field of view of its lens.
+
 Reference: L. Kish, "Survey Sampling" (1965), section 5.4.
 """
 
@@ -27,10 +29,12 @@ from rigkit.calibration.solving.linearise import view_products
 from rigkit.calibration.solving.shape import WARP_UNKNOWNS, ShapeModel, warp_of_board
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
-from rigkit.cameras.base import Camera
+from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.cameras.compare import grid_pixels
+from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3, skew
 
@@ -39,6 +43,12 @@ LENS_UNKNOWN = 0.1
 PRIOR_GRID = (12, 9)
 MIN_SIGMA_PX = 0.02
 """Least standard deviation of a real corner: with exact corners every view would have unlimited information."""
+PERSPECTIVE_DEG = 100.0
+"""Lenses with a smaller horizontal field of view are mostly rectilinear; wider ones are fisheyes."""
+CURVE_RADII = 64
+CURVE_END = 1.05
+"""End of the radial curve, relative to the corner of the image."""
+MAX_THETA_RAD = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,3 +302,31 @@ def _inverse(matrices: FloatArray) -> FloatArray:
     scale = 1.0 / np.sqrt(np.maximum(np.einsum("...ii->...i", matrices), np.finfo(float).tiny))
     unit = matrices * scale[..., :, None] * scale[..., None, :]
     return np.asarray(np.linalg.pinv(unit, hermitian=True) * scale[..., :, None] * scale[..., None, :])
+
+
+def check_field(hfov_deg: float) -> None:
+    """Raise InputError for an impossible horizontal field of view."""
+    if not 0.5 <= hfov_deg <= 300.0:
+        raise InputError(f"a lens of {hfov_deg:g} degrees: give the field of view across the image's width, 0.5 to 300")
+
+
+def guessed_camera(hfov_deg: float, size_px: tuple[int, int], model: str | None = None) -> Camera:
+    """Return a camera with a horizontal field of view of `hfov_deg`: perspective below 100 degrees, else equidistant;
+    of `model`, by default Brown's or Kannala and Brandt's.
+
+    Raises InputError for an impossible angle, or a model that cannot represent it.
+    """
+    check_field(hfov_deg)
+    half_px, half_rad = 0.5 * size_px[0], np.radians(0.5 * hfov_deg)
+    straight = hfov_deg < PERSPECTIVE_DEG
+    corner_px = CURVE_END * 0.5 * float(np.hypot(*size_px))
+    if straight:
+        focal = half_px / np.tan(half_rad)
+        theta = np.linspace(0.0, np.arctan(corner_px / focal), CURVE_RADII)
+        radius = focal * np.tan(theta)
+    else:
+        focal = half_px / half_rad
+        theta = np.linspace(0.0, min(corner_px / focal, MAX_THETA_RAD), CURVE_RADII)
+        radius = focal * theta
+    kind = camera_model(model or ("brown" if straight else "kannala_brandt"))
+    return kind.from_radial_curve(size_px, RadialCurve(image_center(size_px), theta, radius))

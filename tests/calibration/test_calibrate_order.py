@@ -10,7 +10,7 @@ from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.uncertainty import FarProjection
-from rigkit.calibration.diagnosis.mixed import two_cameras
+from rigkit.calibration.diagnosis.moved import two_cameras
 from rigkit.calibration.views.repeats import cluster_numbers, folds_of
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3

@@ -21,8 +21,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.candidates import MAX_SLANT_DEG, TILT_DEG, board_poses_in_view, outline_mm, placement
 from rigkit.planning.goal import Goal, projection_goal, px_words, rays_within
-from rigkit.planning.guess import guessed_camera
-from rigkit.planning.information import BoardPoses, CornerError, Knowledge
+from rigkit.planning.information import BoardPoses, CornerError, Knowledge, guessed_camera
 from rigkit.planning.plan import choose_views, covariance_of, plan_views
 
 NOISE_PX = 0.2

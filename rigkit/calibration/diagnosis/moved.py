@@ -1,4 +1,5 @@
-"""Tests whether all images are of one lens: earlier and later ones, those of two kinds of names, and any two groups.
+"""Tests whether all images are of one lens: earlier and later ones, those of two kinds of names, and any two groups;
+and whether they are of two cameras that took them together.
 
 The change point is searched at first order: the scores of the images, with poses eliminated, are summed in the order of
 the images, and the split is where lenses of the two parts differ most. As the best of many splits is good by chance,
@@ -8,12 +9,16 @@ too, the search is repeated in random orders of the images (permutation test). G
 An error of the board model makes images differ, too, where they show the board in different ways. So splits are
 compared with splits by place: boards left and right, near and far, tilted in different directions. Only a split that
 separates more clearly than all of those is of two lenses.
+
+Two cameras on one mount see each board in two poses with always the same motion in between. In images of one camera no
+motion between poses occurs twice, unless the board was moved by equal steps: then an image is the end of one step and
+the start of the next.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,10 +35,12 @@ from rigkit.calibration.diagnosis.two_kinds import (
     listed,
     min_of_a_kind,
 )
+from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit, fit_model
 from rigkit.calibration.solving.solver import FROM_OPTIMUM, solve
 from rigkit.calibration.solving.state import State, weighted_squares
 from rigkit.calibration.views.observations import Observations
+from rigkit.calibration.views.repeats import close_pairs
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.moving_pupil import far_camera
@@ -55,6 +62,18 @@ AGAINST_PLACE_SEARCHED = 1.7
 """The same for a split that is the best one of all: 0.7 to 2.0 in 20 REAL and RENDERED sessions of one camera, 1.8 to
 5.6 in 13 of 14 of two (earlier versions of the split). Alone it does not separate them; the other conditions do."""
 DIGITS = re.compile(r"\d+")
+SAME_MOTION = 0.005
+"""Two motions are equal where they move the board to the same place within this part of its distance."""
+MIN_MOTION = 2.0
+"""A smaller multiple of that is no motion."""
+MIN_PARTNERS = 4
+"""Number of pairs of images with the same motion that is not chance: a motion has six parameters."""
+MIN_SHARE_PAIRED = 0.5
+"""Part of all images that must be in such pairs."""
+MAX_SHARE_CHAINED = 0.2
+"""Part of these images that may be both start and end; more is a board moved by equal steps."""
+MAX_STARTS = 24
+"""Number of views from which motions are tried, spread over the places of the boards, whatever their order."""
 
 
 def moved_lens(observations: Observations, fit: Fit, *, tests: int = 1) -> tuple[Finding, ...]:
@@ -273,3 +292,79 @@ def _places(observations: Observations, state: State) -> FloatArray:
     points = (state.points_in_cam(observations)[0] * present).sum(axis=1) / count
     off = np.linalg.norm(pixels - pixels.mean(axis=0), axis=1)
     return np.stack([*pixels.T, off, np.linalg.norm(points, axis=1), *state.rotation[:, :2, 2].T])
+
+
+def two_cameras(calibration: Calibration, number: IntArray) -> Iterator[Finding]:
+    """Yield a finding if the images are of two synchronous cameras; `number` (V,) are the `cluster_numbers` of the
+    views' images."""
+    views = calibration.views
+    images = [view.image for view in views]
+    _, first = np.unique(number, return_index=True)
+    if len(first) < 2 * MIN_PARTNERS:
+        return
+    rotation, centre = calibration.corners.rotation, calibration.corners.translation_mm
+    boards = np.unique([view.board_id for view in views], return_inverse=True)[1]
+    start, end = _partners(rotation, centre, boards, number)
+    if len(start) < MIN_PARTNERS:
+        return
+    alike = len(np.unique(number[start]))
+    together = np.unique(np.concatenate([number[start], number[end]]))
+    chained = np.intersect1d(number[start], number[end])
+    enough = len(together) >= MIN_SHARE_PAIRED * len(first)
+    of_one = list(dict.fromkeys(images[k] for k in sorted(start.tolist())))
+    if alike >= MIN_PARTNERS and enough and len(chained) <= MAX_SHARE_CHAINED * len(together):
+        yield Finding.bad(
+            f"images of two cameras are mixed: the board moves in the same way between '{images[start[0]]}' and "
+            f"'{images[end[0]]}' and in {alike - 1} other pairs of images, as in stereo pairs, of which one camera "
+            f"took {listed(of_one)}",
+            "calibrate each camera from its own images, or both as a rig with [[cameras]]; leave out images "
+            "that a program made from others",
+        )
+
+
+def _partners(
+    rotation: FloatArray, centre: FloatArray, boards: IntArray, number: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Return start and end of the pairs of views with the most common motion of the board, from poses (V, 3, 3) and
+    (V, 3) mm."""
+    distance = float(np.linalg.norm(centre, axis=1).mean())
+    # A pose as four points: the board's origin, and the ends of axes of half the distance.
+    frame = 0.5 * distance * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    reach = SAME_MOTION * distance * 2.0
+    along = np.lexsort(centre.T)
+    starts = along[np.unique(np.linspace(0, len(centre) - 1, min(MAX_STARTS, len(centre))).astype(np.int64))]
+    # Displacement of a frame at the boards' mean place by each motion, as products of all ends and starts: coordinates
+    # first, then start, end and point.
+    typical = frame + centre.mean(axis=0)
+    seen_from = (typical - centre[starts, None]) @ rotation[starts]
+    moved = np.swapaxes(rotation, 0, 1).reshape(-1, 3) @ seen_from.reshape(-1, 3).T
+    moved = moved.reshape(3, len(centre), len(starts), len(frame))
+    moved += centre.T[:, :, None, None] - typical.T[:, None, None]
+    chosen = (number[:, None] != number[starts]) & (boards[:, None] == boards[starts])
+    chosen &= (moved * moved).sum(axis=0).max(axis=-1) > (0.5 * MIN_MOTION * reach) ** 2
+    i, j = np.nonzero(chosen.T)
+    moved = np.moveaxis(moved[:, j, i], 0, 1).reshape(-1, 12)
+    alike = _neighbours(moved, reach) if len(moved) else np.zeros(0, np.int64)
+    if alike.max(initial=0) < 2:
+        # No motion occurs twice.
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    near = np.linalg.norm(moved - moved[int(np.argmax(alike))], axis=1) <= reach
+    best = np.flatnonzero(near)
+    points = frame @ np.swapaxes(rotation, -1, -2) + centre[:, None]
+    # The motion closest to the median of those.
+    middle = best[int(np.argmin(np.linalg.norm(moved[best] - np.median(moved[best], axis=0), axis=1)))]
+    start, end = starts[i[middle]], j[middle]
+    landed = (points - centre[start]) @ (rotation[end] @ rotation[start].T).T + centre[end]
+    one, other = landed.reshape(-1, 12), points.reshape(-1, 12)
+    # |a - b|^2 - |a|^2, all of them as one product.
+    end = ((other**2).sum(axis=1) - 2.0 * one @ other.T).argmin(axis=1)
+    found = np.flatnonzero(((one - other[end]) ** 2).sum(axis=1) < reach**2)
+    found = found[(boards[found] == boards[end[found]]) & (number[found] != number[end[found]])]
+    return found, end[found]
+
+
+def _neighbours(points: FloatArray, reach: float) -> IntArray:
+    """Return for each of the points (N, 12) the number within `reach` of it, (N,), itself included."""
+    i, j = close_pairs(points, reach)
+    near = np.linalg.norm(points[i] - points[j], axis=1) <= reach
+    return np.asarray(1 + np.bincount(np.concatenate([i[near], j[near]]), minlength=len(points)))

@@ -29,8 +29,7 @@ from rigkit.calibration.diagnosis.captured import (
     undistorted,
 )
 from rigkit.calibration.diagnosis.changing import CHANGES, changing
-from rigkit.calibration.diagnosis.mixed import two_cameras
-from rigkit.calibration.diagnosis.moved import moment
+from rigkit.calibration.diagnosis.moved import moment, two_cameras
 from rigkit.calibration.diagnosis.pupil import modelled_pupil, moving_pupil
 from rigkit.calibration.diagnosis.two_kinds import KINDS_REMEDY, listed, min_of_a_kind
 from rigkit.calibration.result import Calibration, ViewResult

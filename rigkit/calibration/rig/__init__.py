@@ -5,7 +5,7 @@
 - initial mounts and frames: `frames`
 - the joint least squares: `layout`, `state`, `pose_jacobians`, `shape`, `known`, `solver`; outlier frames: `disagree`,
   `joint`
-- uncertainty: `heldout`, `lags`, `solved_again`, `displaced`, `uncertainty`
+- uncertainty: `lags`, `solved_again`, `displaced`, `uncertainty`
 - diagnosis: `verdicts`
 - the result: `assemble`, `result`, `board_rig`
 

@@ -3,7 +3,7 @@
 The rig's frame is that of its first camera. Not every camera must see every board in every frame: it is enough that the
 cameras are connected by targets that two of them see at once. Boards may move between frames, each on its own, or
 together if they are mounted to each other (`rigid_boards`): then their poses on the target are solved for as well. One
-camera with such a target is a rig, too.
+camera with such a target is a rig, too. The held-out error is by cross-validation over frames.
 """
 
 from __future__ import annotations
@@ -13,19 +13,25 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
 from rigkit.calibration.choosing.candidate_fits import CandidateFits, camera_named_in_errors
+from rigkit.calibration.choosing.choice import MIN_IMAGES_OF_FIT
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.diagnosis.pupil import pupil_is_significant
 from rigkit.calibration.diagnosis.two_kinds import contradicting_images
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig
-from rigkit.calibration.rig.heldout import heldout_rms
+from rigkit.calibration.rig.certainty.frame_covariance import residual_sigma
 from rigkit.calibration.rig.joint import BAD_COST_SIGMAS, JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.known import KnownCameras
-from rigkit.calibration.rig.solving.lags import TIMINGS
+from rigkit.calibration.rig.solving.lags import TIMINGS, cost_of_own_times
+from rigkit.calibration.rig.solving.shutters import readout_steps, with_longer_readouts
+from rigkit.calibration.rig.solving.solver import refine_frames, solve_rig
+from rigkit.calibration.rig.solving.state import RigObservations
 from rigkit.calibration.rig.verdicts import diagnose_rig
 from rigkit.calibration.rig.views.board_places import board_places
 from rigkit.calibration.rig.views.copies import with_copies_matched
@@ -37,6 +43,8 @@ from rigkit.calibration.rig.views.mispaired import (
     slipped_camera,
 )
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews, frame_observations
+from rigkit.calibration.solving.solver import FROM_OPTIMUM
+from rigkit.calibration.solving.state import weighted_squares
 from rigkit.calibration.with_pupil import require_known
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
@@ -274,3 +282,51 @@ def _renamed(before: Sequence[FrameObservations], after: Sequence[FrameObservati
         old.keys() != new.keys() or any(old[key].view is not new[key].view for key in old)
         for old, new in zip(before, after, strict=True)
     )
+
+
+def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float | None, ...]]:
+    """Return the 2-D RMS over held-out frames, of all cameras together and of each: cameras, mounts, places and shapes
+    of boards are from the other folds, only one pose for each target is fitted, jointly to all cameras. Readouts of
+    rolling shutters, too, are corrected to first order to those of the other folds. The images' own times are those of
+    the solution; what it costs to predict them instead (`cost_of_own_times`) is in the first error. With fewer frames
+    than folds each is a fold. None with less than MIN_IMAGES_OF_FIT frames, or where a camera's mount is determined by
+    the frames of one fold alone.
+
+    Unlike the held-out errors of single cameras it includes disagreement between cameras. Residuals are weighted as in
+    the solution.
+    """
+    observations, state = joint.observations, joint.solution.state
+    nothing = None, (None,) * len(observations.cameras)
+    if folds < 2 or int(joint.frames.max()) + 1 < MIN_IMAGES_OF_FIT:
+        return nothing
+    fold = joint.folds(folds)
+    squared, count = np.zeros(len(observations.cameras)), np.zeros(len(observations.cameras))
+    sigma, own_times = residual_sigma(observations, joint.solution, joint.sigma_px), 0.0
+    for k in range(int(fold.max()) + 1):
+        test = fold == k
+        train = observations.subset(~test)
+        if not _is_connected(train):
+            return nothing
+        solved = solve_rig(train, state, joint.sigma_px, FROM_OPTIMUM).state
+        part, start = observations.subset(test), solved.with_frames(state)
+        if joint.timing == "readouts":
+            part = with_longer_readouts(part, start, readout_steps(train, solved)[0])
+        found = refine_frames(part, start)
+        own_times += cost_of_own_times(part, found, sigma)
+        for c, (own, weight) in enumerate(zip(part.cameras, part.weights, strict=True)):
+            squared[c] += float(weighted_squares(found.of_camera(c, part), own, weight).sum())
+            count[c] += float((weight > 0.0).sum())
+    each = tuple(float(np.sqrt(s / n)) if n else None for s, n in zip(squared, count, strict=True))
+    return float(np.sqrt((squared.sum() + own_times) / count.sum())), each
+
+
+def _is_connected(observations: RigObservations) -> bool:
+    """Return whether all cameras are connected by shared poses."""
+    poses = [set(own.tolist()) for own in observations.frame]
+    linked, rest = poses[0], poses[1:]
+    while rest:
+        near = [own for own in rest if own & linked]
+        if not near:
+            return False
+        linked, rest = linked.union(*near), [own for own in rest if not own & linked]
+    return True

@@ -33,7 +33,7 @@ from rigkit.io.manifests.rig_session import ONE
 from rigkit.io.manifests.session import SESSION_NAME
 from rigkit.io.media.video import Video
 from rigkit.planning.goal import Goal
-from rigkit.planning.guess import check_field
+from rigkit.planning.information import check_field
 from rigkit.workflows.calibration.calibrate import SessionCalibration
 from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.calibration.next_pictures import length_goals

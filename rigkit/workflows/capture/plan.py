@@ -21,8 +21,7 @@ from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.io.manifests.rig_session import is_rig_session
 from rigkit.io.manifests.session import load_session
-from rigkit.planning.guess import guessed_camera
-from rigkit.planning.information import CornerError, Knowledge
+from rigkit.planning.information import CornerError, Knowledge, guessed_camera
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.report.pages.check_page import power_table
 from rigkit.report.pages.plan_page import plan_page

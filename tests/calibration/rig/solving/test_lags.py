@@ -16,9 +16,8 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens
 
 from rigkit.calibration.rig import calibrate
-from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.calibrate import calibrate_rig, heldout_rms
 from rigkit.calibration.rig.certainty.solved_again import readout_error
-from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import JointRig, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving import lags
