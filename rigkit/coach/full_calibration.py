@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
 from rigkit.calibration.certainty.departures import with_own_noise
@@ -19,6 +19,7 @@ from rigkit.calibration.certainty.displaced import lens_modes, uncertain_camera
 from rigkit.calibration.choosing.candidate_fits import CandidateFits, fit_candidates
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
@@ -29,16 +30,6 @@ from rigkit.planning.information import Knowledge
 STEADY = 0.15
 """Largest relative change of the cross-validation error since fewer frames. For a tenth frame to raise the rms of nine
 by 15 % when predicted, its residuals must be twice as large as theirs."""
-
-
-class CrossValidated(Protocol):
-    """A calibration with a cross-validation error."""
-
-    @property
-    def heldout_rms_px(self) -> float | None: ...
-
-
-Found = TypeVar("Found", bound=CrossValidated)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -70,6 +61,9 @@ def full_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> Fu
         return FullCalibration(found, known, uncertain_camera(found, modes=modes), candidate_fits)
     except (InputError, DegenerateError):
         return None
+
+
+Found = TypeVar("Found", bound=FullCalibration | RigCalibration)
 
 
 class FullCalibrations(Generic[Found]):
