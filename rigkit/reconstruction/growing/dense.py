@@ -30,6 +30,7 @@ from rigkit.reconstruction.growing.grow import (
     EpipolarConstraint,
     GrowingView,
     GrownPatches,
+    PosedViews,
     grow,
     grow_in_both_directions,
 )
@@ -144,13 +145,14 @@ def grow_scene(
             f"no surface grows from {len(agreeing)} correspondences; check that the images are sharp and "
             "show surfaces with texture"
         )
-    grown, sweep = fill_by_sweep(grown, PairRays.of(grown, r.camera1, r.camera2).measured(pose), view1, view2, pose)
+    views = PosedViews(view1, view2, pose)
+    grown, sweep = fill_by_sweep(grown, PairRays.of(grown, r.camera1, r.camera2).measured(pose), views)
     rays = PairRays.of(grown, r.camera1, r.camera2)
     measured = rays.measured(pose)
     surface = fit_surface(measured, step, even.pose.epipolar_rms_px)
     if sweep is not None:
         surface = surface.where(at_best_depth(surface, grown, measured.slope, sweep, view1))
-        surface, grown = fill_holes(surface, grown, sweep, view1, view2, pose, even.pose.epipolar_rms_px)
+        surface, grown = fill_holes(surface, grown, sweep, views, even.pose.epipolar_rms_px)
         rays = PairRays.of(grown, r.camera1, r.camera2)
     by_pose = _planes_by_pose(rays, pose, covariance)
     moves = _moved_by_calibration(even, r, moved, pose_is_known=pose_is_known)

@@ -14,12 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.sweep import LevelPlanes, fitted_level_planes
 from rigkit.optim.robust_scale import robust_sigma
-from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches
+from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, PosedViews
 from rigkit.reconstruction.growing.surface import GrownSurface
-from rigkit.reconstruction.growing.sweep import ALIKE_LEVELS, RIVAL_RADIUS, Sweep, directions_in_cam2, replace_pairs
+from rigkit.reconstruction.growing.sweep import ALIKE_LEVELS, RIVAL_RADIUS, Sweep, replace_pairs
 
 REACHES = (1, 2, 4)
 """Distances, in nodes, of the neighbours in eight directions: up to the reach of a plane's fit."""
@@ -46,24 +45,18 @@ def at_best_depth(
 
 
 def fill_holes(
-    surface: GrownSurface,
-    grown: GrownPatches,
-    sweep: Sweep,
-    view1: GrowingView,
-    view2: GrowingView,
-    cam2_from_cam1: Rigid3,
-    shared_px: float = 0.0,
+    surface: GrownSurface, grown: GrownPatches, sweep: Sweep, views: PosedViews, shared_px: float = 0.0
 ) -> tuple[GrownSurface, GrownPatches]:
     """Return the surface with its holes filled by planes of the sweep, and the pairs with those of these planes.
 
     A plane must fit the pixels better than any parallel one, by a margin that grows as fewer samples around it agree.
     `shared_px` is an error along the epipolar lines that is common to all nodes around.
     """
-    nodes = view1.nodes(grown.step)
+    nodes = views.view1.nodes(grown.step)
     there = sweep.reliable[sweep.nearest(nodes)]
     compared = np.flatnonzero(there & surface.valid)[::COMPARED_EVERY]
     holes = np.flatnonzero(there & ~surface.valid)
-    both = _swept_planes(np.concatenate([compared, holes]), grown.step, sweep, view1, view2, cam2_from_cam1)
+    both = _swept_planes(np.concatenate([compared, holes]), grown.step, sweep, views)
     scale = _noise_over_scatter(both, surface.plane.reshape(-1, 3)[both.nodes])
     planes = both.select(np.flatnonzero(~surface.valid.ravel()[both.nodes]))
     good = sweep.cost_over_rivals(planes.pixels1, planes.plane, planes.slope) < planes.agree
@@ -78,7 +71,7 @@ def fill_holes(
     # An extended plane has an additional error by the curvature of the surface.
     bends = choice.scatter[near, None, None] * own[:, :, None] * own[:, None, :]
     covariance[near] = surface.covariance.reshape(-1, 3, 3)[source] + bends
-    return _with_planes(surface, grown, planes, plane, covariance, view1, view2, cam2_from_cam1)
+    return _with_planes(surface, grown, planes, plane, covariance, views)
 
 
 class _SweptPlanes(NamedTuple):
@@ -99,11 +92,9 @@ class _SweptPlanes(NamedTuple):
         return self._replace(**{name: getattr(self, name)[which] for name in self._fields})
 
 
-def _swept_planes(
-    nodes: IntArray, step: int, sweep: Sweep, view1: GrowingView, view2: GrowingView, cam2_from_cam1: Rigid3
-) -> _SweptPlanes:
+def _swept_planes(nodes: IntArray, step: int, sweep: Sweep, views: PosedViews) -> _SweptPlanes:
     """Return the planes of the sweep's surface at row-major `nodes`; those behind the camera are left out."""
-    at = sweep.nearest(view1.nodes(step).reshape(-1, 2)[nodes])
+    at = sweep.nearest(views.view1.nodes(step).reshape(-1, 2)[nodes])
     fits: LevelPlanes = fitted_level_planes(
         sweep.winners,
         sweep.seen,
@@ -121,12 +112,10 @@ def _swept_planes(
     # Planes in which fewer samples lie err more: in proportion to 1 / agree (motorcycle, REAL, shares of 0.6 to 1).
     of_z = to_z @ ((fits.variance / fits.agree**2)[:, None, None] * np.linalg.inv(fits.normals)) @ to_z.T
     pixels1, rays = sweep.pixels1[at].astype(np.float64), sweep.rays1[at]
-    frame = np.concatenate([rays[:, None, :], np.swapaxes(view1.camera.ray_jacobian(pixels1), 1, 2)], axis=1)
+    frame = np.concatenate([rays[:, None, :], np.swapaxes(views.view1.camera.ray_jacobian(pixels1), 1, 2)], axis=1)
     to_plane = np.linalg.inv(frame)
     half = 0.5 * spacing
-    (first, seen1), (second, seen2) = (
-        view2.camera.project(directions_in_cam2(rays, z[:, 0] + change, cam2_from_cam1)) for change in (-half, half)
-    )
+    (first, seen1), (second, seen2) = (views.project(rays, z[:, 0] + change) for change in (-half, half))
     slope = np.where(seen1 & seen2, np.linalg.norm(second - first, axis=1) / spacing, np.nan)
     planes = _SweptPlanes(
         nodes,
@@ -186,11 +175,10 @@ def _with_planes(
     planes: _SweptPlanes,
     plane: FloatArray,
     covariance: FloatArray,
-    view1: GrowingView,
-    view2: GrowingView,
-    cam2_from_cam1: Rigid3,
+    views: PosedViews,
 ) -> tuple[GrownSurface, GrownPatches]:
     """Return the surface and the pairs with `plane` (N, 3) and its `covariance` at the nodes of `planes`."""
+    view1 = views.view1
     nodes = view1.nodes(grown.step).reshape(-1, 2)[planes.nodes]
     rays, seen = view1.camera.unproject(nodes)
     inverse = np.sum(plane * rays, axis=1)
@@ -201,7 +189,7 @@ def _with_planes(
     new.ravel()[at] = True
     z = np.einsum("nij,nj->ni", frame, plane)
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", rays, covariance, rays))
-    grown = replace_pairs(grown, new, z, sigma, view1, view2, cam2_from_cam1)
+    grown = replace_pairs(grown, new, z, sigma, views)
     values = {
         "points": rays / inverse[:, None],
         "normals": -plane / np.linalg.norm(plane, axis=1, keepdims=True),

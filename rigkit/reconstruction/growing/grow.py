@@ -9,7 +9,7 @@ and images are not rectified.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.refine_patches import patch_pyramid, patch_rules
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels
+from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.patches import EpipolarKnowledge, Pyramid, grown, starts_of
 
 HALF_WIDTH = 7
@@ -68,6 +69,20 @@ class GrowingView:
         """Return the pixels (R, C, 2) every `step` px."""
         width, height = self.size_px
         return np.stack(np.meshgrid(*(np.arange(0.0, n, step) for n in (width, height))), axis=-1)
+
+
+class PosedViews(NamedTuple):
+    """Two images to grow in, and the relative pose of their cameras."""
+
+    view1: GrowingView
+    view2: GrowingView
+    cam2_from_cam1: Rigid3
+
+    def project(self, rays: FloatArray, inverse: FloatArray) -> tuple[Pixels, BoolArray]:
+        """Return the pixels (..., 2) in image 2 of points at inverse ranges (...) on rays (..., 3) of camera 1, and a
+        mask of those that camera 2 sees."""
+        pose = self.cam2_from_cam1
+        return self.view2.camera.project(rays @ pose.rotation.T + inverse[..., None] * pose.translation_mm)
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from rigkit.affine.normal import linear_gauge
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
-from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.sweep import CENSUS_BITS, swept_costs, swept_rivals, swept_surfaces
 from rigkit.optim.robust_scale import robust_sigma
-from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrowingView, GrownPatches
+from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrowingView, GrownPatches, PosedViews
 from rigkit.reconstruction.growing.surface import NodeMeasurements
 
 SAMPLES_A_NODE = 2
@@ -157,7 +156,7 @@ class Sweep:
 
 
 def fill_by_sweep(
-    grown: GrownPatches, measured: NodeMeasurements, view1: GrowingView, view2: GrowingView, cam2_from_cam1: Rigid3
+    grown: GrownPatches, measured: NodeMeasurements, views: PosedViews
 ) -> tuple[GrownPatches, Sweep | None]:
     """Return the pairs, completed by those of a sweep at nodes where none grew, and the sweep.
 
@@ -166,16 +165,16 @@ def fill_by_sweep(
     """
     if not np.isfinite(measured.z).any():
         return grown, None
-    sweep = _sweep(grown, measured, view1, view2, cam2_from_cam1)
+    sweep = _sweep(grown, measured, views)
     best, around = swept_surfaces(
         sweep.costs, len(sweep.inverse), sweep.samples1, bend=CURVATURE_COST, jump=JUMP_COST, even=EVEN_LEVELS
     )
-    level, good = _winners(best, around, sweep, view2, cam2_from_cam1)
+    level, good = _winners(best, around, sweep, views)
     sweep = replace(sweep, winners=level, seen=good)
     good = (
         good
-        & (_sampled(_contrast(view1), sweep.pixels1) > MIN_SWEPT_CONTRAST)
-        & (_sampled(_image_circle(view1), sweep.pixels1) == 1.0)
+        & (_sampled(_contrast(views.view1), sweep.pixels1) > MIN_SWEPT_CONTRAST)
+        & (_sampled(_image_circle(views.view1), sweep.pixels1) == 1.0)
     )
     spacing = sweep.inverse[1] - sweep.inverse[0]
     at_nodes = (measured.z[..., 0] - sweep.inverse[0]) / spacing
@@ -188,13 +187,11 @@ def fill_by_sweep(
     at = sweep.nearest(grown.pixels1)
     grown = grown.where(grown.valid & (sweep.near_winner(at_nodes, at, measured.slope) | ~good[at]))
     inverse = np.where(good, sweep.inverse[0] + spacing * level, np.nan)[::SAMPLES_A_NODE, ::SAMPLES_A_NODE]
-    grown = _with_swept_pairs(grown, inverse, residual * spacing, view1, view2, cam2_from_cam1)
+    grown = _with_swept_pairs(grown, inverse, residual * spacing, views)
     return grown, replace(sweep, reliable=good)
 
 
-def _sweep(
-    grown: GrownPatches, measured: NodeMeasurements, view1: GrowingView, view2: GrowingView, cam2_from_cam1: Rigid3
-) -> Sweep:
+def _sweep(grown: GrownPatches, measured: NodeMeasurements, views: PosedViews) -> Sweep:
     inverse = measured.z[..., 0]
     low, high = np.nanquantile(inverse, [0.001, 0.999])
     pixel = 1.0 / float(np.nanquantile(measured.slope, 0.9))
@@ -204,32 +201,27 @@ def _sweep(
     count = int(np.clip(np.ceil((high - low) / pixel) + 1, 3, MAX_SWEEP_LEVELS))
     levels = np.linspace(low, high, count)
     step = grown.step / SAMPLES_A_NODE
-    width, height = view1.size_px
+    width, height = views.view1.size_px
     shape = int((height - 1) // step) + 1, int((width - 1) // step) + 1
     coarse = [np.arange(0, n + TABLE_SPACING, TABLE_SPACING) * step for n in reversed(shape)]
-    rays, seen = view1.camera.unproject(np.stack(np.meshgrid(*coarse), axis=-1))
-    places, valid = view2.camera.project(directions_in_cam2(rays, levels[:, None, None], cam2_from_cam1))
+    rays, seen = views.view1.camera.unproject(np.stack(np.meshgrid(*coarse), axis=-1))
+    places, valid = views.project(rays, levels[:, None, None])
     table = np.where((valid & seen)[..., None], places, np.nan).astype(np.float32)
     fine = np.stack(np.meshgrid(*(step * np.arange(n) for n in reversed(shape))), axis=-1)
-    rays1, seen1 = view1.camera.unproject(fine)
+    rays1, seen1 = views.view1.camera.unproject(fine)
     pixels1 = fine.astype(np.float32)
-    samples1 = _sampled(_smooth(view1, step), pixels1)
+    samples1 = _sampled(_smooth(views.view1, step), pixels1)
     return Sweep(
         inverse=levels,
         step_px=step,
         pixels1=pixels1,
         rays1=np.where(seen1[..., None], rays1, np.nan),
         samples1=samples1,
-        costs=swept_costs(_smooth(view2, step), samples1, table, TABLE_SPACING),
+        costs=swept_costs(_smooth(views.view2, step), samples1, table, TABLE_SPACING),
         winners=np.full(shape, np.nan),
         seen=np.zeros(shape, dtype=bool),
         reliable=np.zeros(shape, dtype=bool),
     )
-
-
-def directions_in_cam2(rays: FloatArray, inverse: FloatArray, cam2_from_cam1: Rigid3) -> FloatArray:
-    """Return the directions, in the frame of camera 2, of points at inverse ranges on rays (..., 3)."""
-    return np.asarray(rays @ cam2_from_cam1.rotation.T + inverse[..., None] * cam2_from_cam1.translation_mm)
 
 
 def _sampled(image: NDArray[np.float32], places: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -260,7 +252,7 @@ def _image_circle(view: GrowingView) -> NDArray[np.float32]:
 
 
 def _winners(
-    best: NDArray[np.int32], around: NDArray[np.int32], sweep: Sweep, view2: GrowingView, cam2_from_cam1: Rigid3
+    best: NDArray[np.int32], around: NDArray[np.int32], sweep: Sweep, views: PosedViews
 ) -> tuple[FloatArray, BoolArray]:
     """Return the levels (R, C), refined from `best` by a parabola, and a mask (R, C) of those visible in image 2."""
     count = len(sweep.inverse)
@@ -272,14 +264,14 @@ def _winners(
     level = np.asarray(np.clip(inner + part, 0.0, count - 1.0), np.float64)
     # At the first and last level the surface may be beyond the sweep.
     inside = (best > 0) & (best < count - 1)
-    place, seen = view2.camera.project(directions_in_cam2(sweep.rays1, sweep.inverse[best], cam2_from_cam1))
+    place, seen = views.project(sweep.rays1, sweep.inverse[best])
     inside &= seen
-    width, height = view2.size_px
+    width, height = views.view2.size_px
     with np.errstate(invalid="ignore"):
         inside &= ((place >= 0.0) & (place <= np.array([width - 1, height - 1]))).all(axis=-1)
     place = np.where(inside[..., None], place, 0.0)
     cost = np.where(inside, around[..., 0], np.iinfo(np.int32).max)
-    return level, inside & _unoccluded(place, best, cost, sweep.step_px, view2)
+    return level, inside & _unoccluded(place, best, cost, sweep.step_px, views.view2)
 
 
 def _reliable(sweep: Sweep, good: BoolArray, grown: FloatArray) -> BoolArray:
@@ -346,34 +338,22 @@ def _unoccluded(
     return np.asarray(np.abs(claimed[cell].reshape(best.shape) - best) <= 1)
 
 
-def _with_swept_pairs(
-    grown: GrownPatches,
-    inverse: FloatArray,
-    sigma: float,
-    view1: GrowingView,
-    view2: GrowingView,
-    cam2_from_cam1: Rigid3,
-) -> GrownPatches:
+def _with_swept_pairs(grown: GrownPatches, inverse: FloatArray, sigma: float, views: PosedViews) -> GrownPatches:
     """Return the pairs, with those of the inverse ranges (R, C; NaN: unknown) at nodes that have none."""
     at = np.isfinite(inverse) & (inverse > 0.0) & ~grown.valid
     # The gradient is unknown: assume a surface that faces the camera.
     z = np.pad(inverse[at][:, None], ((0, 0), (0, 2)))
-    return replace_pairs(grown, at, z, np.full(len(z), sigma), view1, view2, cam2_from_cam1)
+    return replace_pairs(grown, at, z, np.full(len(z), sigma), views)
 
 
 def replace_pairs(
-    grown: GrownPatches,
-    at: BoolArray,
-    z: FloatArray,
-    sigma: FloatArray,
-    view1: GrowingView,
-    view2: GrowingView,
-    cam2_from_cam1: Rigid3,
+    grown: GrownPatches, at: BoolArray, z: FloatArray, sigma: FloatArray, views: PosedViews
 ) -> GrownPatches:
     """Return the pairs, with those at the nodes `at` (mask (R, C)) replaced by those of N inverse ranges and gradients.
 
     `z` (N, 3) is as in `NodeMeasurements`, `sigma` (N,) of the inverse ranges. Surfaces outside of image 2 get no pair.
     """
+    view1, view2, cam2_from_cam1 = views
     pixels1, inverse = view1.nodes(grown.step)[at], z[:, 0]
     rays, _ = view1.camera.unproject(pixels1)
     points = rays / inverse[:, None]

@@ -18,7 +18,13 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.sweep import swept_costs, swept_surfaces
 from rigkit.reconstruction.growing import sweep as sweep_module
 from rigkit.reconstruction.growing.dense import grow_scene
-from rigkit.reconstruction.growing.grow import EpipolarConstraint, GrowingView, GrownPatches, grow_in_both_directions
+from rigkit.reconstruction.growing.grow import (
+    EpipolarConstraint,
+    GrowingView,
+    GrownPatches,
+    PosedViews,
+    grow_in_both_directions,
+)
 from rigkit.reconstruction.growing.surface import NodeMeasurements, PairRays
 from rigkit.reconstruction.growing.sweep import fill_by_sweep
 from rigkit.reconstruction.scene import reconstruct_scene
@@ -33,7 +39,7 @@ FLAT = np.s_[45:70, 190:230]
 
 
 @cache
-def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, tuple[GrowingView, GrowingView], Corner]:
+def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, PosedViews, Corner]:
     rng = np.random.default_rng(5)
     corner, camera = Corner.of_a_room(), SMALL_LENSES[lens]
     images: list[NDArray[np.generic]] = [
@@ -54,13 +60,13 @@ def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, tuple[Gr
     keep[HOLE] = False
     grown = grown.where(keep)
     measured = PairRays.of(grown, camera, camera).measured(CAM2_FROM_CAM1)
-    return grown, measured, (view1, view2), corner
+    return grown, measured, PosedViews(view1, view2, CAM2_FROM_CAM1), corner
 
 
 @pytest.mark.parametrize("lens", SMALL_LENSES)
 def test_gaps_between_patches_are_filled_to_the_stated_accuracy(lens: str) -> None:
     grown, measured, views, corner = grown_with_hole(lens)
-    done, _ = fill_by_sweep(grown, measured, *views, CAM2_FROM_CAM1)
+    done, _ = fill_by_sweep(grown, measured, views)
     # Only beside the seams of the walls the sweep contradicts patches.
     assert (done.swept & grown.valid).sum() < 0.005 * grown.valid.sum()
     kept = grown.valid & ~done.swept
@@ -68,7 +74,7 @@ def test_gaps_between_patches_are_filled_to_the_stated_accuracy(lens: str) -> No
     hole = np.zeros(done.valid.shape, dtype=bool)
     hole[HOLE] = True
     camera = SMALL_LENSES[lens]
-    place, _ = camera.project(CAM2_FROM_CAM1.apply(corner.surface(camera, views[0].nodes(STEP)[hole])[0]))
+    place, _ = camera.project(CAM2_FROM_CAM1.apply(corner.surface(camera, views.view1.nodes(STEP)[hole])[0]))
     inside = ((place > 10.0) & (place < np.array(SMALL_SIZE) - 11.0)).all(axis=1)
     filling = done.swept & hole
     assert inside.sum() > 400
@@ -90,7 +96,7 @@ def test_pairs_that_the_sweep_contradicts_give_way_to_its_own() -> None:
     # By three pixels along the epipolar line.
     z = measured.z.copy()
     z[wrong, 0] += 3.0 / measured.slope[wrong]
-    done, sweep = fill_by_sweep(grown, replace(measured, z=z), *views, CAM2_FROM_CAM1)
+    done, sweep = fill_by_sweep(grown, replace(measured, z=z), views)
     assert wrong.sum() > 200 and sweep is not None
     assert done.swept[wrong].mean() > 0.95
     expected, _ = SMALL_LENSES["pinhole"].project(
@@ -108,7 +114,7 @@ def test_pairs_that_the_sweep_contradicts_give_way_to_its_own() -> None:
 
 def test_nothing_is_filled_where_there_is_no_texture() -> None:
     grown, measured, views, _ = grown_with_hole("pinhole")
-    done, _ = fill_by_sweep(grown, measured, *views, CAM2_FROM_CAM1)
+    done, _ = fill_by_sweep(grown, measured, views)
     rows, columns = (np.arange(n) * STEP for n in done.valid.shape)
     inside = np.zeros(done.valid.shape, dtype=bool)
     v, u = FLAT
@@ -120,10 +126,10 @@ def test_nothing_is_filled_where_there_is_no_texture() -> None:
 
 
 def test_a_sweep_that_contradicts_the_patches_is_not_believed() -> None:
-    grown, measured, (view1, view2), _ = grown_with_hole("pinhole")
-    unrelated = np.random.default_rng(1).uniform(0.0, 255.0, view2.grey.shape)
-    other = replace(view2, grey=unrelated.astype(np.uint8))
-    done, sweep = fill_by_sweep(grown, measured, view1, other, CAM2_FROM_CAM1)
+    grown, measured, views, _ = grown_with_hole("pinhole")
+    unrelated = np.random.default_rng(1).uniform(0.0, 255.0, views.view2.grey.shape)
+    other = replace(views.view2, grey=unrelated.astype(np.uint8))
+    done, sweep = fill_by_sweep(grown, measured, views._replace(view2=other))
     assert done is grown
     assert sweep is None
 
@@ -134,7 +140,7 @@ def test_a_wall_at_one_range_is_swept_without_a_fault() -> None:
     same = measured.z.copy()
     same[..., 0] = np.where(np.isfinite(same[..., 0]), np.nanmedian(same[..., 0]), np.nan)
     with np.errstate(all="raise", under="ignore"):
-        done, _ = fill_by_sweep(grown, replace(measured, z=same), *views, CAM2_FROM_CAM1)
+        done, _ = fill_by_sweep(grown, replace(measured, z=same), views)
     assert done.valid.sum() >= grown.valid.sum()
 
 
