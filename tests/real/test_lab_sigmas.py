@@ -17,13 +17,15 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.manifests.manifest import load_dataset
 from rigkit.validation.checks import validate
 from rigkit.workflows.reconstruction.datasets import load_cameras
-from rigkit.workflows.reconstruction.pairs import match_found, reconstruct_with
+from rigkit.workflows.reconstruction.pairs import BoardsOfPair, reconstruct_with
 
 SIGMA_PX = 0.03
 DRAWS_A_PAIR = 25
 WITHIN_ONE, WITHIN_TWO = (0.63, 0.73), (0.92, 0.98)
 """68.3 and 95.4 % for a Gaussian; 200 sets are good to about 3 and 1.5 %."""
 EXACT = 1e-9
+UNSEEN = np.zeros((0, 0), dtype=np.uint8)
+"""The image behind made corners: none."""
 WALLS = (("plane1", "plane2"), ("plane1", "plane3"), ("plane2", "plane3"))
 
 
@@ -70,7 +72,7 @@ def test_measured_quantities_fall_within_the_predicted_sigmas(rng: np.random.Gen
         for _ in range(DRAWS_A_PAIR):
             found1 = tuple(seen(b, p, g, camera, rng) for b, p, g in boards)
             found2 = tuple(seen(b, pose.apply(p), g, camera, rng) for b, p, g in boards)
-            matched = match_found(pair, camera, camera, found1, found2, "raw")
+            matched = BoardsOfPair(pair, (camera, camera), (found1, found2), (UNSEEN, UNSEEN)).matched("raw")
             report = validate(reconstruct_with(matched, pair, "3SDIR"), known)
             angles += [check.k for check in report.checks if check.kind == "angle"]
             baselines.append(report.check("baseline").k)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -32,8 +31,36 @@ Detections: TypeAlias = tuple[BoardDetection, ...]
 Image: TypeAlias = NDArray[Any]
 
 
-def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detections, Detections, Image, Image]:
-    """Return the boards found in each image of a pair, and the images; raises InputError if an image shows none.
+@dataclass(frozen=True, eq=False, slots=True)
+class BoardsOfPair:
+    """The boards that were found in the two images of a pair; `cameras`, `boards` and `images` are of either image."""
+
+    pair: Pair
+    cameras: tuple[Camera, Camera]
+    boards: tuple[Detections, Detections]
+    images: tuple[Image, Image]
+
+    def matched(self, chain: str, support: Support = "patch") -> MatchedPair:
+        """Return the matched corners of the boards, as declared in the manifest; cameras as for `match_pair`."""
+        return match_pair(
+            self.pair.pair_id,
+            *self.cameras,
+            *self.boards,
+            self.pair.boards,
+            layout=self.pair.layout or None,
+            angles=self.pair.truth.angles,
+            chain="rectified" if chain == "rectified" else "raw",
+            support=support,
+        )
+
+    def squares_that_fit(self) -> tuple[str, ...]:
+        """Return, in words, the square size with which a misfitting board would fit the other boards of the pair."""
+        far1, far2 = (far_camera(camera) for camera in self.cameras)
+        return diagnose_squares(fitting_squares(*self.boards, self.pair.boards, far1, far2))
+
+
+def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> BoardsOfPair:
+    """Return the boards found in each image of a pair; raises InputError if an image shows none.
 
     The cameras are used to predict missed corners, join parts of boards, reject occluded corners and model distortion.
     """
@@ -49,7 +76,7 @@ def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detection
             )
         images.append(image)
         found.append(detections)
-    return found[0], found[1], images[0], images[1]
+    return BoardsOfPair(pair, (camera1, camera2), (found[0], found[1]), (images[0], images[1]))
 
 
 def match_images(
@@ -60,54 +87,17 @@ def match_images(
     For a board that does not fit as declared, the square size that would fit is stated in the notes, or in the error
     raised if no board is left.
     """
-    found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
+    found = find_boards(pair, camera1, camera2)
     try:
-        matched = match_found(pair, camera1, camera2, found1, found2, chain, support)
+        matched = found.matched(chain, support)
     except RigkitError as error:
-        message = squares_that_fit(pair, camera1, camera2, found1, found2)
+        message = found.squares_that_fit()
         if not message:
             raise
         raise type(error)(f"pair '{pair.pair_id}': {'; '.join(message)} ({error})") from error
     if matched.identity.missing:
-        message = squares_that_fit(pair, camera1, camera2, found1, found2)
-        matched = replace(matched, notes=(*message, *matched.notes))
-    return matched, image1, image2
-
-
-def match_found(
-    pair: Pair,
-    camera1: Camera,
-    camera2: Camera,
-    detections1: Sequence[BoardDetection],
-    detections2: Sequence[BoardDetection],
-    chain: str,
-    support: Support = "patch",
-) -> MatchedPair:
-    """Match the boards found in the two images of a pair, as declared in the manifest; cameras as for `match_pair`."""
-    return match_pair(
-        pair.pair_id,
-        camera1,
-        camera2,
-        detections1,
-        detections2,
-        pair.boards,
-        layout=pair.layout or None,
-        angles=pair.truth.angles,
-        chain="rectified" if chain == "rectified" else "raw",
-        support=support,
-    )
-
-
-def squares_that_fit(
-    pair: Pair,
-    camera1: Camera,
-    camera2: Camera,
-    detections1: Sequence[BoardDetection],
-    detections2: Sequence[BoardDetection],
-) -> tuple[str, ...]:
-    """Return, in words, the square size with which a misfitting board would fit the other boards of a pair."""
-    fitting = fitting_squares(detections1, detections2, pair.boards, far_camera(camera1), far_camera(camera2))
-    return diagnose_squares(fitting)
+        matched = replace(matched, notes=(*found.squares_that_fit(), *matched.notes))
+    return matched, *found.images
 
 
 def geometry_of(matched: MatchedPair, pair: Pair) -> PairGeometry:

@@ -6,9 +6,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-from numpy.typing import NDArray
 
 from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.core.choices import PLANE_CHOICES, Planes
@@ -37,14 +34,13 @@ from rigkit.validation.tables import best_report
 from rigkit.workflows.options.clouds import ValidateOptions
 from rigkit.workflows.reconstruction.datasets import PairFailure, PairJob, over_pairs, ready_dataset, write_for
 from rigkit.workflows.reconstruction.pairs import (
+    Image,
     find_boards,
     geometry_of,
-    match_found,
     measured_shapes,
     planes_of,
     reconstruct_other_chain,
     shifts_of,
-    squares_that_fit,
 )
 from rigkit.workflows.validation.paper import printed_tables
 from rigkit.workflows.validation.validation_files import RESERVED, PairValidation, validation_files
@@ -129,19 +125,18 @@ def _validate(job: PairJob[ValidateOptions]) -> PairValidation:
     pair = job.pair
     names = (pair.camera1.camera_id, pair.camera2.camera_id)
     camera1, camera2 = (loaded.near for loaded in job.cameras.of(pair))
-    found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
+    found = find_boards(pair, camera1, camera2)
     known = {name: loaded.camera for name, loaded in job.cameras.known.items()}
-    causes = diagnose_cameras(pair.pair_id, names, (found1, found2), pair.boards, known)
+    causes = diagnose_cameras(pair.pair_id, names, found.boards, pair.boards, known)
 
     def wrong_squares() -> tuple[str, ...]:
-        note = squares_that_fit(pair, camera1, camera2, found1, found2)
-        return tuple(f"pair '{pair.pair_id}': {words}" for words in note)
+        return tuple(f"pair '{pair.pair_id}': {words}" for words in found.squares_that_fit())
 
     try:
-        matched = match_found(pair, camera1, camera2, found1, found2, job.options.chain, job.options.support)
+        matched = found.matched(job.options.chain, job.options.support)
         if matched.identity.missing:
             causes += wrong_squares()
-        return _validated(job, matched, image1, image2, causes)
+        return _validated(job, matched, found.images, causes)
     except RigkitError as error:
         # Without this, no board was matched at all.
         causes = causes or wrong_squares()
@@ -151,23 +146,19 @@ def _validate(job: PairJob[ValidateOptions]) -> PairValidation:
 
 
 def _validated(
-    job: PairJob[ValidateOptions],
-    matched: MatchedPair,
-    image1: NDArray[Any],
-    image2: NDArray[Any],
-    causes: tuple[str, ...],
+    job: PairJob[ValidateOptions], matched: MatchedPair, images: tuple[Image, Image], causes: tuple[str, ...]
 ) -> PairValidation:
     pair = job.pair
     geometry = geometry_of(matched, pair)
     scale = job.options.det_scale
     reconstructions = {
-        m: reconstruct_from(geometry, affine_method=m, scale=scale, image1=image1) for m in AFFINE_METHODS
+        m: reconstruct_from(geometry, affine_method=m, scale=scale, image1=images[0]) for m in AFFINE_METHODS
     }
     shifts = _shifts(reconstructions, job)
     fitted = _fitted_planes(geometry, job)
     known = [shifts[m] for m in reconstructions]
     reports = validate_each(list(reconstructions.values()), pair.truth, known, fitted, pair.layout)
-    counts = contradicted_counts(matched, [to_grey(image) for image in (image1, image2)])
+    counts = contradicted_counts(matched, [to_grey(image) for image in images])
     reports = tuple(replace(report, checks=(*report.checks, *counts)) for report in reports)
     best = best_report(reports)
     files: dict[str, bytes] = {
@@ -184,7 +175,7 @@ def _validated(
         compared = crosscheck(shown, other_chain=other, shifts=shifts[best.affine_method], shapes=shapes)
     section = None
     if job.options.pictures:
-        drawn = pair_pictures(shown, image1, image2, pdf=job.options.pdf)
+        drawn = pair_pictures(shown, *images, pdf=job.options.pdf)
         files |= drawn
         section = _section(reconstructions, shown, reports, drawn)
     return PairValidation(reports=reports, best=best, crosscheck=compared, causes=causes, files=files, section=section)

@@ -68,7 +68,7 @@ def test_boards_behind_a_pole_are_found_with_the_camera(tmp_path: Path) -> None:
     cv2.imwrite(str(path), image)
     pair = pair_of(path, BOARDS)
     truth = np.concatenate([b.see(CAMERA, cam)[0] for b in scene.boards])
-    found, again, _, _ = find_boards(pair, CAMERA, CAMERA)
+    found, again = find_boards(pair, CAMERA, CAMERA).boards
     assert [len(d.grid) for d in found] == [len(d.grid) for d in again]
     # Without the camera one board comes in two parts, and corners half under the pole's edge are up to 0.8 px off.
     assert [(d.columns, d.rows) for d in found] == [(11, 8)] * 3
