@@ -12,6 +12,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels
 from rigkit.detection.saddles.response import FloatImage, GreyImage
+from rigkit.kernels import front
 
 FIELDS_MARGIN_PX = 6
 """Margin of the evaluated part of the image around the outermost corners."""
@@ -85,19 +86,8 @@ def _alternating_tiles(grey: GreyImage) -> BoolArray:
     """Return which of the tiles (TILES, TILES) have MIN_ALTERNATING."""
     height, width = grey.shape
     groups = min(GROUPS, height // 4) // TILES * TILES
-    first = 2 * (np.arange(groups) * ((height - 4) // 2) // max(groups - 1, 1))
-    one, two, three, four = (grey[first + k].astype(np.float32) for k in range(4))
-    across = width // TILES
-    alternating, between = (
-        np.abs(part[:, : across * TILES]).reshape(TILES, groups // TILES, TILES, across)
-        for part in (one - two + three - four, one + two - three - four)
-    )
-    more, less = (
-        (alternating > np.maximum(between, LINE_STEP)),
-        (between > np.maximum(alternating, LINE_STEP)),
-    )
-    counts = [np.count_nonzero(which, axis=(1, 3)) for which in (more, less)]
-    return np.asarray(counts[0] > MIN_ALTERNATING * counts[1] + LINE_SHARE * across * (groups // TILES))
+    more, less = front.alternating(grey, groups, TILES, LINE_STEP)
+    return np.asarray(more > MIN_ALTERNATING * less + LINE_SHARE * (width // TILES) * (groups // TILES))
 
 
 def _fields_apart(part: FloatImage) -> bool:

@@ -17,6 +17,10 @@ EXPORT int64_t has_mosaic(
 EXPORT int64_t count_bad_pixels(
     IMAGE(grey), int64_t first, int64_t apart, double step, double share, RESULT(double, span, 1));
 
+EXPORT void count_alternating(
+    IMAGE(grey), int64_t groups, int64_t tiles, double step, RESULT(int64_t, more, tiles, tiles),
+    RESULT(int64_t, less, tiles, tiles));
+
 /* smoothing.c */
 
 EXPORT void shrink_floats(
@@ -198,8 +202,8 @@ EXPORT void surface_scatter(
     const scatter_rules_t *rules, SCRATCH(double, scratch, (5 + SCATTER_TERMS) * rows * columns), RESULT(double, out, 2));
 EXPORT void edge_shifts(
     ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns, double sign, image_t image, double scale,
-    double offset, double reach, ARRAY(const double, along, parts), int64_t parts, int64_t steps, int64_t most,
-    SCRATCH(double, sums, parts, steps + 1), RESULT(double, out, parts));
+    double offset, ARRAY(const double, reach, parts), ARRAY(const double, along, parts), int64_t parts, int64_t steps,
+    int64_t most, SCRATCH(double, sums, parts, steps + 1), RESULT(double, out, parts));
 
 /* splits.c */
 

@@ -66,6 +66,17 @@ def bad_pixels(image: GreyImage, first: int, stride: int, step: float, share: fl
     return count, float(span[0])
 
 
+def alternating(image: GreyImage, groups: int, tiles: int, step: float) -> tuple[IntArray, IntArray]:
+    """Return the numbers of places in each of `tiles` x `tiles` parts of the image whose differences within four lines
+    alternate from line to line, and of those where they lie between the first and the last two lines.
+
+    The larger of both is at least `step`, the sum of four grey levels. `groups` of four lines, a multiple of `tiles`,
+    are looked at, each from an even line on.
+    """
+    more, less = kernels().count_alternating(image, groups, tiles, step)
+    return more, less
+
+
 def shrunk(image: GreyImage, factor: int) -> Image:
     """Return the means of `factor` x `factor` pixels."""
     if image.dtype == np.uint8 and factor <= MAX_SUMMED:

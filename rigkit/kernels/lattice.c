@@ -310,12 +310,12 @@ static int square_of(
     return isfinite(sum);
 }
 
-/* Set `out` to the offsets of the edges of a lattice to the dark side of the line of their corners, at `parts` places `along` it
- * (reference.lattice.shifts_of_edges). `sign` is that of the first corner; `sums` has room for parts x (steps + 1). */
+/* Set `out` to the offsets of the edges of a lattice to the dark side of the line of their corners, at `parts` places `along` it,
+ * each within its own `reach` (reference.lattice.shifts_of_edges). `sign` is that of the first corner; `sums` has room for parts x (steps + 1). */
 FOR_EACH_PROCESSOR
 void edge_shifts(
     const double *pixels, int64_t rows, int64_t columns, double sign, const image_t image, double scale, double offset,
-    double reach, const double *along, int64_t parts, int64_t steps, int64_t most, double *sums, double *out)
+    const double *reach, const double *along, int64_t parts, int64_t steps, int64_t most, double *sums, double *out)
 {
     double corner[4][2];
     int64_t count = 0, next = 0;
@@ -331,14 +331,14 @@ void edge_shifts(
                     continue;
                 /* The first edge of the square along this axis, and the opposite one. */
                 const double *start = corner[0], *end = corner[1 + down], *lateral = corner[2 - down], *last = corner[3];
-                const double side = 0.5 * reach * ((row + column) % 2 ? -sign : sign);
+                const double side = 0.5 * ((row + column) % 2 ? -sign : sign);
                 const double across_u = side * (lateral[0] + last[0] - start[0] - end[0]);
                 const double across_v = side * (lateral[1] + last[1] - start[1] - end[1]);
                 for (int64_t k = 0; k < parts; k++) {
                     const double u = start[0] + along[k] * (end[0] - start[0]);
                     const double v = start[1] + along[k] * (end[1] - start[1]);
                     for (int64_t s = 0; s <= steps; s++) {
-                        const double step = 2.0 * (double)s / (double)steps - 1.0;
+                        const double step = reach[k] * (2.0 * (double)s / (double)steps - 1.0);
                         const float seen = brightness_at(image, (float)(u + step * across_u), (float)(v + step * across_v));
                         sums[k * (steps + 1) + s] += (double)seen;
                     }
@@ -351,6 +351,6 @@ void edge_shifts(
         double mean = -middle;
         for (int64_t s = 0; s <= steps; s++)
             mean += sum[s];
-        out[k] = 2.0 * reach * (mean / (double)steps - middle) / contrast;
+        out[k] = 2.0 * reach[k] * (mean / (double)steps - middle) / contrast;
     }
 }

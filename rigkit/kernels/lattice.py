@@ -63,15 +63,15 @@ def shifts_of_edges(
     image: NDArray[np.float32],
     scale: float,
     offset: float,
-    reach: float,
+    reach: Sequence[float],
     along: Sequence[float],
     steps: int,
     max_edges: int,
 ) -> FloatArray:
     """Return the offsets (K,) of `detection.checks.validate._edge_offsets`, over about `max_edges` edges."""
     level, sign = ImageOf.of(brightness=image), 1.0 if rising else -1.0
-    places = np.array(along)
-    return np.asarray(kernels().edge_shifts(pixels, sign, level, scale, offset, reach, places, steps, max_edges))
+    within, places = np.array(reach), np.array(along)
+    return np.asarray(kernels().edge_shifts(pixels, sign, level, scale, offset, within, places, steps, max_edges))
 
 
 def clearest_splits(

@@ -117,33 +117,64 @@ INLINE int64_t arm_along(double a, double b)
     return fabs(b) > fabs(a) ? (b < 0.0 ? 3 : 1) : (a < 0.0 ? 2 : 0);
 }
 
+/* A place in a level of the pyramid: the pixel (u, v) of the image, and the largest distance from an edge at which it is read. */
+typedef struct {
+    double u, v, most;
+} level_place_t;
+
+INLINE level_place_t place_in_level(const corners_t *corners, double scale, double offset, int64_t i)
+{
+    return (level_place_t){
+        (corners->pixels[2 * i] - offset) / scale, (corners->pixels[2 * i + 1] - offset) / scale, corners->reach[i]};
+}
+
+/* Return how far from the edge between two places the image is read. */
+INLINE double lateral_of(const link_rules_t *rules, level_place_t from, level_place_t to)
+{
+    double lateral = rules->lateral * sqrt((to.u - from.u) * (to.u - from.u) + (to.v - from.v) * (to.v - from.v));
+    lateral = lateral > rules->min_lateral ? lateral : rules->min_lateral;
+    return lateral < from.most ? lateral : from.most;
+}
+
 /* Return whether the image has the edge from corner i (reference.links._edge_seen). */
 INLINE int link_seen(
     const corners_t *corners, const image_t image, double scale, double offset, const link_rules_t *rules, int64_t i,
     const candidate_t *link)
 {
-    const int64_t j = link->end;
-    const double u = (corners->pixels[2 * i] - offset) / scale, v = (corners->pixels[2 * i + 1] - offset) / scale;
-    const double end_u = (corners->pixels[2 * j] - offset) / scale;
-    const double end_v = (corners->pixels[2 * j + 1] - offset) / scale;
-    double lateral = rules->lateral * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
-    const double most = corners->reach[i];
-    lateral = lateral > rules->min_lateral ? lateral : rules->min_lateral;
-    lateral = lateral < most ? lateral : most;
-    const double there = corners->contrast[j], here = corners->contrast[i];
+    const level_place_t from = place_in_level(corners, scale, offset, i);
+    const level_place_t to = place_in_level(corners, scale, offset, link->end);
+    const double there = corners->contrast[link->end], here = corners->contrast[i];
     const double weakest = rules->contrast_ratio * (there < here ? there : here);
     return edge_seen(
-        image, rules->along, rules->places, rules->min_places, u, v, end_u, end_v, link->arm % 2 ? -1.0 : 1.0, lateral, weakest);
+        image, rules->along, rules->places, rules->min_places, from.u, from.v, to.u, to.v, link->arm % 2 ? -1.0 : 1.0,
+        lateral_of(rules, from, to), weakest);
 }
 
-/* Set to[arm] to 4 * corner + its arm for the nearest corner along each arm of the corner at `place` to which there is an edge; -1
- * if there is none. */
-INLINE void link_arms(
-    const corners_t *corners, const squares_t *squares, const places_t *places, int64_t place, const image_t image, double scale,
-    double offset, const link_rules_t *rules, const near_t *near, int64_t *to)
+/* Prefetch the pixels that are read first for an edge between two corners, on both sides of its middle. */
+INLINE void fetch_edge(
+    const corners_t *corners, const image_t image, double scale, double offset, const link_rules_t *rules, int64_t i, int64_t end)
 {
-    enum { MAX_CANDIDATES = 512 };
-    candidate_t candidates[MAX_CANDIDATES];
+    const level_place_t from = place_in_level(corners, scale, offset, i), to = place_in_level(corners, scale, offset, end);
+    const double chord_u = to.u - from.u, chord_v = to.v - from.v;
+    const double part = lateral_of(rules, from, to) / (sqrt(chord_u * chord_u + chord_v * chord_v) + 1e-9);
+    for (int side = -1; side <= 1; side += 2) {
+        const double u = 0.5 * (from.u + to.u) - side * part * chord_v, v = 0.5 * (from.v + to.v) + side * part * chord_u;
+        if (u >= 0.0 && v >= 0.0 && u < (double)image.width && v < (double)(image.height - 1)) {
+            const float *at = image.brightness + (int64_t)v * image.width + (int64_t)u;
+            __builtin_prefetch(at);
+            __builtin_prefetch(at + image.width);
+        }
+    }
+}
+
+enum { MAX_CANDIDATES = 512 };
+
+/* Set `candidates` to the possible neighbours of the corner at `place`, the nearest first, and prefetch their edges; return their
+ * number. */
+INLINE int64_t list_candidates(
+    const corners_t *corners, const squares_t *squares, const places_t *places, int64_t place, const image_t image, double scale,
+    double offset, const link_rules_t *rules, const near_t *near, candidate_t *candidates)
+{
     const int64_t i = squares->order[place], wanted = rules->neighbours + 1;
     const home_t home = {
         places->u[place],
@@ -174,16 +205,34 @@ INLINE void link_arms(
                 arm_along(
                     -(u * places->columns[A_U][at] + v * places->columns[A_V][at]),
                     -(u * places->columns[B_U][at] + v * places->columns[B_V][at]))};
+            fetch_edge(corners, image, scale, offset, rules, i, fresh.end);
             int64_t rank = listed++;
             for (; rank > 0 && candidates[rank - 1].square > square; rank--)
                 candidates[rank] = candidates[rank - 1];
             candidates[rank] = fresh;
         }
     }
+    return listed;
+}
+
+/* Set nearest[4 * i + arm] to 4 * corner + its arm for the nearest of the `listed` candidates along each arm of corner i to which
+ * there is an edge, and farthest[4 * i + arm] to the squared distance of the last one that was tested, and of all before.
+ *
+ * An edge that was tested from its other end is not tested again, if the image is read at the same distance. */
+INLINE void link_arms(
+    const corners_t *corners, const image_t image, double scale, double offset, const link_rules_t *rules, int64_t i,
+    const candidate_t *candidates, int64_t listed, int64_t *nearest, float *farthest)
+{
     for (int64_t k = 0; k < listed; k++) {
         const candidate_t *link = candidates + k;
-        if (to[link->arm] < 0 && link_seen(corners, image, scale, offset, rules, i, link))
-            to[link->arm] = 4 * link->end + link->back;
+        const int64_t mine = 4 * i + link->arm, theirs = 4 * link->end + link->back;
+        if (nearest[mine] >= 0)
+            continue;
+        const int known =
+            (nearest[theirs] == mine || link->square < farthest[theirs]) && corners->reach[i] == corners->reach[link->end];
+        farthest[mine] = link->square;
+        if (known ? nearest[theirs] == mine : link_seen(corners, image, scale, offset, rules, i, link))
+            nearest[mine] = theirs;
     }
 }
 
@@ -201,7 +250,7 @@ FOR_EACH_PROCESSOR int64_t find_links(
 {
     const int64_t count = corners->count, room = count + TOGETHER;
     squares_t squares;
-    double *memory = calloc((size_t)room, 2 * sizeof(double) + (COLUMNS + 1) * sizeof(float) + 2 * sizeof(int32_t));
+    double *memory = calloc((size_t)room, 2 * sizeof(double) + (COLUMNS + 5) * sizeof(float) + 2 * sizeof(int32_t));
     int32_t *scratch = malloc((size_t)SQUARES_MEMORY(count) * sizeof(int32_t));
     if (!memory || !scratch) {
         free(memory);
@@ -223,11 +272,22 @@ FOR_EACH_PROCESSOR int64_t find_links(
             places.columns[A_U + part][k] = (float)corners->lines[4 * i + part];
         places.columns[CONTRAST][k] = (float)corners->contrast[i];
     }
+    float *farthest = (float *)(near.meets + room);
     for (int64_t k = 0; k < 4 * count; k++)
         nearest[k] = both[k] = -1;
-    /* In the order of the grid: neighbours read the same corners and pixels. */
-    for (int64_t k = 0; k < count; k++)
-        link_arms(corners, &squares, &places, k, image, scale, offset, rules, &near, nearest + 4 * (int64_t)squares.order[k]);
+    /* In the order of the grid: neighbours read the same corners and pixels. The edges of a corner are read after those of the
+     * next one were prefetched. */
+    candidate_t candidates[2][MAX_CANDIDATES];
+    int64_t listed[2] = {0, 0};
+    for (int64_t k = 0; k <= count; k++) {
+        if (k < count)
+            listed[k % 2] = list_candidates(
+                corners, &squares, &places, k, image, scale, offset, rules, &near, candidates[k % 2]);
+        if (k > 0)
+            link_arms(
+                corners, image, scale, offset, rules, squares.order[k - 1], candidates[(k - 1) % 2], listed[(k - 1) % 2], nearest,
+                farthest);
+    }
     free(memory);
     free(scratch);
     for (int64_t k = 0; k < 4 * count; k++)

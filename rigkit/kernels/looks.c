@@ -1,5 +1,5 @@
-/* Sparse tests of an image: whether it is the raw mosaic of a colour camera, and whether it has bad pixels. The definitions in
- * numpy are in tests/kernels/reference/looks.py. */
+/* Sparse tests of an image: whether it is the raw mosaic of a colour camera, whether it has bad pixels, and whether its even and odd
+ * lines differ. The definitions in numpy are in tests/kernels/reference/looks.py. */
 #include "kernels.h"
 
 /* Return whether one of the four positions in cells of 2 x 2 pixels is brighter or darker than the mean of its cell by `share` of
@@ -73,4 +73,45 @@ int64_t count_bad_pixels(
             count += own - most > least || fewest - own > least;
         }
     return count;
+}
+
+/* Add to `more` and `less` the places of four lines whose differences alternate, and those that lie between the first and the last
+ * two; `type` is that of the image. */
+#define DEFINE_COUNT_ALTERNATING(name, type) \
+    INLINE void name(const type *lines, int64_t width, int64_t across, float step, int64_t *more, int64_t *less) \
+    { \
+        const type *second = lines + width, *third = second + width, *fourth = third + width; \
+        int32_t alternating_here = 0, between_here = 0; \
+        for (int64_t u = 0; u < across; u++) { \
+            const float outer = (float)lines[u] - (float)fourth[u], inner = (float)second[u] - (float)third[u]; \
+            const float alternating = fabsf(outer - inner), between = fabsf(outer + inner); \
+            alternating_here += alternating > (between > step ? between : step); \
+            between_here += between > (alternating > step ? alternating : step); \
+        } \
+        *more += alternating_here; \
+        *less += between_here; \
+    }
+
+DEFINE_COUNT_ALTERNATING(count_alternating_bytes, uint8_t)
+DEFINE_COUNT_ALTERNATING(count_alternating_floats, float)
+
+/* Set `more` and `less` (tiles, tiles) to the numbers of places of `groups` (a multiple of `tiles`) of four lines whose differences
+ * alternate, and of those that lie between the first and the last two (reference.looks.alternating). */
+FOR_EACH_PROCESSOR void count_alternating(
+    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t groups, int64_t tiles, double step, int64_t *more,
+    int64_t *less)
+{
+    const int64_t across = width / tiles, last = groups > 1 ? groups - 1 : 1;
+    memset(more, 0, (size_t)(tiles * tiles) * sizeof(int64_t));
+    memset(less, 0, (size_t)(tiles * tiles) * sizeof(int64_t));
+    for (int64_t group = 0; group < groups; group++) {
+        const int64_t first = 2 * (group * ((height - 4) / 2) / last), row = group / (groups / tiles);
+        for (int64_t column = 0; column < tiles; column++) {
+            const int64_t at = first * width + column * across, tile = row * tiles + column;
+            if (bytes)
+                count_alternating_bytes((const uint8_t *)grey + at, width, across, (float)step, more + tile, less + tile);
+            else
+                count_alternating_floats((const float *)grey + at, width, across, (float)step, more + tile, less + tile);
+        }
+    }
 }

@@ -118,7 +118,10 @@ def test_where_edges_lie(holes: float, rng: np.random.Generator, in_numpy: Calla
     lattices = [item.lattice for item in find_lattices(grey, 12)]
     assert len(lattices) == 3
     lattices = [item.without(rng.random(item.known.shape) < holes) for item in lattices]
-    ways = [(validate.NARROW_STRIPE, (0.5,)), (validate.WIDE_STRIPE, validate.OFFSET_PARTS)]
+    ways = [
+        ((validate.NARROW_STRIPE,), (0.5,)),
+        ((validate.NARROW_STRIPE, *3 * (validate.WIDE_STRIPE,)), (0.5, 0.2, 0.5, 0.8)),
+    ]
     compiled = [validate._edge_offsets(item, level, *way) for item in lattices for way in ways]
     in_numpy()
     plain = [validate._edge_offsets(item, level, *way) for item in lattices for way in ways]
@@ -142,7 +145,8 @@ def test_real_boards_are_judged_alike(name: str, in_numpy: Callable[[], None]) -
             changes = [change.every for change in spacing_changes(pixels)]
             whole = (slice(0, pixels.shape[0]), slice(0, pixels.shape[1]))
             scatter = excess_scatter(pixels, item.sigma_px, (whole,))
-            shifts = validate._edge_offsets(item.lattice, level, validate.WIDE_STRIPE, validate.OFFSET_PARTS)
+            reach = [validate.WIDE_STRIPE for _ in validate.OFFSET_PARTS]
+            shifts = validate._edge_offsets(item.lattice, level, reach, validate.OFFSET_PARTS)
             numbers.append([*changes, *scatter, *shifts])
         return numbers
 

@@ -36,3 +36,14 @@ def test_bad_pixels_are_counted(dtype: type, rng: np.random.Generator) -> None:
         ours = front.bad_pixels(image, first, apart, step, share)
         assert ours == reference.bad_pixels(image, first, apart, step, share)
         assert (ours[0] > 20) == (step < 200.0)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+@pytest.mark.parametrize("size", [(32, 40), (83, 121)])
+def test_lines_that_alternate_are_counted(size: tuple[int, int], dtype: type, rng: np.random.Generator) -> None:
+    image: NDArray[Any] = rng.integers(100, 130, size).astype(dtype)
+    image[1::2, size[1] // 2 :] += dtype(40)
+    for groups, step in ((8, 0.0), (size[0] // 4 // 8 * 8, 32.0)):
+        ours, theirs = (way.alternating(image, groups, 8, step) for way in (front, reference))
+        for one, other in zip(ours, theirs, strict=True):
+            assert np.array_equal(one, other) and one.any()

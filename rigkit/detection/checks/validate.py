@@ -154,8 +154,8 @@ def sample_of(lattice: Lattice) -> Lattice | None:
 
 def has_edge_offset(lattice: Lattice, level: Level) -> bool:
     """Return whether the edges of `lattice` on `level` are off the lines between their corners, or bowed."""
-    (shift,) = _edge_offsets(lattice, level, NARROW_STRIPE, (0.5,))
-    start, middle, end = _edge_offsets(lattice, level, WIDE_STRIPE, OFFSET_PARTS)
+    reach = (NARROW_STRIPE, *(WIDE_STRIPE for _ in OFFSET_PARTS))
+    shift, start, middle, end = _edge_offsets(lattice, level, reach, (0.5, *OFFSET_PARTS))
     if -MAX_DARK < shift < MAX_BRIGHT:
         # Edges of discs that touch are hardly off in the narrow stripe. Markers are on the bright side of edges.
         return bool(-WIDE_STRIPE < middle < 0.0 and middle - 0.5 * (start + end) < -MAX_BOW)
@@ -164,18 +164,18 @@ def has_edge_offset(lattice: Lattice, level: Level) -> bool:
 
 def has_bowed_edges(lattice: Lattice, level: Level) -> bool:
     """Return whether the edges of `lattice` on `level` are bowed, as those of discs are."""
-    return _bowed(*_edge_offsets(lattice, level, WIDE_STRIPE, OFFSET_PARTS))
+    return _bowed(*_edge_offsets(lattice, level, [WIDE_STRIPE for _ in OFFSET_PARTS], OFFSET_PARTS))
 
 
 def _bowed(start: float, middle: float, end: float) -> bool:
     return not abs(middle - 0.5 * (start + end)) < MAX_BOW
 
 
-def _edge_offsets(lattice: Lattice, level: Level, reach: float, along: Sequence[float]) -> FloatArray:
+def _edge_offsets(lattice: Lattice, level: Level, reach: Sequence[float], along: Sequence[float]) -> FloatArray:
     """Return the offsets (K,), in squares, of edges to the dark side of their corners' line at parts `along` (K,) of
     it.
 
-    The edges are searched within `reach` squares on both sides.
+    The edges are searched within `reach` (K,) squares on both sides.
     """
     seen = (level.smooth, level.scale, level.offset)
     return native.shifts_of_edges(lattice.pixels, lattice.rising, *seen, reach, along, STEPS_ACROSS, MAX_EDGES)

@@ -306,12 +306,33 @@ def _carried_over(one: _LatticePart, two: _LatticePart, squared: FloatArray) -> 
     """
     near2 = np.argsort(squared.min(axis=0), kind="stable")[:FAR_OUT]
     near1 = np.argsort(squared[:, near2[:NEAREST_OUT]].min(axis=1), kind="stable")[:NEAREST_IN]
-    grid_from_pixel = None
-    if not (one.grid[near1] == one.grid[near1[0]]).all(axis=0).any():
-        grid_from_pixel, _ = cv2.findHomography(one.pixels[near1], one.grid[near1].astype(np.float64), 0)
-    if grid_from_pixel is None:
+    if (one.grid[near1] == one.grid[near1[0]]).all(axis=0).any():
         return near2, np.full((len(near2), 2), np.inf)
-    return near2, cv2.perspectiveTransform(two.pixels[near2][None], grid_from_pixel)[0]
+    return near2, _extrapolated(one.pixels[near1], one.grid[near1], two.pixels[near2])
+
+
+def _extrapolated(pixels: FloatArray, grid: IntArray, there: FloatArray) -> FloatArray:
+    """Return the (column, row) at the pixels `there` (M, 2) by a homography through corners at `pixels` (N, 2) with
+    `grid` (N, 2), NaN if it is not determined.
+
+    Least squares of the equations linear in its coefficients, near the corners those of the distances in the grid.
+    """
+    middle, scale = pixels.mean(axis=0), max(float(np.abs(pixels - pixels[0]).max()), 1e-9)
+    origin = grid.mean(axis=0)
+    places, cells = (pixels - middle) / scale, grid - origin
+    rows = np.zeros((2, len(places), 8))
+    rows[0, :, 0:2] = rows[1, :, 3:5] = places
+    rows[0, :, 2] = rows[1, :, 5] = 1.0
+    rows[..., 6:] = -cells.T[..., None] * places
+    equations = rows.reshape(-1, 8)
+    try:
+        a = np.linalg.solve(equations.T @ equations, equations.T @ cells.T.reshape(-1))
+    except np.linalg.LinAlgError:
+        return np.full((len(there), 2), np.nan)
+    at = (there - middle) / scale
+    along = np.stack([at @ a[0:2] + a[2], at @ a[3:5] + a[5]], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(along / (1.0 + at @ a[6:])[:, None] + origin)
 
 
 def _facing(one: Lattice, two: Lattice, steps: int, shape: int = cv2.MORPH_CROSS) -> int:

@@ -76,7 +76,7 @@ def shifts_of_edges(
     image: FloatImage,
     scale: float,
     offset: float,
-    reach: float,
+    reach: Sequence[float],
     along: Sequence[float],
     steps: int,
     most: int,
@@ -95,14 +95,15 @@ def shifts_of_edges(
     start, end, across, sign = (np.concatenate([e[k].reshape(-1, *e[k].shape[2:]) for e in edges]) for k in range(4))
     there = np.flatnonzero(np.isfinite(across[:, 0]))
     there = there[:: max(len(there) // most, 1)]
-    start, chord, across = start[there], (end - start)[there], (reach * sign[there])[:, None] * across[there]
+    start, chord, across = start[there], (end - start)[there], sign[there][:, None] * across[there]
+    within = np.array(reach)[:, None, None, None]
     on_chord = start + np.array(along)[:, None, None] * chord
-    places = on_chord[:, None] + np.linspace(-1.0, 1.0, steps + 1)[:, None, None] * across
+    places = on_chord[:, None] + within * np.linspace(-1.0, 1.0, steps + 1)[:, None, None] * across
     values = sample(level.smooth, places).sum(axis=2, dtype=np.float64)
     # The mean of a step from dark to bright says where it is, however sharp it is.
     dark, bright = values[:, 0], values[:, -1]
     mean = (values.sum(axis=1) - 0.5 * (dark + bright)) / steps
-    return np.asarray(2.0 * reach * (mean - 0.5 * (dark + bright)) / np.maximum(bright - dark, 1e-9))
+    return np.asarray(2.0 * np.array(reach) * (mean - 0.5 * (dark + bright)) / np.maximum(bright - dark, 1e-9))
 
 
 def _changes_along_rows(pixels: FloatArray) -> SpacingChange:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, GreyImage, upper_median
+from rigkit.core.arrays import FloatArray, GreyImage, IntArray, upper_median
 
 
 def square_ratios(image: GreyImage, step: int, least: float) -> FloatArray:
@@ -28,3 +28,16 @@ def bad_pixels(image: GreyImage, first: int, apart: int, step: float, share: flo
     moved = [np.roll(values, (v, u), axis=(0, 1)) for v in (-1, 0, 1) for u in (-1, 0, 1) if v or u]
     beyond = np.maximum(values - np.max(moved, axis=0), np.min(moved, axis=0) - values)
     return int(np.count_nonzero(beyond[rows, 1:-1] > max(step, share * span))), span
+
+
+def alternating(image: GreyImage, groups: int, tiles: int, step: float) -> tuple[IntArray, IntArray]:
+    height, width = image.shape
+    first = 2 * (np.arange(groups) * ((height - 4) // 2) // max(groups - 1, 1))
+    one, two, three, four = (image[first + k].astype(np.float64) for k in range(4))
+    across = width // tiles
+    apart, between = (
+        np.abs(part[:, : across * tiles]).reshape(tiles, groups // tiles, tiles, across)
+        for part in (one - two + three - four, one + two - three - four)
+    )
+    more, less = apart > np.maximum(between, step), between > np.maximum(apart, step)
+    return np.count_nonzero(more, axis=(1, 3)), np.count_nonzero(less, axis=(1, 3))
