@@ -60,9 +60,10 @@ from rigkit.detection.checks.validate import has_bowed_edges, has_edge_offset, i
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.lattices import SearchedImage, candidate_lattices
+from rigkit.detection.lattices import candidate_lattices
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image
+from rigkit.detection.searched_image import SearchedImage
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.subpixel import refine
 from rigkit.io.media.images import read_image

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from rigkit.core.arrays import upper_median
 from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS, Evidence
 from rigkit.detection.fields import of_one_moment
-from rigkit.detection.lattices import SearchedImage, candidate_lattices
+from rigkit.detection.lattices import candidate_lattices
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import grey_image
+from rigkit.detection.searched_image import SearchedImage
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.subpixel import refine
 

@@ -30,8 +30,8 @@ from rigkit.detection.lattice.grow import MAX_FAILED_GROWTHS, grow_all
 from rigkit.detection.lattice.lattice import MIN_ROWS, Lattice, build_lattices
 from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
-from rigkit.detection.saddles.response import GreyImage, Level, enlarged_level, grey_image, pyramid
-from rigkit.detection.saddles.saddle import Corners, Saddles, each_once, find_corners, joined
+from rigkit.detection.saddles.response import GreyImage, Level, grey_image
+from rigkit.detection.searched_image import SearchedImage
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
 from rigkit.detection.subpixel.subpixel import refine
@@ -78,7 +78,7 @@ def find_lattices(
     sizes: Sequence[tuple[int, int]] = (),
     *,
     has_markers: MarkerTest | None = None,
-    enlarged: bool = False,
+    searched: SearchedImage | None = None,
 ) -> list[RefinedLattice]:
     """Return the refined lattices of all boards in `image`, in arbitrary order and orientation.
 
@@ -86,17 +86,17 @@ def find_lattices(
     `has_markers` : for boards with markers in their squares, which affect edges and fit. Lattices with edge offsets
     (`has_edge_offset`) are then not rejected, and those for which it is true are accepted regardless of their evidence
     and shape.
-    `enlarged` : search at twice the resolution only, for small squares and narrow white lines beside markers.
+    `searched` : the corners of `image`, if they are known, or those at twice the resolution.
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
     criteria = BoardCriteria(min_corners, sizes, has_markers)
-    searched = SearchedImage.of(grey, enlarged=enlarged)
+    searched = searched or SearchedImage.of(grey)
     plausible = _RejectionCounter(_is_plausible if has_markers is None else _plausible_or_marked(has_markers))
 
-    def search(at: SearchedImage, more_than: int = 0) -> list[RefinedLattice]:
-        boards = candidate_lattices(at, min_corners, plausible)
-        if sum(item.count for item in boards) <= more_than:
+    def search(at: SearchedImage, before: Sequence[RefinedLattice] = ()) -> list[RefinedLattice]:
+        boards = candidate_lattices(at, min_corners, _again_or(plausible, before) if before else plausible)
+        if sum(item.count for item in boards) <= corner_count(before):
             return []
         out = fit_and_confirm(grey, boards, criteria)
         if has_markers is None:
@@ -111,14 +111,14 @@ def find_lattices(
     found = search(searched)
     if _needs_second_search(searched, found, sizes):
         found = max(search(searched.with_smeared()), found, key=corner_count)
-    for k in range(1, 1 if enlarged else len(searched.levels)):
+    for k in range(1, 1 if searched.enlarged else len(searched.levels)):
         # Coarser levels help only where squares do not meet at their corners; those of clutter do.
         if _has_whole_board(found, sizes) or plausible.rejected >= MAX_FAILED_GROWTHS:
             break
         coarser = searched.coarser(k)
         if coarser is None:
             break
-        found = max(found, search(coarser, corner_count(found)), key=corner_count)
+        found = max(found, search(coarser, found), key=corner_count)
     if min_corners < MIN_BOARD_CORNERS and has_markers is None:
         return found
     return [
@@ -128,41 +128,6 @@ def find_lattices(
         or is_compact(item.lattice, size_px)
         or (has_markers is not None and has_markers(grey, item.lattice))
     ]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class SearchedImage:
-    """An image in grey levels, the finest level of its pyramid, the levels searched, and the corners found in them."""
-
-    grey: GreyImage
-    finest: Level
-    levels: list[Level]
-    corners: Corners
-    saddles: Saddles
-
-    @classmethod
-    def of(cls, grey: GreyImage, *, enlarged: bool = False) -> SearchedImage:
-        levels = pyramid(grey)
-        searched = [enlarged_level(grey), *levels] if enlarged else levels
-        # Enlargement by interpolation does not make edges sharper.
-        finest = searched[0] if searched[0].scale >= 1.0 else levels[0]
-        return cls(grey, finest, searched, *find_corners(searched))
-
-    def coarser(self, without: int) -> SearchedImage | None:
-        """Return the corners of the coarser levels only, `without` the finest ones; None if there are too few.
-
-        With saturation or thin print bright squares merge at the corners, with spreading ink dark ones. The borders of
-        the quadrants are then off the lines, by an angle that decreases with the radius of the ring. Since dots look
-        like squares on coarser levels, lattices are tested on the finest one.
-        """
-        corners = each_once(self.saddles.by_level[without:])
-        if len(corners) < MIN_BOARD_CORNERS:
-            return None
-        return replace(self, levels=self.levels[without:], corners=corners)
-
-    def with_smeared(self) -> SearchedImage:
-        """Return this with the corners that only motion blur explains added."""
-        return replace(self, corners=joined([self.corners, self.saddles.smeared]))
 
 
 @dataclass(slots=True)
@@ -176,6 +141,18 @@ class _RejectionCounter:
         passed = self.plausible(grey, finest, lattice)
         self.rejected += not passed
         return passed
+
+
+def _again_or(plausible: IsPlausible, before: Sequence[RefinedLattice]) -> IsPlausible:
+    """Return a test by which a lattice with mostly the same corners as those confirmed `before` is plausible; others
+    are tested by `plausible`."""
+    known = np.concatenate([item.lattice.pixels[item.lattice.known] for item in before])
+
+    def test(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
+        same = near_any(lattice.pixels[lattice.known], known, SAME_PX)
+        return 2 * int(np.count_nonzero(same)) > len(same) or plausible(grey, finest, lattice)
+
+    return test
 
 
 def corner_count(found: Sequence[RefinedLattice]) -> int:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
@@ -29,6 +30,9 @@ several times the error of a loose corner, and less than half of the smallest sq
 MAX_STEP = 1.5
 """Largest Newton step from the peak of the response to the saddle, px of the level."""
 
+
+DENSE_CELL_PX = 8
+"""Side of the cells in which points are counted, px of the level: 3 x 3 cells have 4 x 4 corners of squares of 6 px."""
 
 NOWHERE: FloatArray = np.zeros((0, 2))
 """The pixels of no corners."""
@@ -69,16 +73,21 @@ class Saddles:
 
     Attributes
     ----------
-    pixels : (N, 2) full resolution.
+    points : (N, 2) full resolution, of each level.
     by_level : the corners of each level, including those found on a finer one and those with motion blur.
     moved : which corners of each level have motion blur.
     still : the corners without motion blur, each once.
     """
 
-    pixels: FloatArray
+    points: tuple[FloatArray, ...]
     by_level: tuple[Corners, ...]
     moved: tuple[BoolArray, ...]
     still: tuple[Corners, ...]
+
+    @cached_property
+    def pixels(self) -> FloatArray:
+        """The saddle points (N, 2) of all levels."""
+        return np.concatenate([NOWHERE, *self.points])
 
     @cached_property
     def smeared(self) -> Corners:
@@ -105,8 +114,29 @@ def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple
         own.append(Corners(found.pixels, found.angles, found.contrast, np.full(len(found.pixels), level.scale)))
         smeared.append(found.smeared)
         kept.append(own[-1].of(~(found.smeared | found.repeated)))
-    every = np.concatenate([np.empty((0, 2)), *saddles])
-    return joined(kept), Saddles(every, tuple(own), tuple(smeared), tuple(kept))
+    return joined(kept), Saddles(tuple(saddles), tuple(own), tuple(smeared), tuple(kept))
+
+
+def with_finer(level: Level, coarser: Saddles) -> tuple[Corners, Saddles]:
+    """Return the corners and saddles as `find_corners` does, of a `level` and of `coarser` ones, known already."""
+    found = _corners_of(level, ())
+    own = Corners(found.pixels, found.angles, found.contrast, np.full(len(found.pixels), level.scale))
+    kept = [own.of(~found.smeared)]
+    for corners, moved in zip(coarser.by_level, coarser.moved, strict=True):
+        kept.append(_without_known(corners, ~moved, kept))
+    return joined(kept), Saddles(
+        (found.saddles, *coarser.points), (own, *coarser.by_level), (found.smeared, *coarser.moved), tuple(kept)
+    )
+
+
+def dense(points: FloatArray, level: Level, least: int) -> BoolArray:
+    """Return which of the `points` (N, 2) are in 3 x 3 cells of DENSE_CELL_PX of `level` with `least` or more."""
+    column, row = ((points - level.offset) / (level.scale * DENSE_CELL_PX)).astype(np.int64).T
+    height, width = (side // DENSE_CELL_PX + 1 for side in level.smooth.shape)
+    counts = np.bincount(row * width + column, minlength=height * width).reshape(height, width)
+    window = cv2.boxFilter(counts.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    full = cv2.dilate((window >= least).astype(np.uint8), np.ones((3, 3), np.uint8))
+    return np.asarray(full[row, column] > 0)
 
 
 def each_once(by_level: Iterable[Corners]) -> Corners:

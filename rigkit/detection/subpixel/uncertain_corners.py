@@ -56,8 +56,11 @@ def _nearby(values: FloatArray, where: BoolArray) -> FloatArray:
         return np.zeros(0)
     reach = 2 * NEARBY_CELLS + 1
     padded = np.pad(values, NEARBY_CELLS, constant_values=np.nan)
-    around = np.lib.stride_tricks.sliding_window_view(padded, (reach, reach))[where]
-    return np.asarray(np.nanmedian(around, axis=(1, 2)))
+    around = np.lib.stride_tricks.sliding_window_view(padded, (reach, reach))[where].reshape(-1, reach**2)
+    # np.nanmedian takes ten times as long. Unknown corners are sorted to the end.
+    ordered, count = np.sort(around, axis=1), np.count_nonzero(np.isfinite(around), axis=1)
+    each = np.arange(len(around))
+    return np.asarray(0.5 * (ordered[each, (count - 1) // 2] + ordered[each, count // 2]))
 
 
 def sigmas_beside_edges(item: RefinedLattice) -> FloatArray:

@@ -20,8 +20,8 @@ from rigkit.core.patterns.aprilgrid import MAX_BORDER, MAX_SPACING, TAG_FAMILIES
 from rigkit.core.patterns.aruco import dictionary_modules, marker_count, smallest_dictionary
 from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
-from rigkit.detection.lattices import SearchedImage
 from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.searched_image import SearchedImage
 from rigkit.detection.tags.codes import Codes, TagCode, read_tags, transferred
 from rigkit.detection.tags.module_size import module_size
 from rigkit.detection.tags.placing import squares_of

@@ -17,9 +17,16 @@ from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.checks.validate import BY_CHANCE, has_edge_offset, is_large_enough
 from rigkit.detection.lattice.lattice import MIN_ROWS
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.lattices import MIN_BOARD_CORNERS, BoardCriteria, corner_count, find_lattices, fit_and_confirm
+from rigkit.detection.lattices import (
+    MIN_BOARD_CORNERS,
+    BoardCriteria,
+    corner_count,
+    find_lattices,
+    fit_and_confirm,
+)
 from rigkit.detection.saddles.local_contrast import equalised, stretched
 from rigkit.detection.saddles.response import BASE_PIXELS, GreyImage, each_level
+from rigkit.detection.searched_image import SearchedImage
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.tags.in_squares import has_markers_of
 
@@ -107,21 +114,25 @@ class Search:
         only = self.chessboard_sizes if plain else ()
         marked = [board for board in self.boards if board.pattern.type == Charuco.type]
         has_markers = functools.partial(has_markers_of, marked) if marked else None
-        found = find_lattices(self.grey, self.min_corners_seen, only, has_markers=has_markers)
+        seen = SearchedImage.of(self.grey)
+        found = find_lattices(self.grey, self.min_corners_seen, only, has_markers=has_markers, searched=seen)
         if marked and not self.quick and self.grey.size < BASE_PIXELS and _may_miss_squares(found, marked):
-            every = find_lattices(self.grey, self.min_corners_seen, has_markers=has_markers, enlarged=True)
+            every = find_lattices(
+                self.grey, self.min_corners_seen, has_markers=has_markers, searched=seen.with_enlarged()
+            )
             found = max(found, every, key=corner_count)
         if not found and plain and not self.quick and self.grey.size > BASE_PIXELS:
             # Squares of 6 px of a 4K image are of 3 px in the finest level. Patterns as fine have the more places where
             # a few squares alternate by chance.
             least = max(self.min_corners_seen, min([BY_CHANCE, *(board.corner_count for board in self.boards)]))
-            found = find_lattices(self.grey, least, only, enlarged=True)
+            larger = seen.with_fine_squares()
+            found = find_lattices(self.grey, least, only, searched=larger) if larger else []
         if not found and self.grey.dtype != np.uint8:
             # In images of more than 8 bits a board may use a hundredth of the range of brightness.
-            seen = [item.lattice for item in find_lattices(equalised(self.grey), self.min_corners_seen, only)]
+            even = [item.lattice for item in find_lattices(equalised(self.grey), self.min_corners_seen, only)]
             # Equalisation shifts corners beside bright objects: they are fitted on a linearly stretched image.
-            self.grey = stretched(self.grey, [lattice.pixels for lattice in seen])
-            found = fit_and_confirm(self.grey, seen, BoardCriteria(self.min_corners_seen, only, has_markers))
+            self.grey = stretched(self.grey, [lattice.pixels for lattice in even])
+            found = fit_and_confirm(self.grey, even, BoardCriteria(self.min_corners_seen, only, has_markers))
         return found
 
 
