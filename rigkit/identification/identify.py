@@ -7,7 +7,7 @@ assignment with the smallest joint residual is chosen; its odds against the othe
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from rigkit.core.truth import MeasuredAngle
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.identification.assignments import Assignment, ranked_assignments
 from rigkit.identification.board_ids import LocatedBoard, assign_board_ids, first_corner_turn, ids_by_angles
-from rigkit.identification.board_matches import GridPoses, ImageObservations, ImagePair
+from rigkit.identification.board_matches import BoardMatch, GridPoses, ImageObservations, ImagePair
 from rigkit.identification.joint_pose import BoardCorners, BoardObservation, refine_joint
 from rigkit.identification.placements import BoardKind, Placement, board_kinds, describe, placements
 
@@ -93,7 +93,7 @@ def identify_pair(
     has its own pose in every image. The excess of its chi2 is due to noise, calibration errors or a wrong assignment.
     With an unknown scale of the errors the odds of two assignments are (excess_b / excess_a) ** (3 (n - 1)). One board
     alone therefore never decides; several do, unless their arrangement is symmetric. Ties within 1000 : 1 are resolved
-    by the smallest roll between the cameras, and reported.
+    by the smallest roll between the cameras, then by the most corners in common, and reported.
     """
     kinds = _checked_kinds(boards)
     pair = ImagePair.of((detections1, detections2), kinds, (camera1, camera2))
@@ -102,7 +102,7 @@ def identify_pair(
     ranked = ranked_assignments(pair)
     best = ranked[0]
     tied = [s for s in ranked if s is best or _log_odds(pair, best, s) < LOG_ODDS]
-    winner = min(tied, key=lambda s: (-len(s.matches), sum(x.against_colour for x in s.matches), _roll_rad(s)))
+    winner = min(tied, key=_preference(min(_roll_rad(s) for s in tied), pair.views))
     identity = _result(pair, winner, tied, boards, layout)
     given = {d.board_id for d in (*detections1, *detections2)} | set(layout or ())
     fitting = ids_by_angles(identity.cam1_from_board, [b for b in boards if b.board_id not in given], angles)
@@ -127,10 +127,44 @@ def _checked_kinds(boards: Sequence[Board]) -> tuple[BoardKind, ...]:
 def _nothing_shared(pair: ImagePair) -> str:
     counts = [sum(bool(k) for k in view.kinds) for view in pair.views]
     listed = ", ".join(f"{i} ({k.board.columns}x{k.board.rows})" for k in pair.kinds for i in k.ids)
+    sizes = sorted(
+        {
+            f"{d.columns}x{d.rows}"
+            for view in pair.views
+            for d, own in zip(view.detections, view.kinds, strict=True)
+            if not own
+        }
+    )
+    others = f"; other grids: {', '.join(sizes)}" if sizes else ""
     return (
         f"no listed board is seen in both images (listed boards in image 1: {counts[0]}, in image 2: {counts[1]}; "
-        f"listed: {listed}); check the board sizes and that both images show the same boards"
+        f"listed: {listed}{others}); check the board sizes and that both images show the same boards"
     )
+
+
+def _preference(
+    least_rad: float, views: tuple[ImageObservations, ImageObservations]
+) -> Callable[[Assignment], tuple[float, ...]]:
+    """Return the key by which tied assignments are sorted, most likely first; `least_rad` is the smallest roll of all.
+
+    Shifted along a board, a grid changes the roll by noise alone: there the shift counts by which both images show most
+    corners in common. Two equal grids of a board that is covered alike are the same corners.
+    """
+
+    def key(assignment: Assignment) -> tuple[float, ...]:
+        roll, found = _roll_rad(assignment), [view.detections for view in views]
+        shared = sum(_shared(s, found[0][s.first], found[1][s.second]) for s in assignment.matches)
+        against = sum(s.against_colour for s in assignment.matches)
+        quarter_turns = round((roll - least_rad) / (0.5 * np.pi))
+        return -len(assignment.matches), against, quarter_turns, -shared, roll
+
+    return key
+
+
+def _shared(match: BoardMatch, first: BoardDetection, second: BoardDetection) -> int:
+    """Return how many corners of a board both detections show."""
+    on_board = match.placement1.grid_of(first), match.placement2.grid_of(second)
+    return len(set(map(tuple, on_board[0].tolist())) & set(map(tuple, on_board[1].tolist())))
 
 
 def _roll_rad(assignment: Assignment) -> float:

@@ -22,9 +22,11 @@ from rigkit.core.detections import BoardDetection, common_corners
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import DirectionPairs, Matches
 from rigkit.core.patterns.base import Pattern
+from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.printing import brief
 from rigkit.core.truth import MeasuredAngle
 from rigkit.identification.identify import PairIdentity, identify_pair
+from rigkit.identification.placements import board_kinds, placements
 
 Chain = Literal["raw", "rectified"]
 
@@ -170,6 +172,7 @@ def _matched(
     patterns = [board.pattern for board in used]
     directions, noise = _directions(viewed, patterns, view1, view2, support, window, matches)
     notes = [f"board '{name}': {why}" for name, why in identity.missing.items()]
+    notes += [note for pair in identity.pairs() for note in _shown_alike_in_part(*pair, by_id)]
     if unseen:
         notes.append(f"{unseen} corners lie outside the calibrated field of view and were left out")
     return MatchedPair(
@@ -188,12 +191,14 @@ def _matched(
 
 
 def _check_sizes(pair_id: str, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> None:
-    """Raise InputError if no detection has a declared size and two complete grids have the same other size.
+    """Raise InputError if no detection has a declared size and two complete grids have the same size, which no declared
+    board has room for.
 
-    A single odd grid may be a part of a larger board.
+    A single odd grid may be a part of a larger board. So may two equal ones of a chessboard, covered alike: images show
+    whether it ends there (`rigkit.validation.board_ends`).
     """
     declared = {frozenset(board.size) for board in boards}
-    sizes = Counter(f"{d.columns}x{d.rows}" for d in detections if d.complete)
+    sizes = Counter(f"{d.columns}x{d.rows}" for d in detections if d.complete and not _is_part(d, boards))
     if any(frozenset((d.columns, d.rows)) in declared for d in detections) or not sizes:
         return
     size, count = sizes.most_common(1)[0]
@@ -203,6 +208,25 @@ def _check_sizes(pair_id: str, detections: Sequence[BoardDetection], boards: Seq
             f"pair '{pair_id}': the boards listed have {listed} inner corners, but {count} complete grids of {size} "
             "were found; correct columns and rows in the board file"
         )
+
+
+def _shown_alike_in_part(first: BoardDetection, second: BoardDetection, boards: Mapping[str, Board]) -> list[str]:
+    """Return a note, if both images show the same whole grid of fewer corners than their board is declared with."""
+    board = boards[str(first.board_id)]
+    columns, rows = (int(n) for n in np.ptp(first.grid, axis=0) + 1)
+    alike = len(common_corners(first, second)[0]) == len(first.grid) == len(second.grid) == columns * rows
+    if not alike or (columns, rows) == board.size:
+        return []
+    return [
+        f"board '{board.board_id}': both images show the same {columns}x{rows} of its {board.columns}x{board.rows} "
+        "corners: something covers the others, or the board file is wrong"
+    ]
+
+
+def _is_part(detection: BoardDetection, boards: Sequence[Board]) -> bool:
+    """Return whether a grid may be a part of one of the chessboards among the `boards`."""
+    chessboards = [board for board in boards if isinstance(board.pattern, Chessboard)]
+    return any(placements(detection, kind) for kind in board_kinds(chessboards))
 
 
 def _with_rays(

@@ -10,6 +10,9 @@ import pytest
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import InputError
+from rigkit.core.patterns.circles import Circles
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredAngle
 from rigkit.identification.identify import identify_pair
@@ -115,3 +118,31 @@ def test_the_joint_covariance_of_directions_is_one() -> None:
     for covariance in (pair.noise.covariance1, pair.noise.covariance2):
         eigenvalues = np.linalg.eigvalsh(covariance)
         assert (eigenvalues[:, 0] > -1e-12 * eigenvalues[:, -1]).all()
+
+
+def covered(found: BoardDetection, columns: int, rows: int) -> BoardDetection:
+    seen = (found.grid[:, 0] < columns) & (found.grid[:, 1] < rows)
+    return BoardDetection(None, columns, rows, found.grid[seen], found.pixels[seen], found.sigma_px[seen])
+
+
+@pytest.mark.parametrize("size", [(7, 6), (8, 4)])
+def test_one_board_covered_alike_in_both_images_keeps_its_size_and_the_cameras_their_distance(
+    size: tuple[int, int],
+) -> None:
+    for seed in range(3):
+        made = scene(np.random.default_rng(seed), (90.0, 90.0, 90.0))
+        first, second = ([covered(found[0], *size)] for found in made.detections())
+        pair = match_pair("pair", CAMERA, CAMERA, first, second, BOARDS[:1])
+        shift_mm = pair.identity.cam2_from_cam1.translation_mm - made.cam2_from_cam1.translation_mm
+        assert np.linalg.norm(shift_mm) < 0.01 * np.linalg.norm(made.cam2_from_cam1.translation_mm)
+        assert any(f"the same {size[0]}x{size[1]} of its 8x6 corners" in note for note in pair.notes)
+
+
+def test_grids_that_no_listed_board_has_room_for_are_refused_with_their_size() -> None:
+    made = scene(np.random.default_rng(0), (90.0, 90.0, 90.0))
+    first, second = ([replace(found[0], board_id=None)] for found in made.detections())
+    with pytest.raises(InputError, match="have 7x6 inner corners, but 2 complete grids of 8x6 were found"):
+        match_pair("pair", CAMERA, CAMERA, first, second, [replace(BOARDS[0], columns=7)])
+    circles = replace(BOARDS[0], columns=9, pattern=Circles())
+    with pytest.raises(InputError, match="have 9x6 inner corners, but 2 complete grids of 8x6 were found"):
+        match_pair("pair", CAMERA, CAMERA, first, second, [circles])

@@ -19,7 +19,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.posetype import PoseType
 from rigkit.reconstruction.pairing import match_pair
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
-from rigkit.validation.board_ends import contradicted_counts
+from rigkit.validation.board_ends import BoardSide, _corners_shown, contradicted_counts
 from rigkit.validation.check import Check
 
 Shown = tuple[StereoScene, tuple[NDArray[Any], NDArray[Any]]]
@@ -86,3 +86,24 @@ def test_a_cover_over_the_last_columns_of_both_images_contradicts_nothing(depth:
 
 def test_what_is_declared_and_seen_contradicts_nothing() -> None:
     assert contradicted(shown()[1], BOARDS[0]) == ()
+
+
+def test_squares_that_go_on_beyond_the_declared_ones_fail() -> None:
+    def first_columns(found: BoardDetection) -> BoardDetection:
+        seen = found.grid[:, 0] < COLUMNS - 1
+        kept = found.grid[seen], found.pixels[seen], found.sigma_px[seen]
+        return BoardDetection(found.board_id, COLUMNS - 1, ROWS, *kept)
+
+    (check,) = contradicted(shown()[1], replace(BOARDS[0], columns=COLUMNS - 1), first_columns)
+    assert not check.passed and (check.measured, check.ours) == (COLUMNS - 1, COLUMNS)
+    assert f"{COLUMNS} x {ROWS} inner corners or more" in check.how
+
+
+def test_what_is_left_may_lie_on_the_board_the_other_way_round() -> None:
+    """Of a square part, the ends of the rows are no ends of columns."""
+    ends, unknown = (BoardSide.ENDS, BoardSide.ENDS), (BoardSide.ENDS, BoardSide.UNKNOWN)
+    square, upright = np.array([6, 6]), np.array([9, 4])
+    assert _corners_shown(square, (9, 6), (unknown, ends)) == (9, 6)
+    assert _corners_shown(square, (9, 6), (ends, unknown)) == (9, 6)
+    assert _corners_shown(square, (9, 6), (ends, ends)) == (6, 6)
+    assert _corners_shown(upright, (9, 6), (unknown, ends)) == (9, 4)

@@ -24,6 +24,7 @@ from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.pairing import MatchedPair, match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, fit_planes, on_planes, reconstruct_from
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
+from rigkit.validation.board_ends import contradicted_counts
 from rigkit.validation.diagnose import diagnose_squares
 from rigkit.workflows.reconstruction.datasets import LoadedCamera
 
@@ -85,7 +86,7 @@ def match_images(
     """Return the matched corners of a pair, and its two images.
 
     For a board that does not fit as declared, the square size that would fit is stated in the notes, or in the error
-    raised if no board is left.
+    raised if no board is left. Raises InputError if the images contradict a declared number of columns or rows.
     """
     found = find_boards(pair, camera1, camera2)
     try:
@@ -97,6 +98,8 @@ def match_images(
         raise type(error)(f"pair '{pair.pair_id}': {'; '.join(message)} ({error})") from error
     if matched.identity.missing:
         matched = replace(matched, notes=(*found.squares_that_fit(), *matched.notes))
+    for check in contradicted_counts(matched, [to_grey(image) for image in found.images]):
+        raise InputError(f"pair '{pair.pair_id}': {check.name}: {check.measured:g} {check.how}")
     return matched, *found.images
 
 
