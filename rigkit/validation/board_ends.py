@@ -36,7 +36,7 @@ MIN_PAIRS_IN_IMAGE = 3
 """Smallest number of such pairs within an image: two of noise end there by chance once in twenty times."""
 
 
-class BoardSide(Enum):
+class BeyondCorners(Enum):
     """What follows the last corners along an axis: a whole square with which the board ends, a square and another one
     of the other colour, or neither."""
 
@@ -72,14 +72,16 @@ def contradicted_counts(pair: MatchedPair, images: Sequence[NDArray[Any]]) -> tu
     return tuple(checks)
 
 
-def _corners_shown(count: IntArray, declared: tuple[int, int], sides: Sequence[Sequence[BoardSide]]) -> tuple[int, int]:
+def _corners_shown(
+    count: IntArray, declared: tuple[int, int], sides: Sequence[Sequence[BeyondCorners]]
+) -> tuple[int, int]:
     """Return columns and rows of corners by the `sides` (before the first, beyond the last) of a grid of `count` (2,)
     corners along each axis; where the sides do not contradict them, those declared."""
 
-    def along(own: int, size: int, ends: Sequence[BoardSide]) -> int:
+    def along(own: int, size: int, ends: Sequence[BeyondCorners]) -> int:
         if own < size:
-            return own if all(end is BoardSide.ENDS for end in ends) else size
-        return own + int(BoardSide.GOES_ON in ends)
+            return own if all(end is BeyondCorners.ENDS for end in ends) else size
+        return own + int(BeyondCorners.GOES_ON in ends)
 
     def shown(turned: bool) -> tuple[int, int]:
         first, second = (along(int(count[k]), declared[k ^ turned], sides[k]) for k in (0, 1))
@@ -96,7 +98,7 @@ def _side(
     corners: tuple[IntArray, IntArray],
     axis: int,
     up: bool,
-) -> BoardSide:
+) -> BeyondCorners:
     """Return what is one square beyond the last corners along an axis (`up`), or before its first; views: image,
     camera, and its pose of the board."""
     first, last = corners
@@ -107,10 +109,10 @@ def _side(
     places[..., axis] = (edge + out * np.array([0.5, 1.0 - BESIDE_LINE, 1.0 + BESIDE_LINE]))[:, None]
     points = np.concatenate([places * board.squares_mm, np.zeros((*places.shape[:-1], 1))], axis=-1)
     found = {_side_in(image, *camera.project(pose.apply(points))) for image, camera, pose in views} - {None}
-    return found.pop() or BoardSide.UNKNOWN if len(found) == 1 else BoardSide.UNKNOWN
+    return found.pop() or BeyondCorners.UNKNOWN if len(found) == 1 else BeyondCorners.UNKNOWN
 
 
-def _side_in(image: NDArray[Any], pixels: Pixels, valid: BoolArray) -> BoardSide | None:
+def _side_in(image: NDArray[Any], pixels: Pixels, valid: BoolArray) -> BeyondCorners | None:
     """Return what the contrast of adjacent squares does between the second and third row of pixels (3, N, 2), of which
     the first is in their middle; None if too few are in the image."""
     inside = valid & ((pixels >= 0.0) & (pixels <= np.array(image.shape[::-1]) - 1.0)).all(axis=-1)
@@ -122,12 +124,12 @@ def _side_in(image: NDArray[Any], pixels: Pixels, valid: BoolArray) -> BoardSide
     enough = HALF_CONTRAST * np.median(np.abs(square))
     is_square = before * np.sign(square) > enough
     for side, there in (
-        (BoardSide.ENDS, np.abs(beyond) < enough),
-        (BoardSide.GOES_ON, -beyond * np.sign(square) > enough),
+        (BeyondCorners.ENDS, np.abs(beyond) < enough),
+        (BeyondCorners.GOES_ON, -beyond * np.sign(square) > enough),
     ):
         if np.mean(is_square & there) >= MIN_SHARE_ENDING:
             return side
-    return BoardSide.UNKNOWN
+    return BeyondCorners.UNKNOWN
 
 
 def _check(board: Board, axis: int, count: int, size: str, corners: int) -> Check:

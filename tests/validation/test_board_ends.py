@@ -19,7 +19,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.posetype import PoseType
 from rigkit.reconstruction.pairing import match_pair
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
-from rigkit.validation.board_ends import BoardSide, _corners_shown, contradicted_counts
+from rigkit.validation.board_ends import BeyondCorners, _corners_shown, contradicted_counts
 from rigkit.validation.check import Check
 
 Shown = tuple[StereoScene, tuple[NDArray[Any], NDArray[Any]]]
@@ -101,7 +101,7 @@ def test_squares_that_go_on_beyond_the_declared_ones_fail() -> None:
 
 def test_what_is_left_may_lie_on_the_board_the_other_way_round() -> None:
     """Of a square part, the ends of the rows are no ends of columns."""
-    ends, unknown = (BoardSide.ENDS, BoardSide.ENDS), (BoardSide.ENDS, BoardSide.UNKNOWN)
+    ends, unknown = (BeyondCorners.ENDS, BeyondCorners.ENDS), (BeyondCorners.ENDS, BeyondCorners.UNKNOWN)
     square, upright = np.array([6, 6]), np.array([9, 4])
     assert _corners_shown(square, (9, 6), (unknown, ends)) == (9, 6)
     assert _corners_shown(square, (9, 6), (ends, unknown)) == (9, 6)
