@@ -115,6 +115,7 @@ def diagnose(
         *_of_another_kind(calibration, order),
         *change,
         *cropped_images(calibration),
+        *([] if mixed else undistorted(calibration, sure=far.worst_px <= UNCERTAIN_PX)),
         *([] if contradicting else stretched),
         *unlike,
         *diagnose_capture(calibration),
@@ -127,7 +128,6 @@ def diagnose(
     if not mixed:
         found += [
             *unclear,
-            *undistorted(calibration, sure=far.worst_px <= UNCERTAIN_PX),
             *([] if contradicting else pattern),
             *_overfit(calibration),
             *diagnose_boards(calibration, " if pixels are square" if upright else "", sure=not contradicting),

@@ -27,10 +27,20 @@ WORDS = "the images show no distortion"
         (lens("fish"), "scaramuzza", False),
     ],
 )
-def test_no_distortion_is_said(camera: Camera, model: str, reported: bool, rng: np.random.Generator) -> None:
+def test_no_distortion_is_said_first(camera: Camera, model: str, reported: bool, rng: np.random.Generator) -> None:
     views, _, _ = random_views(camera, 16, rng, reach_deg=25.0, noise_px=0.02)
     found = calibrate(views, SIZE, model=model, board="flat", folds=0)
-    assert any(WORDS in str(verdict) for verdict in found.verdicts) == reported
+    assert (WORDS in str(found.verdicts[0])) == any(WORDS in str(verdict) for verdict in found.verdicts) == reported
+
+
+@pytest.mark.parametrize(("k1", "reported"), [(3e-4, True), (-0.01, False)])
+def test_what_an_undistorting_program_leaves_grows_off_axis(
+    k1: float, reported: bool, rng: np.random.Generator
+) -> None:
+    wide = Brown(SIZE, np.array([600.0, 600.0, 801.0, 595.0, k1, 0.0, 0.0, 0.0, 0.0]))
+    views, _, _ = random_views(wide, 16, rng, reach_deg=55.0, noise_px=0.02)
+    found = calibrate(views, SIZE, model="brown", board="flat", folds=0)
+    assert (WORDS in str(found.verdicts[0])) == reported
 
 
 def test_a_narrow_lens_may_have_none(rng: np.random.Generator) -> None:
