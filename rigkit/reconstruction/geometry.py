@@ -124,7 +124,11 @@ def pair_geometry(
         contradiction = () if declared is PoseType.AUTO else decision.notes
         if contradiction and decision.level_sigma_rad is None:
             # Held exactly it would bend the boards, and hide that this declaration is wrong.
-            decision = replace(decision, level_sigma_rad=DEFAULT_LEVEL_RAD)
+            instead = (
+                f"{'; '.join(contradiction)}; the type is held to {np.degrees(DEFAULT_LEVEL_RAD):.2f} deg instead of "
+                "exactly (errors of the calibrations, which may explain it, count only in the checks of validate)"
+            )
+            decision = replace(decision, level_sigma_rad=DEFAULT_LEVEL_RAD, notes=(instead,))
         return _in_mm(pair, decision, _maximum_likelihood_pose(pair, decision))
     except DegenerateError as error:
         # A wrong declaration is the likeliest reason of a degenerate pose.

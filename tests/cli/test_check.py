@@ -151,6 +151,7 @@ def test_images_are_exchanged_where_the_other_order_holds_or_explains_more(monke
         hypothesis=next(h for h in hypotheses_of(rig) if h.kind == "rotation"),
         amounts=np.zeros(3),
         covariance=np.eye(3),
+        freedom=np.inf,
         chance=0.0,
         size_px=5.0,
         max_px=5.0,

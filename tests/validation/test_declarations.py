@@ -80,7 +80,9 @@ def test_an_exact_level_that_was_off_by_tenths_of_a_degree_fails_and_bends_nothi
     exact = declared(pose_type, pose_type, rng, level_deg=0.0, declared_level_deg=0.0)
     assert validate(exact, TRUTH).passed
     assert exact.geometry is not None and exact.geometry.decision.level_sigma_rad is None
-    report = validate(declared(pose_type, pose_type, rng, level_deg=0.4, declared_level_deg=0.0), TRUTH)
+    off = declared(pose_type, pose_type, rng, level_deg=0.4, declared_level_deg=0.0)
+    assert any("held to 0.20 deg instead of exactly" in note for note in off.notes)
+    report = validate(off, TRUTH)
     assert not report.check(f"pose type {pose_type}").passed
     assert all(check.passed for check in report.checks if check.kind == "angle")
 

@@ -16,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.special import fdtrc
 
-from rigkit.calibration.solving.clustered import LARGE_FREEDOM
+from rigkit.calibration.solving.clustered import LARGE_FREEDOM, widening
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.planning.goal import Goal
@@ -60,6 +60,7 @@ class Change:
     ----------
     hypothesis : what changed.
     amounts, covariance : (K,) and (K, K), in `hypothesis.units`.
+    freedom : degrees of freedom of the covariance.
     chance : p-value, from the F-test of this hypothesis.
     size_px : rms displacement of the projection after the best rotation; for a mount, of the points it shows.
     max_px : the same including the uncertainty of the amounts, so that a poorly known change is not taken as small.
@@ -69,6 +70,7 @@ class Change:
     hypothesis: Hypothesis
     amounts: FloatArray
     covariance: FloatArray
+    freedom: float
     chance: float
     size_px: float
     max_px: float
@@ -76,8 +78,9 @@ class Change:
 
     @property
     def sigmas(self) -> FloatArray:
-        """Standard deviations of the amounts."""
-        return np.sqrt(np.diag(self.covariance))
+        """Standard deviations of the amounts, widened for the degrees of freedom, as is `chance`: a single amount of
+        two of them has the p-value of two of a normal distribution."""
+        return np.asarray(widening(self.freedom) * np.sqrt(np.diag(self.covariance)))
 
     def __str__(self) -> str:
         if self.hypothesis.kind == "lens":
@@ -329,7 +332,14 @@ def _fit_hypothesis(whitened: Whitened, hypothesis: Hypothesis) -> Change | None
     m = len(amounts)
     chance = float(fdtrc(m, whitened.freedom, max(gain, 0.0) / m))
     return Change(
-        hypothesis=hypothesis, amounts=amounts, covariance=covariance, chance=chance, size_px=0.0, max_px=0.0, gain=gain
+        hypothesis=hypothesis,
+        amounts=amounts,
+        covariance=covariance,
+        freedom=whitened.freedom,
+        chance=chance,
+        size_px=0.0,
+        max_px=0.0,
+        gain=gain,
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, lens, noisy_view, random_views
 from helpers.monitoring_scenes import NOISE_PX, best_held, changed_lens, checked, poses_held
+from scipy.special import fdtrc, ndtr
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.departures import with_own_noise
@@ -52,6 +53,17 @@ def test_unchanged_cameras_hold(calibration: Calibration) -> None:
     blind = replace(checks[0], powers=tuple(replace(power, chance=0.1) for power in checks[0].powers))
     assert check_facts(blind).headline.startswith("Still holds, as far as these images show (")
     assert re.search(r"drawn [125]0* times as long", change_svg(checks[0], 0))
+
+
+def test_sigmas_of_amounts_tell_the_same_as_their_chance(calibration: Calibration) -> None:
+    """Of a single amount, two of them have the p-value of two of a normal distribution."""
+    two = 2.0 * float(ndtr(-2.0))
+    tried = [c for k in range(8) for c in checked(calibration, lens("reg"), np.random.default_rng(k)).tried]
+    single = [c for c in tried if c.amounts.size == 1]
+    assert single and all((abs(c.amounts[0]) > 2.0 * c.sigmas[0]) == (c.chance < two) for c in single)
+    known = replace(single[0], freedom=5.0)
+    edge = fdtrc(1, known.freedom, (2.0 * known.sigmas[0]) ** 2 / known.covariance[0, 0])
+    assert edge == pytest.approx(two, rel=1e-6)
 
 
 @pytest.mark.parametrize(
