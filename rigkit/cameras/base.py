@@ -7,6 +7,7 @@ supported: rays are unit vectors and z may be negative.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -104,6 +105,8 @@ class Camera(ABC):
     """Name in the registry and in files."""
     orders: ClassVar[tuple[int, ...]] = ()
     """Sizes of a model that has several: Brown's numbers of distortion terms, Scaramuzza's degrees."""
+    closed_ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    """Least and greatest values of parameters that are valid at both: a best fit may lie there."""
 
     @property
     def series(self) -> tuple[int, ...]:
@@ -297,6 +300,19 @@ class Camera(ABC):
         object.__setattr__(out, "size_px", self.size_px)
         out._keep(parameters)
         return out
+
+    @property
+    def ends(self) -> FloatArray:
+        """The least and the greatest values (2, P) of the parameters in `closed_ranges`, infinite for the others."""
+        ranges = [self.closed_ranges.get(name, (-np.inf, np.inf)) for name in self.parameter_names()]
+        return np.array(ranges, dtype=np.float64).reshape(-1, 2).T
+
+    def stepped(self, step: FloatArray) -> Self:
+        """Return the camera after the step (P,) of a solver, which stops at the `ends`: a minimum may lie there.
+
+        Raises InputError where another parameter leaves its range.
+        """
+        return self.with_parameters(np.clip(self.parameters + step, *self.ends))
 
     def on_image(self, pixels: Pixels) -> BoolArray:
         """Return which pixels (..., 2) are on the sensor, up to half a pixel beyond the centres of its border

@@ -5,6 +5,7 @@ Reference: V. Usenko, N. Demmel, D. Cremers, "The double sphere camera model", 3
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -27,6 +28,7 @@ class DoubleSphere(FocalCamera):
     """
 
     model: ClassVar[str] = "double_sphere"
+    closed_ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"alpha": (0.0, 1.0)}
 
     @classmethod
     def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:

@@ -6,6 +6,7 @@ from V. Usenko, N. Demmel, D. Cremers, "The double sphere camera model", 3DV 201
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -29,6 +30,7 @@ class EUCM(FocalCamera):
     """
 
     model: ClassVar[str] = "eucm"
+    closed_ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"alpha": (0.0, 1.0)}
 
     @classmethod
     def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:

@@ -66,6 +66,11 @@ class NearCamera(Camera):
         return (*self.lens.parameter_names(), *PUPIL_NAMES)
 
     @property
+    def ends(self) -> FloatArray:
+        unlimited = np.repeat([[-np.inf], [np.inf]], PUPIL_TERMS, axis=1)
+        return np.concatenate([self.lens.ends, unlimited], axis=1)
+
+    @property
     def series(self) -> tuple[int, ...]:
         return self.lens.series
 

@@ -58,6 +58,7 @@ class NormalEquations:
     products : (V, K, K) of each camera: J^T W J of every view, where the K columns are the derivatives by the camera's
         parameters, the boards' warps and the pose (w, t), and last the residual; without released corners and priors.
     prior_cost : cost of the priors, px^2.
+    room : (2, G) the steps to the ends of the globals' ranges (`Camera.ends`); None without any.
     points_from : index of the first coordinate of released board points among the globals, three for each point and
         coupled within a point only; None without released points.
     """
@@ -72,6 +73,7 @@ class NormalEquations:
     products: tuple[FloatArray, ...]
     prior_cost: float = 0.0
     points_from: int | None = None
+    room: FloatArray | None = None
 
     def with_priors(
         self,
@@ -86,19 +88,21 @@ class NormalEquations:
         `sigma_px` is the standard deviation of a corner: it scales residuals in px against the priors.
         """
         gg, g, cost = self.gg.copy(), self.g.copy(), 0.0
+        room = np.tile([[-np.inf], [np.inf]], len(g))
         for own, camera in cameras:
             rows, residual = camera_prior(camera)
             rows, residual = sigma_px * rows, sigma_px * residual
             gg[own, own] += rows.T @ rows
             g[own] -= rows.T @ residual
             cost += float(residual @ residual)
+            room[:, own] = camera.ends - camera.parameters
         if unknowns.size:
             weight = (sigma_px / shape_sigma) ** 2
             diagonal = np.arange(shape.start, shape.stop)
             gg[diagonal, diagonal] += weight
             g[shape] -= weight * unknowns
             cost += float((weight * unknowns**2).sum())
-        return replace(self, gg=gg, g=g, prior_cost=cost)
+        return replace(self, gg=gg, g=g, prior_cost=cost, room=room if np.isfinite(room).any() else None)
 
     def with_quadratic(self, where: slice, off: FloatArray, information: FloatArray) -> NormalEquations:
         """Add the cost off^T information off of globals that deviate by `off` (n,) from their prior mean."""
@@ -114,7 +118,32 @@ class NormalEquations:
         return total if np.isfinite(total) else np.inf
 
     def step(self, damping: float) -> SchurStep | None:
-        """Return the damped Gauss-Newton step, None where the damped system is not positive definite."""
+        """Return the damped Gauss-Newton step, None where the damped system is not positive definite. Globals that
+        would leave their range go to its end, and all others follow (an active set; J. Nocedal, S. Wright, "Numerical
+        optimization", 2006, chapter 16.5)."""
+        found = self._free_step(damping)
+        if found is None or self.room is None:
+            return found
+        within = np.clip(found.globals, *self.room)
+        free = within == found.globals
+        if free.all():
+            return found
+        held = np.where(free, 0.0, within)
+        rest = replace(
+            self,
+            gg=self.gg * free * free[:, None] + np.diag(np.where(free, 0.0, 1.0)),
+            gp=self.gp * free[:, None],
+            g=(self.g - self.gg @ held) * free,
+            p=self.p - held @ self.gp,
+            room=np.where(free, self.room, [[-np.inf], [np.inf]]),
+        ).step(damping)
+        if rest is None:
+            return None
+        predicted = rest.predicted + float(held @ (2.0 * self.g - self.gg @ held))
+        return SchurStep(rest.globals + held, rest.poses, predicted)
+
+    def _free_step(self, damping: float) -> SchurStep | None:
+        """Return the step without regard to `room`."""
         first = self.points_from
         if first is None or len(self.g) - first <= 6 * len(self.pp):
             found = schur_step(self.gg, self.gp, self.pp, self.g, self.p, damping)

@@ -42,7 +42,7 @@ class State:
         p = self.camera.parameters.size
         return replace(
             self,
-            camera=self.camera.with_parameters(self.camera.parameters + step.globals[:p]),
+            camera=self.camera.stepped(step.globals[:p]),
             rotation=exp_so3(step.poses[:, :3]) @ self.rotation,
             translation_mm=self.translation_mm + step.poses[:, 3:],
             unknowns=self.unknowns + step.globals[p:],

@@ -17,6 +17,8 @@ from rigkit.calibration.solving.solver import Linearised, minimise, solve, with_
 from rigkit.calibration.solving.state import State, evaluate
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import RadialCurve
+from rigkit.cameras.brown import Brown
+from rigkit.cameras.eucm import EUCM
 from rigkit.cameras.scaramuzza import Scaramuzza
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import exp_so3
@@ -26,6 +28,8 @@ GRADIENT_REL = 1e-5
 COST_REL = 1e-8
 """The optimum of another solver from the same start: both stop where the cost no longer changes."""
 
+AT_REST = 1e-4
+"""Gradient by an unknown that is at its minimum, in parts of the residuals: the cost is within the square of it."""
 FEW_ITERATIONS = 7
 """From the radial start; four or five is usual, whatever the model."""
 
@@ -209,3 +213,23 @@ def test_a_step_that_makes_no_camera_is_refused(rng: np.random.Generator) -> Non
     found = minimise(start, linearise, moved)
     assert found.convergence.converged and len(refused) == 1
     assert found.normal.cost == pytest.approx(minimise(start, linearise, State.moved).normal.cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("start", [0.6, 0.95, 1.0])
+def test_a_best_fit_at_the_end_of_a_range_is_found(start: float, rng: np.random.Generator) -> None:
+    """The lens would need alpha > 1: at its end all other unknowns are at their minimum, and alpha would grow."""
+    barrel = Brown(SIZE, np.array([900.0, 900.0, 640.0, 480.0, -0.2, 0.03, 0.0, 0.0, 0.0]))
+    views, rotation, translation = random_views(barrel, 6, rng, reach_deg=REACH_DEG["reg"])
+    observations = Observations.from_views(views)
+    camera = EUCM(SIZE, np.array([900.0, 900.0, 640.0, 480.0, start, 0.4 / start]))
+    found = solve(observations, State.start(camera, rotation, translation, observations))
+    assert found.convergence.converged
+    assert found.state.camera.parameters[4] == 1.0
+    pull = found.normal.g / np.sqrt(np.diag(found.normal.gg))
+    assert pull[4] > 0.0
+    assert np.abs(np.delete(pull, 4)).max() < AT_REST * np.sqrt(found.normal.cost)
+    # No step at all is left: the others do not follow an alpha that stays.
+    step = found.normal.step(0.0)
+    assert step is not None
+    assert step.globals[4] == 0.0
+    assert step.predicted < COST_REL * found.normal.cost

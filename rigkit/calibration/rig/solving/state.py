@@ -131,7 +131,7 @@ class RigState:
         lenses = zip(self.cameras, layout.cameras, strict=True)
         mounts, boards = _steps(step.globals, layout.mounts), _steps(step.globals, layout.boards)
         return RigState(
-            cameras=tuple(c.with_parameters(c.parameters + step.globals[own]) for c, own in lenses),
+            cameras=tuple(c.stepped(step.globals[own]) for c, own in lenses),
             mount_rotation=exp_so3(mounts[:, :3]) @ self.mount_rotation,
             mount_mm=self.mount_mm + mounts[:, 3:],
             frame_rotation=exp_so3(step.poses[:, :3]) @ self.frame_rotation,
