@@ -13,6 +13,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.fields import of_one_moment
 from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.repeated_lines import LEGIBLE, without_repeated_lines
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import grey_image
@@ -58,8 +59,21 @@ def detect_boards(
         one.
     """
     check_searchable(boards or ())
+    found = _detected(image, boards or (), min_corners, camera, quick)
+    before = without_repeated_lines(image) if isinstance(image, np.ndarray) and image.ndim > 1 else None
+    if before is None:
+        return found
+    fewer = _detected(before.image, boards or (), min_corners, None, quick)
+    all_lines, once = (sum(len(item.grid) for item in items) for items in (found, fewer))
+    return tuple(map(before.restored, fewer)) if once > LEGIBLE * all_lines else found
+
+
+def _detected(
+    image: NDArray[np.generic], boards: Sequence[Board], min_corners: int, camera: Camera | None, quick: bool
+) -> tuple[BoardDetection, ...]:
+    """Return all boards in `image`, all of whose lines are the sensor's."""
     stored = of_one_moment(without_mosaic(grey_image(image)))
-    search = Search(without_bad_pixels(stored), boards or (), min_corners, camera, stored, quick=quick)
+    search = Search(without_bad_pixels(stored), boards, min_corners, camera, stored, quick=quick)
     found: list[BoardDetection] = []
     for kind, finder in FINDERS.items():
         own = [board for board in search.boards if board.pattern.type == kind]
