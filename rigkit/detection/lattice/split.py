@@ -247,9 +247,10 @@ def _joined(one: _LatticePart, two: _LatticePart) -> Lattice | None:
         return None
     near, place = _carried_over(one, two, squared)
     whole = np.rint(place)
-    far_off = float(np.abs(place - whole).max())
-    near, place, whole = near[:NEAREST_OUT], place[:NEAREST_OUT], whole[:NEAREST_OUT]
-    off = float(np.abs(place - whole).max())
+    with np.errstate(invalid="ignore"):
+        away = np.abs(place - whole).max(axis=1)
+    far_off, off = float(away.max()), float(away[:NEAREST_OUT].max())
+    near, whole = near[:NEAREST_OUT], whole[:NEAREST_OUT]
     if not off < MEETS_AT_ALL:
         return None
     for quarter in range(4):

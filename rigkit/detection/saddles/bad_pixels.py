@@ -1,7 +1,9 @@
-"""Hot and dead pixels, and salt-and-pepper noise.
+"""Hot and dead pixels, columns and rows, and salt-and-pepper noise.
 
-Since a lens blurs over more than a pixel, a pixel that differs strongly from all of its neighbours is a defect. A
-sparse sample determines whether an image has such pixels; if so, all are replaced by the median of their neighbours.
+Since a lens blurs over more than a pixel, a pixel that differs strongly from all of its neighbours is a defect, and
+so is a column (or row) that is brighter, or darker, than both neighbours nearly everywhere. A sparse sample determines
+whether an image has such pixels or lines; if so, all are replaced by the median of their neighbours, and lines by the
+mean of theirs.
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from rigkit.core.arrays import IntArray
+from rigkit.core.arrays import BoolArray, IntArray
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.kernels import front
 
@@ -30,11 +32,22 @@ adjacent. The pixel at the corner of a square differs from five."""
 REPAIR_ROUNDS = 2
 """Rounds of repair: of three adjacent bad pixels the middle one is found after the others are replaced."""
 
+SAMPLED_ACROSS = (4, 128)
+EXTREME_SHARE, EVIDENT_SHARE, MAX_BAD_LINES = 0.9, 0.2, 0.05
+"""Number of places along a line at which it is compared with its neighbours, at first and where that finds any; shares
+of the places at which a bad line is at least as bright as both (or as dark), and brighter by SPAN_SHARE: beside
+saturated or black parts a hot or dead line does not differ; and largest share of bad lines: more are a pattern of the
+scene or of a screen. In 683 images, most of them REAL, there is no such line."""
+
 NEIGHBOUR_STEPS: IntArray = np.array([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1) if v or u])
 
 
 def without_bad_pixels(grey: GreyImage) -> GreyImage:
-    """Return `grey` with its bad pixels replaced by the median of their good neighbours; unchanged without any."""
+    """Return `grey` with its bad lines replaced by the mean of both neighbours, and bad pixels by the median of their
+    good neighbours; unchanged without any."""
+    turned: GreyImage = grey.swapaxes(0, 1)
+    repaired = _without_bad_rows(turned)
+    grey = _without_bad_rows(grey if repaired is turned else repaired.T.copy())
     step = _evident(grey)
     if step is None:
         return grey
@@ -42,6 +55,31 @@ def without_bad_pixels(grey: GreyImage) -> GreyImage:
     for _ in range(REPAIR_ROUNDS):
         _repair(out, step)
     return out
+
+
+def _without_bad_rows(grey: GreyImage) -> GreyImage:
+    """Return `grey` with its bad rows replaced by the mean of both neighbours; unchanged without any."""
+    if min(grey.shape) < 3:
+        return grey
+    rows = np.arange(1, len(grey) - 1)
+    for across in SAMPLED_ACROSS:
+        places = grey[:, grey.shape[1] // (2 * across) :: max(1, grey.shape[1] // across)].T.copy()
+        above, here, below = places[:, rows - 1], places[:, rows], places[:, rows + 1]
+        least, most, step = cv2.min(above, below), cv2.max(above, below), SPAN_SHARE * float(np.ptp(places))
+        bad = _hold(here >= most, EXTREME_SHARE) & _hold(cv2.subtract(here, most) > step, EVIDENT_SHARE)
+        bad |= _hold(here <= least, EXTREME_SHARE) & _hold(cv2.subtract(least, here) > step, EVIDENT_SHARE)
+        rows = rows[bad]
+        if not 0 < len(rows) <= MAX_BAD_LINES * len(grey):
+            return grey
+    out = grey.copy()
+    mean = 0.5 * grey[rows - 1] + 0.5 * grey[rows + 1]
+    out[rows] = mean if grey.dtype == np.float32 else np.rint(mean)
+    return out
+
+
+def _hold(true: BoolArray, share: float) -> BoolArray:
+    """Return which columns (N,) of `true` (M, N) are true in at least this share of the rows."""
+    return np.asarray(np.count_nonzero(true, axis=0) >= share * len(true))
 
 
 def _evident(grey: GreyImage) -> float | None:

@@ -59,6 +59,27 @@ def test_bad_pixels_and_no_others_are_replaced(dtype: type, rng: np.random.Gener
     assert (left > 60.0).mean() < 0.05
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_bad_lines_and_no_others_are_replaced(dtype: type, rng: np.random.Generator) -> None:
+    clean = three_boards(rng).render(supersample=2, noise_levels=2.0, rng=rng)
+    spoiled = clean.copy()
+    spoiled[:, [100, 333, 500]] = 255
+    spoiled[[77, 240]] = 0
+    before, after = (detect_boards(image) for image in (clean, spoiled))
+    assert [item.complete for item in after] == [item.complete for item in before]
+    # At the border there is one neighbour, and a line of the scene crosses bright and dark parts.
+    spoiled[:, 0] = 255
+    spoiled[:, 400] = 120
+    repaired = without_bad_pixels(spoiled.astype(dtype))
+    assert repaired.dtype == dtype
+    bad: np.ndarray = np.zeros(clean.shape, bool)
+    bad[:, [100, 333, 500]] = bad[[77, 240]] = True
+    assert np.array_equal(repaired[~bad], spoiled[~bad])
+    left = np.abs(repaired.astype(np.float64) - clean)[bad]
+    assert np.median(left) < 4.0
+    assert (left > 60.0).mean() < 0.05
+
+
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_good_pictures_stay_as_they_are(name: str, rng: np.random.Generator) -> None:
     optics, photometry = CONDITIONS[name]
