@@ -30,7 +30,7 @@ from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_model import NEAR_PX, TAIL_SIGMAS
 from rigkit.detection.subpixel.refined import RefinedLattice
-from rigkit.detection.subpixel.scatter import scatter_factors
+from rigkit.detection.subpixel.scatter import scatter_factors, small_scatter
 from rigkit.detection.subpixel.subpixel import refine
 from rigkit.detection.subpixel.uncertain_corners import sigmas_beside_edges
 from rigkit.detection.subpixel.whole_board import placed_together
@@ -273,7 +273,7 @@ def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board, cam
     shape, blur = fit_cells(refined.lattice.pixels, known), float(np.median(refined.blur_px[known]))
     narrow = _fitted(image, refined, board, blur)
     if float(np.median(gap_to_markers(board, shape.sides))) > (TAIL_SIGMAS + MARKER_BLURS) * blur + NEAR_PX:
-        return _MarkedBoard(narrow, board, image, board)
+        return _MarkedBoard(_with_scatter(narrow), board, image, board)
     # Blurred ink of the markers reaches into any window.
     given = narrow
     if not narrow.lattice.known.all():
@@ -281,8 +281,20 @@ def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board, cam
         seen = completed(image, _detection(_MarkedBoard(narrow, board, image, board)), [board], camera)
         given = _with_more(narrow, seen, board)
     return _with_markers_masked(image, given, narrow.lattice.known, board, blur) or _MarkedBoard(
-        narrow, board, image, board
+        _with_scatter(narrow), board, image, board
     )
+
+
+def _with_scatter(refined: RefinedLattice, drawn: float = 0.0) -> RefinedLattice:
+    """Return a board's corners with sigmas for their scatter, as those of plain chessboards: prints are irregular.
+
+    `drawn` : relative shift by the markers around them (`_drawn_by_markers`), which their sigmas do not include yet.
+    """
+    alone = refined.sigma_px / refined.scatter / (1.0 + drawn)
+    every = (slice(0, alone.shape[0]), slice(0, alone.shape[1]))
+    scatter = float(scatter_factors(refined.lattice.pixels, alone, [every])[0])
+    scatter *= small_scatter(refined.lattice.pixels, scatter * alone)
+    return replace(refined, sigma_px=scatter * alone, scatter=scatter)
 
 
 def _with_markers_masked(
@@ -314,11 +326,7 @@ def _with_markers_masked(
         # After the first removal there is ink left, which the picture of plain squares lacks; and this step is slow.
         narrow = placed_together(picture, fitted) if turn > 0 else fitted
         after = float(np.median(narrow.blur_px[narrow.lattice.known]))
-    # Wide windows show irregular printing of the squares, as for plain chessboards.
-    alone = narrow.sigma_px / narrow.scatter / (1.0 + drawn)
-    every = (slice(0, sure.shape[0]), slice(0, sure.shape[1]))
-    scatter = float(scatter_factors(narrow.lattice.pixels, alone, [every])[0])
-    return _MarkedBoard(replace(narrow, sigma_px=scatter * alone, scatter=scatter), board, picture, empty)
+    return _MarkedBoard(_with_scatter(narrow, drawn), board, picture, empty)
 
 
 def _drawn_by_markers(

@@ -85,6 +85,21 @@ def test_every_corner_has_its_own_number_and_is_finer_than_opencvs(lens: str) ->
     assert np.sqrt((np.concatenate(sigmas) ** 2).mean()) < 1.2
 
 
+def test_sigmas_of_a_crumpled_print_include_the_scatter_of_its_corners() -> None:
+    """Of large squares, so that markers lie outside of the windows; few rows, and more."""
+    errors = []
+    for size in ((6, 5), (7, 6)):
+        rng = np.random.default_rng(0)
+        scene = one_board(rng, board=replace(BOARD, columns=size[0], rows=size[1]), max_tilt_deg=20.0)
+        image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
+        places = np.indices(image.shape)[::-1].astype(np.float32)
+        for at in places:
+            at += cv2.resize(rng.normal(0.0, 0.2, (16, 20)), image.shape[::-1], interpolation=cv2.INTER_CUBIC)
+        (found,) = detect_boards(cv2.remap(image, places[0], places[1], cv2.INTER_CUBIC), [scene.boards[0].board])
+        errors.append(errors_by_place(found, scene.truth()[0]) / found.sigma_px[:, None])
+    assert 0.7 < np.sqrt((np.concatenate(errors) ** 2).mean()) < 1.4
+
+
 def test_a_part_keeps_its_numbers(rng: np.random.Generator) -> None:
     """Three columns of the board are out of the image, and something lies over its middle."""
     scene = one_board(rng, board=BOARD, max_tilt_deg=20.0)
