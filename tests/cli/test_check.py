@@ -272,6 +272,7 @@ def test_exit_codes_of_unchanged_and_changed_cameras(
     assert printed["cost"] == pytest.approx(0.01 * FOCUS_PERCENT * 200.0, rel=0.4)
     assert f"an error of {printed['cost']:.2g} mm rms in the length" in printed["statement"]
     assert "does not hold" in page.read_text()
+    assert all(image.name in page.read_text() for image in (home / "moved").iterdir())
     assert load_camera(fixed).parameters[0] == pytest.approx(CAMERA.parameters[0] * 1.005, rel=1e-3)
     assert main(["check", str(fixed), str(home / "moved")]) == 0
     capsys.readouterr()

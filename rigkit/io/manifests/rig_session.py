@@ -207,7 +207,9 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
     if how == "order":
         if not as_many:
             raise InputError(f'frames = "order" needs as many images of every camera, there are {counts}')
-        return {name: {image: f"{k:04d}" for k, image in enumerate(own)} for name, own in images.items()}
+        # In this order when sorted, and called as the first camera's images.
+        called = [f"{k:04d}-{PurePath(image).stem}" for k, image in enumerate(next(iter(images.values()), ()))]
+        return {name: dict(zip(own, called, strict=True)) for name, own in images.items()}
     if how == "time":
         return _frames_by_time(images)
     alike = None

@@ -124,7 +124,7 @@ def check_pictures(
             check = replace(check, flipped=flipped_pictures(check.monitored, views))
             _require_right_order(check, views)
     pictures.left_out.extend((f"{path}", OWN_IMAGE) for path in own)
-    files = _files(source, check, options, pictures.left_out)
+    files = _files(source, check, options, now, pictures.left_out)
     write_together(files, force=options.force)
     if options.history is not None:
         _register(options.history, source, check, before, options.temperature_c)
@@ -162,10 +162,14 @@ def _digest_alone(images: Sequence[Path]) -> str:
 
 
 def _files(
-    source: Path, check: CalibrationCheck, options: CheckOptions, left_out: Sequence[tuple[str, str]]
+    source: Path,
+    check: CalibrationCheck,
+    options: CheckOptions,
+    frames: ImagesByMoment,
+    left_out: Sequence[tuple[str, str]],
 ) -> dict[Path, str | bytes]:
     """Return the contents of the files to write, by path: the corrected calibration, and the page, which names the
-    images `left_out`."""
+    images of the `frames`, and those `left_out`."""
     files: dict[Path, str | bytes] = {}
     # No correction where it holds or where nothing explains the images; flipped images are themselves the error.
     right = check.holds or check.unexplained or bool(check.flipped)
@@ -173,6 +177,7 @@ def _files(
         files[options.fix] = fixed_text(source, check)
     if options.report is not None:
         facts = {source.name: digest_line(source), **software_facts()}
+        facts["images given"] = ", ".join(" + ".join(path.name for path in frame) for frame in frames)
         facts |= {f"left out: {Path(name).name}": reason for name, reason in left_out}
         files[options.report] = check_page(check, f"Check of {source.name}", facts)
     return files
@@ -251,13 +256,19 @@ class _Pictures:
         if not self.boards:
             raise InputError(f"check: '{self.source}' does not say what boards there are; give --board 9x6x25")
         found = self._boards_seen(frames)
-        wrong = other_size({name: own for each in found for name, own in each.items()}, self.boards, self.known)
+        wrong = self._other_size(found)
         if wrong is not None:
+            # In some images a larger board passes for a declared one: it is counted where none is declared.
+            wrong = self._other_size(replace(self, boards=())._boards_seen(frames)) or wrong
             raise InputError(f"check: {wrong}; give the board in the images with --board")
         views = _views(self.monitored, frames, found, self.boards, self.left_out)
         if not views:
             raise InputError(f"check: {_nothing_to_check(self.left_out, self.unreadable, self.boards)}")
         return (lambda now: evidence_of(now, views)), views
+
+    def _other_size(self, found: Sequence[Mapping[str, Sequence[BoardDetection]]]) -> str | None:
+        """Return `other_size` of the detections of each camera."""
+        return other_size({name: own for each in found for name, own in each.items()}, self.boards, self.known)
 
     def _read(self, frame: Sequence[Path]) -> list[Any]:
         """Return the images of a moment, [] where one is unusable: the reason goes to `unreadable` or `left_out`."""

@@ -158,4 +158,4 @@ def test_images_without_a_common_frame_are_named() -> None:
     with pytest.raises(InputError, match=r"'a1\.jpg' and 'b1\.jpg' of camera 'l'"):
         frames_of_images({"l": ["a1.jpg", "b1.jpg"], "r": ["c1.jpg"]}, "number")
     # One image of every camera: there is but one moment.
-    assert frames_of_images({"l": ["l.jpg"], "r": ["r.jpg"]}) == {"l": {"l.jpg": "0000"}, "r": {"r.jpg": "0000"}}
+    assert frames_of_images({"l": ["l.jpg"], "r": ["r.jpg"]}) == {"l": {"l.jpg": "0000-l"}, "r": {"r.jpg": "0000-l"}}
