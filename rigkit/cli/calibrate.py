@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.calibrate_arguments import add_arguments as add_arguments
 from rigkit.cli.calibrate_arguments import calibrate_options, folder_options
+from rigkit.cli.console import require_existing
 from rigkit.core.errors import ExitCode, InputError, RigkitError
 
 if TYPE_CHECKING:
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 
 def run(args: argparse.Namespace) -> int:
+    if not any(mark in str(path) for path in args.source for mark in ("camera:", "%")):
+        require_existing(*args.source, remedy="give a folder of images, a video or a session's file")
     sessions = len(args.source) > 1 and all(path.suffix == ".toml" for path in args.source)
     return _many(args) if sessions else _one(args)
 

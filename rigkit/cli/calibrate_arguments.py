@@ -7,7 +7,7 @@ import math
 import os
 from pathlib import Path
 
-from rigkit.cli.console import add_options, file_path, options_of
+from rigkit.cli.console import add_options, options_of, page_path
 from rigkit.core.errors import InputError
 from rigkit.workflows.inputs.formats import FOREIGN_ENDINGS
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions, FolderOptions, Known
@@ -28,8 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-r",
         "--report",
         nargs="?",
-        type=file_path,
-        const="",
+        type=page_path,
+        const=Path(),
         metavar="FILE.html",
         help="write an HTML report (default name: that of the output)",
     )

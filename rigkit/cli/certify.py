@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import add_options, note_written, options_of, print_json, print_statement
+from rigkit.cli.console import add_options, note_written, options_of, print_json, print_statement, require_existing
 from rigkit.workflows.options.cameras import CertifyOptions
 
 
@@ -33,12 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--confidence", type=float, default=95.0, metavar="PERCENT", help="confidence level of the bound (default: 95)"
     )
-    add_options(parser, CertifyOptions, limit="X", sigma_px="PX", cameras="NAME", report="-r FILE.html", pdf="FILE.pdf")
-    add_options(parser, CertifyOptions, force="")
+    add_options(parser, CertifyOptions, limit="X", sigma_px="PX", cameras="--names NAME")
+    add_options(parser, CertifyOptions, report="-r [certificate.html]", pdf="FILE.pdf", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
+    require_existing(args.calibration)
     from rigkit.core.errors import ExitCode, InputError
     from rigkit.core.measurement_task import Quantity, Task
     from rigkit.report.pages.certificate_page import basis, causes_table

@@ -24,6 +24,7 @@ from rigkit.cli.console import (
     print_json,
     print_statement,
     progress_on_stderr,
+    require_existing,
 )
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.workflows.options.check import CheckOptions
@@ -42,12 +43,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_options(parser, CheckOptions, scene="", before="IMAGE|FOLDER...")
     parser.add_argument("--length", type=float, metavar="MM", help="also state the error of a length of MM")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance (with --length)")
-    add_options(parser, CheckOptions, fix="FILE.json", report="-r FILE.html", history="--register FILE.jsonl")
+    add_options(parser, CheckOptions, fix="FILE.json", report="-r [check.html]", history="--register FILE.jsonl")
     add_options(parser, CheckOptions, temperature_c="--temperature C", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
+    require_existing(args.calibration, *args.images)
     from rigkit.io.boards.board_words import board_files, board_of_words
     from rigkit.io.disk.writing import ensure_writable
     from rigkit.report.pages.check_page import check_table, check_to_dict

@@ -44,8 +44,9 @@ def add_options(parser: argparse._ActionsContainer, kind: type, /, **spelled: st
     """Add arguments for fields of a workflow's options, which `options_of` reads.
 
     Type, choices and default are those of the field, the help is its description in the docstring. `spelled` has the
-    flags (--name if there is no long one) and the placeholders of values: output="-o FILE", before="IMAGE...". With the
-    dots a list takes several values at once, without them the argument is repeated.
+    flags (--name if there is no long one) and the placeholders of values: output="-o FILE", before="IMAGE...",
+    report="-r [check.html]". With the dots a list takes several values at once, without them the argument is repeated;
+    in brackets stands the name of the page without a value.
     """
     defaults = {field.name: field.default for field in fields(kind)}
     types, words = get_type_hints(kind), attributes_of(kind)
@@ -72,6 +73,9 @@ def _argument_of(own: Any, default: Any, places: list[str]) -> dict[str, Any]:
     if own is bool:
         return {"action": argparse.BooleanOptionalAction if default is None else "store_true"}
     out: dict[str, Any] = {"default": default} if default is not MISSING else {"required": True}
+    if places and places[0].startswith("["):
+        name = places[0].strip("[]")
+        return out | {"metavar": name, "nargs": "?", "const": Path(name), "type": page_path}
     if places:
         out["metavar"] = tuple(places) if len(places) > 1 else places[0].removesuffix("...")
         own = file_path if own is Path and FILE.fullmatch(places[0]) else own
@@ -89,6 +93,25 @@ def file_path(text: str) -> Path:
     if text.endswith(("/", os.sep)):
         raise argparse.ArgumentTypeError(f"'{text}' names a folder; give a file in it")
     return Path(text)
+
+
+def page_path(text: str) -> Path:
+    """Return the path of a page; raises InputError for a folder of images that was written behind -r."""
+    path = file_path(text)
+    if path.is_dir():
+        raise InputError(f"cannot write the page to '{text}', a folder of that name exists; give -r last")
+    return path
+
+
+def require_existing(*paths: Path, remedy: str = "check the path") -> None:
+    """Raise InputError if there is nothing at a path; called before the work is imported, which takes a second."""
+    for path in paths:
+        try:
+            path.lstat()
+        except FileNotFoundError as error:
+            raise InputError(f"'{path}' does not exist; {remedy}") from error
+        except (OSError, ValueError):
+            pass  # its reader says what is wrong
 
 
 def options_of(kind: type[Options], args: argparse.Namespace, /, **others: Any) -> Options:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import add_options, note_written, options_of, print_json
+from rigkit.cli.console import add_options, note_written, options_of, print_json, require_existing
 from rigkit.core.errors import ExitCode
 from rigkit.workflows.options.cameras import DiffOptions
 
@@ -19,11 +19,12 @@ from rigkit.workflows.options.cameras import DiffOptions
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("a", type=Path, metavar="A.json", help="a calibration, a rig, or rigidly mounted boards")
     parser.add_argument("b", type=Path, metavar="B.json", help="the other one, of the same camera, rig or boards")
-    add_options(parser, DiffOptions, output="-o MAP.png", report="-r FILE.html", force="")
+    add_options(parser, DiffOptions, output="-o MAP.png", report="-r [diff.html]", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
+    require_existing(args.a, args.b)
     from rigkit.workflows.checks.diff import diff
     from rigkit.workflows.checks.diff_output import facts_of, figures_of, words_of, write_diff_page
 

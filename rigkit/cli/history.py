@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import file_path
+from rigkit.cli.console import page_path
 from rigkit.core.errors import ExitCode, printable
 
 
@@ -28,7 +28,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--to", type=Path, metavar="CALIBRATION.json", help="the calibration that --add is compared with"
     )
     parser.add_argument("--temperature", type=float, metavar="C", help="temperature during the capture for --add")
-    parser.add_argument("-r", "--report", type=file_path, metavar="FILE.html", help="write an HTML report")
+    parser.add_argument(
+        "-r",
+        "--report",
+        nargs="?",
+        const=Path("history.html"),
+        type=page_path,
+        metavar="history.html",
+        help="write an HTML report",
+    )
     parser.add_argument("--force", action="store_true", help="replace an existing page")
     parser.add_argument("--json", action="store_true", help="print the entries as JSON")
 

@@ -15,7 +15,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 from rigkit.cli.log import add_log_arguments, logged_run, logging_to
 from rigkit.cli.operating_system import SYSTEM_ERRORS, Terminated, flush_stderr, open_streams, say, signals_interrupt
@@ -82,7 +82,7 @@ class _Version(argparse.Action):
 
 
 class _VerbParser(argparse.ArgumentParser):
-    """Parser of a verb, which shows its own usage for unknown arguments, not that of the main parser."""
+    """Parser of a verb: one line for bad arguments, with the option that an unknown one is similar to."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         known, unknown = super().parse_known_args(args, namespace)
@@ -91,6 +91,10 @@ class _VerbParser(argparse.ArgumentParser):
             meant = next(filter(None, (_similar(one.partition("=")[0], options) for one in unknown)), "")
             self.error(f"unrecognized arguments: {' '.join(unknown)}{meant}")
         return known, unknown
+
+    def error(self, message: str) -> NoReturn:
+        say(f"{self.prog.partition(' ')[2]}: {message}; see {self.prog} --help")
+        self.exit(ExitCode.BAD_INPUT)
 
 
 def _similar(word: str, known: Iterable[str]) -> str:
@@ -116,9 +120,7 @@ def build_parser(verb: str | None) -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(
         dest="verb", metavar="VERB", prog="rigkit", required=True, parser_class=_VerbParser, help=argparse.SUPPRESS
     )
-    if verb not in VERBS:
-        for name in VERBS:
-            verbs.add_parser(name)
+    if verb is None:
         return parser
     sub = verbs.add_parser(verb)
     module = importlib.import_module(f"rigkit.cli.{verb}")
@@ -147,8 +149,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             # As a path it would be the current folder.
             if any(not one or (one.startswith("--") and one.endswith("=")) for one in arguments):
                 raise InputError("an argument is empty (''), perhaps an unset shell variable; give a value")
-            if verb is not None and (meant := _similar(verb, () if verb in VERBS else VERBS)):
-                raise InputError(f"no verb is called '{verb}'{meant}")
+            if verb is not None and verb not in VERBS:
+                raise InputError(f"no verb is called '{verb}'{_similar(verb, VERBS) or '; rigkit --help lists them'}")
             args = build_parser(verb).parse_args(arguments)
             with logging_to(verbose=args.verbose, log_file=args.log_file):
                 return logged_run(args)

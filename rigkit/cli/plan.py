@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigkit.cli.aim_arguments import add_board_argument, add_reach_arguments, length_of, reach_of
-from rigkit.cli.console import add_options, options_of, size_of_words
+from rigkit.cli.console import add_options, options_of, progress_on_stderr, require_existing, size_of_words
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.workflows.options.plan import TYPICAL_SIGMA_PX, LensOptions, PlanOptions
 
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--distance", type=float, metavar="MM", help="at this distance (default: the projection over the image)"
     )
     add_reach_arguments(parser)
-    add_options(parser, PlanOptions, report="-r FILE.html", force="")
+    add_options(parser, PlanOptions, report="-r [plan.html]", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     lens = parser.add_argument_group("before there is a calibration")
     lens.add_argument("--lens", type=float, metavar="DEG", help="field of view across the width of the image")
@@ -53,12 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    done = _planned(args)
     from rigkit.cli.console import note_written, print_json
     from rigkit.core.printing import counted
     from rigkit.report.pages.plan_page import plan_facts, plan_lead, plan_to_dict, plan_words
     from rigkit.report.tables import tables_to_text
 
-    done = _planned(args)
     plan = done.plan
     if args.json:
         print_json(plan_to_dict(plan) | {"page": plan_facts(plan, done.found).to_dict()})
@@ -74,11 +74,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _planned(args: argparse.Namespace) -> PlannedSession:
-    from rigkit.cli.console import progress_on_stderr
-    from rigkit.io.boards.board_words import board_files, board_of_words
-    from rigkit.io.disk.writing import ensure_writable
-    from rigkit.workflows.capture.plan import plan_lens, plan_session
-
     if (args.source is None) == (args.lens is None):
         raise InputError("plan: give a calibration or a session, or describe a lens with --lens, --size and --board")
     if args.check and (args.lens is not None or args.length is not None):
@@ -89,7 +84,14 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
             raise InputError(
                 f"plan: --{given[0].replace('_', '-')} needs --lens; '{args.source}' states it itself, leave it out"
             )
+        require_existing(args.source)
+        from rigkit.workflows.capture.plan import plan_session
+
         return plan_session(args.source, _options(args), progress=progress_on_stderr())
+    from rigkit.io.boards.board_words import board_files, board_of_words
+    from rigkit.io.disk.writing import ensure_writable
+    from rigkit.workflows.capture.plan import plan_lens
+
     if not (args.size and args.board):
         raise InputError("plan: --lens needs --size 1280x960 and --board 9x6x25")
     size_px = size_of_words(args.size)

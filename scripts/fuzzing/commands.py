@@ -8,7 +8,7 @@ COMMANDS: tuple[tuple[str, ...], ...] = (
     ("calibrate", "session.toml", "-o", "new.json", "--no-cache", "--json"),
     ("diff", "calibration.json", "calibration.json", "-o", "new.png", "--force", "--json"),
     ("certify", "calibration.json", "--length", "200", "--distance", "900", "--distance-sigma", "1", "--limit", "2"),
-    ("certify", "rig.json", "--angle", "200", "--distance", "900", "--confidence", "95", "--cameras", "left", "right"),
+    ("certify", "rig.json", "--angle", "200", "--distance", "900", "--confidence", "95", "--names", "left", "right"),
     ("rectify", "image.png", "--camera", "calibration.json", "-o", "new.png", "--hfov-deg", "70", "--size", "80x60"),
     ("rectify", "image.png", "--camera", "calibration.json", "-o", "new.png", "--projection", "cylindrical",
      "--yaw-deg", "10", "--pitch-deg", "5", "--roll-deg", "3"),

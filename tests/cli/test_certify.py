@@ -142,7 +142,7 @@ def test_json_has_the_certificate(quantity: str, rig: Path, capsys: pytest.Captu
         (["--length", "3", "--distance", "900", "--sigma-px", "0"], "--sigma-px 0.0: it must be positive"),
         (["--length", "3", "--distance", "900", "--limit", "nan"], "the limit must be positive"),
         (["--length", "3", "--distance", "900", "--confidence", "100"], "between 0 and 100 %, got 100 %"),
-        (["--length", "3", "--distance", "900", "--cameras", "left", "top"], "two different cameras of left, right"),
+        (["--length", "3", "--distance", "900", "--names", "left", "top"], "two different cameras of left, right"),
         (["--length", "3", "--distance", "900", "--report", "rig.json", "--force"], "rig.json"),
     ],
 )

@@ -270,10 +270,8 @@ def test_image_of_a_few_pixels_is_named(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_unknown_verb_and_no_verb(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["nonsense"])
-    assert stop.value.code == 2
-    assert "usage: rigkit" in capsys.readouterr().err
+    assert main(["nonsense"]) == 2
+    assert capsys.readouterr().err == "rigkit: no verb is called 'nonsense'; rigkit --help lists them\n"
     assert main([]) == 2
     assert "usage: rigkit" in capsys.readouterr().err
 
@@ -372,12 +370,12 @@ def test_invalid_arguments_of_a_verb_are_one_line(
     assert not list(tmp_path.glob("*.*"))
 
 
-def test_an_unknown_option_shows_the_usage_of_its_verb(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_arguments_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["diff", "a.json", "b.json", "--nonsense"])
     assert stop.value.code == 2
     printed = capsys.readouterr().err
-    assert printed.startswith("usage: rigkit diff") and "unrecognized arguments: --nonsense" in printed
+    assert printed == "rigkit: diff: unrecognized arguments: --nonsense; see rigkit diff --help\n"
 
 
 def test_words_that_are_nearly_right_are_proposed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -392,3 +390,12 @@ def test_a_camera_too_many_is_no_data_set(capsys: pytest.CaptureFixture[str]) ->
     assert main(["reconstruct", "--images", "a.png", "b.png", "--camera", "a.json", "b.json"]) == 2
     printed = capsys.readouterr().err
     assert "'b.json' is taken for a DATASET" in printed and "the second image's camera is --camera2" in printed
+
+
+def test_a_folder_behind_r_is_not_taken_for_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos").mkdir()
+    assert main(["calibrate", "-r", "photos", "--square-mm", "25"]) == 2
+    assert capsys.readouterr().err.endswith("give -r last\n")

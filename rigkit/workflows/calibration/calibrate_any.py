@@ -91,10 +91,10 @@ def calibrate_session_file(
         raise InputError("one camera has no extrinsics to solve for; `rigkit pose` gives its pose relative to a board")
     output = options.output or listed.result_path
     options = replace(options, output=output, report=_report_path(options, output))
-    if options.report is None and (page := output.with_suffix(".html")).is_file():
-        _log.warning(f"'{page}' is of an earlier calibration and stays as it is; -r --force replaces it")
     # Before the frames of videos are chosen, which takes minutes; the videos are inputs as well as these frames.
     ensure_writable((output, options.report), force=options.force, inputs=session_inputs(listed, options))
+    if options.report is None and (page := output.with_suffix(".html")).is_file():
+        _log.warning(f"'{page}' is of an earlier calibration and stays as it is; -r --force replaces it")
     session = with_frames(listed, progress)
     with about(options.corners) if options.corners else nullcontext():
         if isinstance(session, RigSession):

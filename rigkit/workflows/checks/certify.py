@@ -94,7 +94,7 @@ def load_instrument(
     """
     rig = is_rig_file(path)
     if cameras is not None and not rig:
-        raise InputError(f"'{path}': --cameras names two cameras of a rig, and this is not a rig's file")
+        raise InputError(f"'{path}': --names gives two cameras of a rig, and this is not a rig's file")
     known, _ = load_monitored(Path(path))
     if rig and len(known.names) < 2:
         raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
