@@ -156,6 +156,7 @@ class _Solution:
             with_rivals([*others, *outcome.candidates], [one.rival for one in close]),
             close,
         )
+        result = replace(result, disagreeing=tuple(image for image, _ in outcome.reasons))
         far = FarProjection.of(result, from_boards=True)
         require_determined(result, far.of_parameters_px)
         return result, far

@@ -254,6 +254,7 @@ class Calibration:
         deviations account for them (`widening`).
     views : the views used, in the order given.
     dropped : (image, reason) of everything not used: whole images, or parts of images with views.
+    disagreeing : images of `dropped` with too few corners that agree with the other views; not in files.
     outliers : corners of used views that were not used.
     candidates : models, degrees and board shapes tried.
     convergence : of the final solve.
@@ -281,6 +282,7 @@ class Calibration:
     freedom: float = float("inf")
     rivals: tuple[Rival, ...] = ()
     pupil: SolvedPupil | None = None
+    disagreeing: tuple[str, ...] = ()
 
     _repr_html_ = drawn
 

@@ -193,5 +193,5 @@ def describe_rig(rig: RigCalibration, checks: Sequence[Check]) -> str:
     lines += frames_left_out(rig.left_out)
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         lines += [f"{camera.name}: {line}" for line in left_out(alone)]
-        lines += [f"{camera.name} alone: {verdict}" for verdict in most_severe_first(alone.verdicts)]
+        lines += [f"'{camera.name}' by itself: {verdict}" for verdict in most_severe_first(alone.verdicts)]
     return "\n".join(lines)

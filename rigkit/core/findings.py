@@ -26,6 +26,7 @@ class Finding:
     image : the image concerned, if it is a single one.
     remedy : what to do, if anything.
     reason : why images are left out, as in `Calibration.dropped`, if that is what the finding says.
+    contradiction : how images contradict each other, so that the sigmas are invalid, if that is what the finding says.
 
     >>> str(Finding.look("5 images only", "take at least 8"))
     'look: 5 images only; take at least 8'
@@ -36,6 +37,7 @@ class Finding:
     image: str | None = None
     remedy: str | None = None
     reason: str | None = None
+    contradiction: str | None = None
 
     @classmethod
     def good(cls, message: str) -> Finding:
@@ -53,6 +55,12 @@ class Finding:
     @classmethod
     def bad(cls, message: str, remedy: str | None = None) -> Finding:
         return cls(severity=Severity.BAD, message=message, remedy=remedy)
+
+    @classmethod
+    def contradicting(cls, message: str, remedy: str) -> Finding:
+        """Return a finding BAD: images contradict each other."""
+        message = f"{message}; the stated uncertainties are invalid"
+        return cls(severity=Severity.BAD, message=message, remedy=remedy, contradiction=message)
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.text}"

@@ -392,10 +392,6 @@ def test_a_camera_too_many_is_no_data_set(capsys: pytest.CaptureFixture[str]) ->
     assert "'b.json' is taken for a DATASET" in printed and "the second image's camera is --camera2" in printed
 
 
-def test_a_folder_behind_r_is_not_taken_for_the_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "photos").mkdir()
-    assert main(["calibrate", "-r", "photos", "--square-mm", "25"]) == 2
+def test_a_folder_behind_r_is_not_taken_for_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", "-r", str(tmp_path), "--square-mm", "25"]) == 2
     assert capsys.readouterr().err.endswith("give -r last\n")

@@ -27,8 +27,6 @@ COMPARABLE = 1.5
 """A corner is an outlier only if it is one for every model whose scatter is within this factor of the smallest."""
 MIN_KEPT_SHARE = 0.5
 """A view with a smaller part of inliers is dropped."""
-DISAGREES_WITH_VIEWS = "agree with the other views; retake it"
-"""End of the reason for dropping such a view."""
 DEGREES_TRIED: dict[str, tuple[int | None, ...]] = {"scaramuzza": (4, 5, 6, 7, 8), "brown": (5,)}
 """Sizes tried of models that have several, if none is given,"""
 DEGREES_BEYOND: dict[str, tuple[int, ...]] = {"scaramuzza": (9, 10)}
@@ -118,7 +116,7 @@ def agreeing_views(
     total = observations.present.sum(axis=1)
     keep = enough_agree(kept, total)
     reasons = tuple(
-        (view.image, f"only {k} of {n} corners of board '{view.board.board_id}' {DISAGREES_WITH_VIEWS}")
+        (view.image, f"only {k} of {n} corners of board '{view.board.board_id}' agree with the other views; retake it")
         for view, k, n, ok in zip(observations.views, kept, total, keep, strict=True)
         if not ok
     )

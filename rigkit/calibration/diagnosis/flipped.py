@@ -18,7 +18,7 @@ import numpy as np
 
 from rigkit.calibration.assemble import with_solution
 from rigkit.calibration.choosing.board_orientation import with_boards_renumbered
-from rigkit.calibration.diagnosis.two_kinds import SIGMAS_DO_NOT_HOLD, ImageScores
+from rigkit.calibration.diagnosis.two_kinds import ImageScores
 from rigkit.calibration.diagnosis.view_evidence import ViewEvidence, columns_of
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
@@ -211,9 +211,8 @@ def _finding_of(back: _FlippedBack, before: float, evidence: ViewEvidence) -> Fi
             0 if apart > 2.0 * MAX_OFF_CENTRE * size else 1,
             f"cropped on opposite sides (principal points {apart:.0f} px apart)",
         )
-    return Finding.bad(
+    return Finding.contradicting(
         f"{len(flipped)} of {len(set(names))} images (such as '{flipped[0]}'), or all others, are "
-        f"{', or '.join(causes)}: undoing that removes {100.0 * (1.0 - left):.0f} % of the sum of squared residuals; "
-        f"{SIGMAS_DO_NOT_HOLD}",
+        f"{', or '.join(causes)}: undoing that removes {100.0 * (1.0 - left):.0f} % of the sum of squared residuals",
         "use the image files as the camera wrote them, and calibrate again",
     )

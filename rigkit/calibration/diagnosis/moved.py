@@ -29,7 +29,6 @@ from rigkit.calibration.diagnosis.two_kinds import (
     MIN_OF_A_KIND,
     MIN_PREDICTED,
     MIN_SHARE_OF_TWO,
-    SIGMAS_DO_NOT_HOLD,
     ImageScores,
     explained_by_focus,
     listed,
@@ -109,9 +108,10 @@ def moved_lens(observations: Observations, fit: Fit, *, tests: int = 1) -> tuple
     message = (
         f"the lens (or the board) changed at image '{images[first]}' ({apart.sigmas:.0f} standard deviations, p <= "
         f"{chance:.2g} for a split at any image): another camera, focus, zoom or mount, or images that a program "
-        f"changed; {SIGMAS_DO_NOT_HOLD}"
+        f"changed"
     )
-    return (Finding.bad(message, "calibrate the images before it and those from it on separately, or retake all"),)
+    remedy = "calibrate the images before it and those from it on separately, or retake all"
+    return (Finding.contradicting(message, remedy),)
 
 
 def two_groups(observations: Observations, fits: Sequence[Fit], *, one_model: bool) -> tuple[Finding, ...]:
@@ -166,14 +166,13 @@ def _groups_named(observations: Observations, second: BoolArray, apart: _Differe
     of_second = {name for name, at in zip(observations.images, observations.clusters(), strict=True) if second[at]}
     fewer, more = sorted(([n for n in images if (n in of_second) is side] for side in (True, False)), key=len)
     if min(np.count_nonzero(second), np.count_nonzero(~second)) < min_of_a_kind(len(second)):
-        return Finding.bad(
-            f"another camera seems to have taken {len(fewer)} of {len(images)} images: {listed(fewer)} "
-            f"({apart.words}); {SIGMAS_DO_NOT_HOLD}",
+        return Finding.contradicting(
+            f"another camera seems to have taken {len(fewer)} of {len(images)} images: {listed(fewer)} ({apart.words})",
             "look whether they are of this camera, at its zoom and focus, and sharp; else leave them out",
         )
-    return Finding.bad(
+    return Finding.contradicting(
         f"the images form two groups that need different lens parameters, as those of two cameras: {len(fewer)} "
-        f"({listed(fewer)}) and {len(more)} like '{more[0]}' ({apart.words}); {SIGMAS_DO_NOT_HOLD}",
+        f"({listed(fewer)}) and {len(more)} like '{more[0]}' ({apart.words})",
         KINDS_REMEDY,
     )
 

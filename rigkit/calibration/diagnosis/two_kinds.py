@@ -24,7 +24,6 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.core.findings import Finding, Severity
 
 MIN_OF_A_KIND, MIN_SHARE_OF_A_KIND = 3, 0.1
 """Smallest number, and part, of images of a kind; fewer are reported one by one."""
@@ -33,8 +32,6 @@ KINDS_REMEDY = (
     "undistorted; calibrate each group separately"
 )
 """Remedy for images of two kinds."""
-SIGMAS_DO_NOT_HOLD = "the stated uncertainties are invalid"
-"""Consequence for the result, in messages."""
 MAX_NAMES = 20
 """Maximal number of images that are listed by name."""
 SIDES_ROUNDS, STARTS = 8, 4
@@ -76,14 +73,6 @@ def min_of_a_kind(images: int) -> float:
 def listed(images: Sequence[str]) -> str:
     """Return the names of images, or of the first of them."""
     return ", ".join(f"'{name}'" for name in images[:MAX_NAMES]) + (", ..." if len(images) > MAX_NAMES else "")
-
-
-def contradicting_images(verdicts: Sequence[Finding]) -> Finding | None:
-    """Return the headline of a calibration whose images contradict each other, without its error; None for others."""
-    first = verdicts[0]
-    if first.severity is not Severity.BAD or SIGMAS_DO_NOT_HOLD not in first.message:
-        return None
-    return replace(first, message=first.message.partition(", but ")[2])
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -13,7 +13,6 @@ from typing import Protocol
 import numpy as np
 
 from rigkit.calibration.certainty.uncertainty import FarProjection
-from rigkit.calibration.choosing.models_tried import DISAGREES_WITH_VIEWS
 from rigkit.calibration.diagnosis.boards import diagnose_boards
 from rigkit.calibration.diagnosis.captured import (
     ASKED_DEG,
@@ -105,6 +104,7 @@ def diagnose(
     unlike, unclear = ([], []) if mixed else _views(calibration)
     pattern = [] if mixed else list(_pattern(calibration, in_force, bool(change)))
     effects = list(_uncertain(calibration, far))
+    another_kind = _too_many_for_accidents(calibration)
     # Images that contradict each other make the lens uncertain: where some were turned, they look stretched. A cause
     # found already explains a later other lens, too.
     contradicting, named = worst(effects) is Severity.BAD, bool(mixed) or worst(change) is Severity.BAD
@@ -112,7 +112,7 @@ def diagnose(
     causes = [
         *_not_converged(calibration, in_force),
         *mixed,
-        *_of_another_kind(calibration, order),
+        *_of_another_kind(calibration, another_kind, order),
         *change,
         *cropped_images(calibration),
         *([] if mixed else undistorted(calibration, sure=far.worst_px <= UNCERTAIN_PX)),
@@ -124,7 +124,7 @@ def diagnose(
         *extrapolated(calibration, extent, far),
         *(finding for finding in also if finding.severity is Severity.BAD and not named),
     ]
-    found = _about_images(calibration, also)
+    found = _about_images(calibration, also, another_kind)
     if not mixed:
         found += [
             *unclear,
@@ -136,10 +136,12 @@ def diagnose(
     return (*with_headline(calibration, causes, effects, extent.where), *modelled_pupil(calibration), *found)
 
 
-def _about_images(c: Calibration, also: Sequence[Finding]) -> list[Finding]:
-    """Return findings that are no causes, of images left out, repeated or missing, after those of `also`."""
+def _about_images(c: Calibration, also: Sequence[Finding], named: Collection[str]) -> list[Finding]:
+    """Return findings that are no causes, of images left out, but those `named` already, repeated or missing, after
+    those of `also`."""
     minor = [finding for finding in also if finding.severity is not Severity.BAD]
-    return [*minor, *_left_out(c.dropped, c.views), *few_repeated(c), *_coverage(c)]
+    others = [(image, reason) for image, reason in c.dropped if image not in named]
+    return [*minor, *_left_out(others, c.views), *few_repeated(c), *_coverage(c)]
 
 
 def _residuals(
@@ -197,17 +199,16 @@ def _not_converged(c: Calibration, in_force: Collection[str]) -> Iterator[Findin
     )
 
 
-def _contradicting(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[str]:
-    """Return the images dropped for lack of inliers, if there are too many to be accidents."""
-    used = {view.image for view in views}
-    out = list(dict.fromkeys(i for i, reason in dropped if reason.endswith(DISAGREES_WITH_VIEWS) and i not in used))
+def _too_many_for_accidents(c: Calibration) -> list[str]:
+    """Return the unused images that disagree with the others, if they are too many to be accidents."""
+    used = {view.image for view in c.views}
+    out = [image for image in dict.fromkeys(c.disagreeing) if image not in used]
     return out if len(out) >= min_of_a_kind(len(used) + len(out)) else []
 
 
-def _of_another_kind(c: Calibration, order: Sequence[str]) -> Iterator[Finding]:
-    """Yield a finding if many images contradict the others: one of the groups is of another lens, setting or board.
+def _of_another_kind(c: Calibration, images: Sequence[str], order: Sequence[str]) -> Iterator[Finding]:
+    """Yield a finding if many `images` contradict the others: one of the groups is of another lens, setting or board.
     `order` are the names of all images."""
-    images = _contradicting(c.dropped, c.views)
     if not images:
         return
     used = {view.image for view in c.views}
@@ -223,8 +224,6 @@ def _of_another_kind(c: Calibration, order: Sequence[str]) -> Iterator[Finding]:
 def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[Finding]:
     """Return findings on the images left out, or their number for each reason. Grids beside a board in a used image are
     not reported."""
-    contradicted = set(_contradicting(dropped, views))
-    dropped = [(image, reason) for image, reason in dropped if image not in contradicted]
     used = {view.image for view in views}
     parts = [(image, reason) for image, reason in dropped if image in used and reason != OTHER_GRIDS]
     found = [Finding.left_out(f"image '{image}' is partly left out", reason, image) for image, reason in parts]

@@ -20,7 +20,6 @@ from rigkit.calibration.choosing.candidate_fits import CandidateFits, camera_nam
 from rigkit.calibration.choosing.choice import MIN_IMAGES_OF_FIT
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.diagnosis.pupil import pupil_is_significant
-from rigkit.calibration.diagnosis.two_kinds import contradicting_images
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig
@@ -169,8 +168,8 @@ def _mistakes(rig: RigCalibration, views: RigViews, cost_sigmas: float) -> list[
     mounts, left_out = [camera.cam_from_rig for camera in rig.cameras], [key[:2] for key in rig.left_out]
     found = mixups_of_frames(views, mounts, left_out)
     for name, single in zip(views.names, views.single, strict=True):
-        own = contradicting_images(single.verdicts)
-        found += [] if own is None else [replace(own, message=f"camera '{name}': {own.message}")]
+        if (how := single.verdicts[0].contradiction) is not None:
+            found.append(replace(single.verdicts[0], message=f"camera '{name}': {how}", contradiction=None))
     if not found and (disagree or len(left_out) >= MIN_FRAMES_OF_PART):
         found += filter(None, [slipped_camera(views)])
     return found

@@ -48,6 +48,7 @@ _FINDING: Schema = {
                 "image?": described(TEXT, "which image it is about"),
                 "remedy?": described(TEXT, "what to do"),
                 "reason?": described(TEXT, "why images are left out, where the message says it"),
+                "contradiction?": described(TEXT, "how images contradict each other, where the message says it"),
             }
         ),
         described(TEXT, "the same in files of earlier versions"),

@@ -69,11 +69,12 @@ def read_json(path: str | Path, schema: str, keys: Collection[str], what: str, *
         raise InputError(f"'{path}': not a {what} ({error}); {remedy}") from error
     found = data.get("schema") if isinstance(data, dict) else None
     if found != schema:
-        has = f"schema is {str(found)[:60]!r}" if found is not None else "it states no schema"
+        kind = str(found).partition("/")[0]
         # Another file of rigkit is a mix-up: what made it would make it again.
-        known = str(found).startswith("rigkit.") and str(found).partition("/")[0] != schema.partition("/")[0]
-        instead = "give such a file" if known else remedy
-        raise InputError(f"'{path}': {has}, but a file with schema '{schema}' is needed here; {instead}")
+        if kind.startswith("rigkit.") and kind != schema.partition("/")[0]:
+            raise InputError(f"'{path}' is a {kind.removeprefix('rigkit.')[:60]} file; give a {what} instead")
+        has = f"schema is {str(found)[:60]!r}" if found is not None else "it states no schema"
+        raise InputError(f"'{path}': {has}, but a file with schema '{schema}' is needed here; {remedy}")
     unknown = sorted(set(data) - set(keys))
     if unknown:
         raise InputError(f"'{path}': unknown key {unknown[0][:60]!r}; known: {', '.join(sorted(keys))}")

@@ -19,6 +19,8 @@ from rigkit.validation.monitoring.verdict import ALARM_CHANCE
 
 DRIFT_HEIGHT, LEFT_MARGIN = 190.0, 56.0
 ZERO_HEIGHT = 0.5 * (DRIFT_HEIGHT - 24.0)
+LABEL_HEIGHT = 12.0
+"""Labels of limits nearer to zero would cover that of zero."""
 CONTROL_SIGMAS = 3.0
 """Control limits, which an amount exceeds in one of 370 checks of an unchanged camera if all sigmas hold. Verdicts have
 p-values of simulated checks, which also count few frames and what lens models leave out."""
@@ -138,10 +140,9 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
     for side, colour, dash in ((0.0, SOFT, ""), (1.0, WRONG, "5 4"), (-1.0, WRONG, "5 4")):
         height = np.repeat(ZERO_HEIGHT * (1.0 - side * limit / top), 2)
         steps = svg.line(np.stack([np.repeat(ends, 2)[1:-1], height], axis=-1))
-        out.append(
-            f'<path d="{steps}" fill="none" stroke="{colour}" stroke-dasharray="{dash}"/>'
-            f"{svg.label(LEFT_MARGIN - 5, height[0] + 4, f'{side * limit[0]:.2g}', 'end')}"
-        )
+        out.append(f'<path d="{steps}" fill="none" stroke="{colour}" stroke-dasharray="{dash}"/>')
+        if side == 0.0 or abs(height[0] - ZERO_HEIGHT) > LABEL_HEIGHT:
+            out.append(svg.label(LEFT_MARGIN - 5, height[0] + 4, f"{side * limit[0]:.2g}", "end"))
     y = ZERO_HEIGHT * (1.0 - value / top)
     out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{INK}" stroke-opacity="0.4"/>')
     of_one_day = own[0].date[:10] == own[-1].date[:10]

@@ -360,7 +360,7 @@ def rig_from(
     rig = _with_misread(rig, session, [view for framed in views.values() for _, view in framed], progress)
     single = [replace(c, dropped=(*dropped[n], *c.dropped)) for n, c in zip(session.cameras, rig.single, strict=True)]
     cameras = [
-        replace(c, calibration=replace(c.calibration, dropped=alone.dropped))
+        replace(c, calibration=replace(c.calibration, dropped=alone.dropped, disagreeing=alone.disagreeing))
         for c, alone in zip(rig.cameras, single, strict=True)
     ]
     return replace(rig, single=tuple(single), cameras=tuple(cameras))

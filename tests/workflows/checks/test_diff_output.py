@@ -49,7 +49,7 @@ def test_files_of_another_kind_are_named_as_what_they_are(tmp_path: Path) -> Non
     with pytest.raises(InputError, match=r"none\.json' does not exist"):
         diff(rig, tmp_path / "none.json")
     # Calibrating again would not make it a rig.
-    with pytest.raises(InputError, match="give such a file"):
+    with pytest.raises(InputError, match="is a calibration file; give a rig file instead"):
         load_saved_rig(camera)
     rig.write_text('{"schema": "rigkit.rig/0"}')
     with pytest.raises(InputError, match="calibrate again"):
