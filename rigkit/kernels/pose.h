@@ -89,7 +89,7 @@ INLINE level_t level_of(double noise)
     return (level_t){noise, 1.0 / noise, 1.0 / (noise * (noise - 1.0))};
 }
 
-/* marginal.marginal_quality of one residual. */
+/* local.marginal_quality of one residual. */
 INLINE double quality_of(double r, level_t level)
 {
     const double rho = fabs(r) * (1.0 / QUANTILE);
@@ -97,7 +97,7 @@ INLINE double quality_of(double r, level_t level)
     return rho <= 1.0 ? 1.0 - rho * rho * level.near : rest * rest * level.far;
 }
 
-/* marginal.marginal_weights of one residual. */
+/* local.marginal_weights of one residual. */
 INLINE double weight_of(double r, level_t level)
 {
     double low = fabs(r) * (1.0 / QUANTILE);

@@ -138,7 +138,7 @@ INLINE void smallest_singular_vector(double *m, double *x, int size)
     memcpy(x, v + size * extreme(m, size, size, -1.0), sizeof(double) * (size_t)size);
 }
 
-/* Replace E by the nearest essential matrix of unit norm (eight_point.essential_nearest). */
+/* Replace E by the nearest essential matrix of unit norm (pose.essential_nearest). */
 INLINE void make_essential(double *E)
 {
     double m[9], v[9];
