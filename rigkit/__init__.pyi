@@ -104,6 +104,9 @@ from rigkit.workflows.inputs.camera_files import import_camera as import_camera
 from rigkit.workflows.inputs.camera_files import import_rig as import_rig
 from rigkit.workflows.inputs.identify_board import IdentifiedBoard as IdentifiedBoard
 from rigkit.workflows.inputs.identify_board import identify_board as identify_board
+from rigkit.workflows.options.boards import CheckOptions as CheckOptions
+from rigkit.workflows.options.boards import LensOptions as LensOptions
+from rigkit.workflows.options.boards import PlanOptions as PlanOptions
 from rigkit.workflows.options.cameras import Cache as Cache
 from rigkit.workflows.options.cameras import CalibrateOptions as CalibrateOptions
 from rigkit.workflows.options.cameras import CertifyOptions as CertifyOptions
@@ -116,7 +119,6 @@ from rigkit.workflows.options.cameras import HandEyeOptions as HandEyeOptions
 from rigkit.workflows.options.cameras import PrintOptions as PrintOptions
 from rigkit.workflows.options.cameras import RectifyOptions as RectifyOptions
 from rigkit.workflows.options.cameras import StudyOptions as StudyOptions
-from rigkit.workflows.options.check import CheckOptions as CheckOptions
 from rigkit.workflows.options.clouds import DatasetOptions as DatasetOptions
 from rigkit.workflows.options.clouds import ExportCloudOptions as ExportCloudOptions
 from rigkit.workflows.options.clouds import MeshOptions as MeshOptions
@@ -126,8 +128,6 @@ from rigkit.workflows.options.clouds import RigSceneOptions as RigSceneOptions
 from rigkit.workflows.options.clouds import SceneOptions as SceneOptions
 from rigkit.workflows.options.clouds import ValidateOptions as ValidateOptions
 from rigkit.workflows.options.coach import CoachOptions as CoachOptions
-from rigkit.workflows.options.plan import LensOptions as LensOptions
-from rigkit.workflows.options.plan import PlanOptions as PlanOptions
 from rigkit.workflows.outputs.export_camera import ExportedCamera as ExportedCamera
 from rigkit.workflows.outputs.export_camera import ExportedRig as ExportedRig
 from rigkit.workflows.outputs.export_camera import export_camera as export_camera

@@ -27,7 +27,7 @@ from rigkit.cli.console import (
     require_existing,
 )
 from rigkit.core.errors import ExitCode, InputError
-from rigkit.workflows.options.check import CheckOptions
+from rigkit.workflows.options.boards import CheckOptions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from rigkit.cli.aim_arguments import add_board_argument, add_reach_arguments, length_of, reach_of
 from rigkit.cli.console import add_options, options_of, progress_on_stderr, require_existing, size_of_words
 from rigkit.core.errors import ExitCode, InputError
-from rigkit.workflows.options.plan import TYPICAL_SIGMA_PX, LensOptions, PlanOptions
+from rigkit.workflows.options.boards import TYPICAL_SIGMA_PX, LensOptions, PlanOptions
 
 if TYPE_CHECKING:
     from rigkit.workflows.capture.plan import PlannedSession

@@ -38,7 +38,7 @@ from rigkit.validation.monitoring.hypotheses import hypotheses_of
 from rigkit.validation.monitoring.power import Power
 from rigkit.validation.monitoring.verdict import CalibrationCheck, Change
 from rigkit.workflows.checks.check import OWN_IMAGE, _replaced_by_known, _require_right_order, check_pictures
-from rigkit.workflows.options.check import CheckOptions
+from rigkit.workflows.options.boards import CheckOptions
 from rigkit.workflows.outputs.provenance import SHORT_HASH
 
 BOARD = Board("board", 9, 6, 25.0, 25.0)

@@ -32,8 +32,8 @@ from rigkit.workflows.calibration.calibrate import calibrate_session, session_in
 from rigkit.workflows.calibration.next_pictures import NEXT_VIEWS, goal_of, next_frames, next_views
 from rigkit.workflows.checks.check import load_monitored
 from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad, warn_of_pupil
+from rigkit.workflows.options.boards import LensOptions, PlanOptions
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions
-from rigkit.workflows.options.plan import LensOptions, PlanOptions
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
 
 LENS_VIEWS = 12

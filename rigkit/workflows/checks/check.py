@@ -52,7 +52,7 @@ from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.camera_files import require_covariance, warn_if_bad
 from rigkit.workflows.inputs.identify_board import why_not_detected
 from rigkit.workflows.moments import ImagesByMoment, moments_of
-from rigkit.workflows.options.check import CheckOptions
+from rigkit.workflows.options.boards import CheckOptions
 from rigkit.workflows.outputs.provenance import (
     digest_line,
     digest_of,
