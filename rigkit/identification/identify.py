@@ -152,19 +152,22 @@ def _preference(
     """
 
     def key(assignment: Assignment) -> tuple[float, ...]:
-        roll, found = _roll_rad(assignment), [view.detections for view in views]
-        shared = sum(_shared(s, found[0][s.first], found[1][s.second]) for s in assignment.matches)
-        against = sum(s.against_colour for s in assignment.matches)
+        roll = _roll_rad(assignment)
+        shared = sum(_shared(match, views) for match in assignment.matches)
+        against = sum(match.against_colour for match in assignment.matches)
         quarter_turns = round((roll - least_rad) / (0.5 * np.pi))
         return -len(assignment.matches), against, quarter_turns, -shared, roll
 
     return key
 
 
-def _shared(match: BoardMatch, first: BoardDetection, second: BoardDetection) -> int:
-    """Return how many corners of a board both detections show."""
-    on_board = match.placement1.grid_of(first), match.placement2.grid_of(second)
-    return len(set(map(tuple, on_board[0].tolist())) & set(map(tuple, on_board[1].tolist())))
+def _shared(match: BoardMatch, views: tuple[ImageObservations, ImageObservations]) -> int:
+    """Return how many corners of a board both its detections show."""
+    first, second = (
+        placement.grid_of(view.detections[index])
+        for placement, view, index in zip(match.placement, views, match.index, strict=True)
+    )
+    return len(set(map(tuple, first.tolist())) & set(map(tuple, second.tolist())))
 
 
 def _roll_rad(assignment: Assignment) -> float:
