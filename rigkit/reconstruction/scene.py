@@ -23,7 +23,7 @@ from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
-from rigkit.core.printing import brief
+from rigkit.core.printing import brief, drawn
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at, oriented_cloud
@@ -70,7 +70,7 @@ class SceneReconstruction:
     sigma_px: float
     sigma_A: float
 
-    __repr__ = brief
+    __repr__, _repr_html_ = brief, drawn
 
     @property
     def unit(self) -> str:

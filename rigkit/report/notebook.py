@@ -18,6 +18,7 @@ from rigkit.core.printing import counted
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rotation import exp_so3
 from rigkit.reconstruction.reconstruct import Reconstruction
+from rigkit.reconstruction.scene import SceneReconstruction
 from rigkit.report import svg
 from rigkit.report.pictures.scene_view import boards_scene, rig_scene, scene_of
 from rigkit.report.rig_tables import rig_reach
@@ -33,7 +34,7 @@ VIEWED_FROM = exp_so3(np.array([0.45, 0.0, 0.0])) @ exp_so3(np.array([0.0, 0.45,
 REDRAW_AFTER_S = 0.1
 
 
-def html_of(result: Calibration | RigCalibration | Reconstruction) -> str:
+def html_of(result: Calibration | RigCalibration | Reconstruction | SceneReconstruction) -> str:
     """Return a result as HTML for a notebook: summary, verdicts, and a drawing of its 3D scene."""
     if isinstance(result, Calibration):
         scene = boards_scene(result.views, result.boards)
@@ -42,10 +43,15 @@ def html_of(result: Calibration | RigCalibration | Reconstruction) -> str:
         return _result_html(
             f"{result!r}\n  {rig_reach(result, ())}", most_severe_first(result.verdicts)[:2], rig_scene(result)
         )
+    metric = True
+    if isinstance(result, SceneReconstruction):
+        result, metric = result.reconstruction, result.metric
+    boards = f"{counted(len(result.boards), 'board')}, " if result.boards else ""
     baseline = measured_words(result.baseline_mm, result.baseline_sigma_mm, 2)
+    lengths = f"baseline {baseline} mm" if metric else "lengths in baselines"
     words = (
         f"Reconstruction of '{result.pair_id}', {result.pose_type}, {result.affine_method}: {len(result.cloud)} "
-        f"points, {counted(len(result.boards), 'board')}, baseline {baseline} mm, Sampson rms "
+        f"points, {boards}{lengths}, Sampson rms "
         f"{result.sampson_rms_px:.3f} px"
     )
     return _result_html(words, (), scene_of(result))

@@ -21,3 +21,8 @@ def test_a_path_may_be_given_as_text(kind: Any) -> None:
     options = kind(**needed | paths)
     assert all(getattr(options, name) == Path("folder/file") for name in paths)
     assert kind(**needed | {name: Path("folder/file") for name in paths}) == options
+
+
+def test_paths_in_lists_may_be_words() -> None:
+    options = rigkit.SceneOptions(images=["a.png", Path("b.png")])  # type: ignore[arg-type]
+    assert options.images == (Path("a.png"), Path("b.png")) and options.name == "a"

@@ -98,6 +98,8 @@ def test_without_a_baseline_it_is_the_unit(rng):
     metric = reconstruct_scene(found, REGULAR, REGULAR, baseline_mm=300.0)
     assert not unit.metric
     assert any("baselines" in words for words in unit.reconstruction.notes)
+    # In a notebook, and without a warning of the means of no boards.
+    assert "points, lengths in baselines, " in unit._repr_html_() and " mm, Sampson" in metric._repr_html_()
     assert np.linalg.norm(unit.reconstruction.cam2_from_cam1.translation_mm) == pytest.approx(1.0)
     one, many = unit.reconstruction.cloud, metric.reconstruction.cloud
     np.testing.assert_allclose(300.0 * one.points_mm, many.points_mm, rtol=1e-9)

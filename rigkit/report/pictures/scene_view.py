@@ -38,7 +38,7 @@ def scene_of(reconstruction: Reconstruction) -> dict[str, Any]:
         "points": _rounded(cloud.points_mm, 2),
         "normals": _rounded(cloud.normals, 4),
         "board": [int(b) for b in cloud.board_index],
-        "square_mm": float(np.mean([b.square_x_mm for b in reconstruction.boards])),
+        "square_mm": float(np.mean([b.square_x_mm for b in reconstruction.boards] or [1.0])),
     }
 
 

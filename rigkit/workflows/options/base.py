@@ -5,20 +5,21 @@ from pathlib import Path
 
 
 class NamesFiles:
-    """Base of option dataclasses: strings become paths in fields of type Path, and a single value need not be in a
-    tuple."""
+    """Base of option dataclasses: strings become paths in fields of type Path, lists become tuples, and a single value
+    need not be in one."""
 
     __slots__ = ()
 
     def __post_init__(self) -> None:
         for field in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
-            if isinstance(value, str) and field.type in (Path, Path | None, "Path", "Path | None"):
-                object.__setattr__(self, field.name, Path(value))
-            elif isinstance(value, str | Path) and field.type in (tuple[Path, ...], "tuple[Path, ...]"):
-                object.__setattr__(self, field.name, (Path(value),))
-            elif isinstance(value, str) and field.type in (tuple[str, ...], "tuple[str, ...]"):
-                object.__setattr__(self, field.name, (value,))
+            value, kind = getattr(self, field.name), str(field.type)
+            if isinstance(value, str | Path) and "..." in kind:
+                value = (value,)
+            if isinstance(value, list | tuple):
+                value = tuple(Path(one) if isinstance(one, str) and "Path" in kind else one for one in value)
+            elif isinstance(value, str) and "Path" in kind:
+                value = Path(value)
+            object.__setattr__(self, field.name, value)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

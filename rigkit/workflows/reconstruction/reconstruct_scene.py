@@ -75,6 +75,9 @@ class SceneResult:
 
     __repr__ = brief
 
+    def _repr_html_(self) -> str:
+        return self.scene._repr_html_()
+
     def figures(self) -> dict[str, Any]:
         """Return the results of the scene as JSON values."""
         r = self.scene.reconstruction
