@@ -335,7 +335,8 @@ def test_known_cameras_are_written_to_the_session(
         for name, pose in (("left", Rigid3.identity()), ("top", RIGHT_FROM_LEFT))
     ]
     known.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": cameras}))
-    wanted = session_of_folders([pictures], ["9x6x30"], tmp_path / "session.toml", known=Known(rig=known))
+    options = CalibrateOptions(known=Known(rig=known))
+    wanted = session_of_folders([pictures], ["9x6x30"], tmp_path / "session.toml", options=options)
     for path, text in wanted.items():
         path.write_text(text)
     session = load_rig_session(tmp_path / "session.toml")

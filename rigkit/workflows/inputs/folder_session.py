@@ -30,7 +30,7 @@ from rigkit.io.media.images import (
 from rigkit.io.media.video import is_video
 from rigkit.workflows.inputs.identify_board import Suggestion, suggestion
 from rigkit.workflows.inputs.layouts import CameraLayout, layouts_of
-from rigkit.workflows.options.cameras import Known
+from rigkit.workflows.options.cameras import CalibrateOptions, Known
 
 _log = logging.getLogger(__name__)
 
@@ -61,8 +61,7 @@ def session_of_folders(
     path: Path,
     *,
     model: str = "auto",
-    output: Path | None = None,
-    known: Known | None = None,
+    options: CalibrateOptions | None = None,
     cameras: ImagesByCamera | None = None,
     by_order: bool = False,
     progress: Progress = silent,
@@ -77,21 +76,20 @@ def session_of_folders(
     boards : board files, or words such as 9x6x25: see `rigkit.io.boards.board_words`.
     path : session file; the paths in it are relative to its folder.
     model : camera model of all cameras.
-    output : file of the calibration; None: named after the session.
-    known : known lenses and rig, of several cameras.
+    options : their file of the calibration (None: named after the session), known lenses and rig are used.
     cameras : the images of each camera; by default those of `cameras_in`.
     by_order : images are of one moment by their order, not by their names.
     progress : of the search for the board that images show, to say what is missing.
     """
     if not boards:
         raise InputError(_missing_board_message(folders, progress))
-    cameras = cameras or cameras_in(folders)
+    cameras, options = cameras or cameras_in(folders), options or CalibrateOptions()
     for folder in dict.fromkeys(folder for own in cameras.values() for folder, _ in own):
         warn_of_unread_formats(folder)
     place = path.parent
     files: dict[Path, str] = {}
     names = [_board_file(words, place, files) for words in boards]
-    named = "" if output is None else f" -o {output.name}"
+    named = "" if options.output is None else f" -o {options.output.name}"
     shown = " ".join(["rigkit calibrate", *map(str, folders), *(f"--board {words}" for words in boards)])
     lines = [
         "# " + " ".join(f"Written by {shown}".split()),
@@ -109,7 +107,7 @@ def session_of_folders(
     if len(cameras) == 1:
         lines.append(f"images = {_patterns_toml(cameras[''], place)}")
     else:
-        lines += _cameras_in_words(cameras, place, known or Known(), by_order=by_order)
+        lines += _cameras_in_words(cameras, place, options.known, by_order=by_order)
     return files | {path: "\n".join(lines).rstrip() + "\n"}
 
 
