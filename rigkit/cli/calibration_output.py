@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from rigkit.core.findings import most_severe_first
+from rigkit.core.findings import Severity, most_severe_first
 from rigkit.core.printing import counted, length_words
 
 if TYPE_CHECKING:
@@ -193,5 +193,10 @@ def describe_rig(rig: RigCalibration, checks: Sequence[Check]) -> str:
     lines += frames_left_out(rig.left_out)
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         lines += [f"{camera.name}: {line}" for line in left_out(alone)]
-        lines += [f"'{camera.name}' by itself: {verdict}" for verdict in most_severe_first(alone.verdicts)]
+        found = most_severe_first(alone.verdicts)
+        # The rig is what counts: of each camera the headline, and what must not be trusted.
+        said = [finding for k, finding in enumerate(found) if k == 0 or finding.severity is Severity.BAD]
+        lines += [f"'{camera.name}' by itself: {finding}" for finding in said]
+        if more := len(found) - len(said):
+            lines.append(f"'{camera.name}' by itself: {counted(more, 'more finding')} on the page (-r) and in --json")
     return "\n".join(lines)

@@ -220,7 +220,7 @@ def described(options: list[FittedModel], chosen: FittedModel, *, rivals: bool =
         elif o is chosen:
             reason = "fewest parameters among those with the lowest held-out error, within its uncertainty"
         else:
-            reason = f"held-out error {100.0 * (o.heldout_px / chosen.heldout_px - 1.0):+.1f} % vs the chosen one"
+            reason = f"held-out error {o.heldout_px / chosen.heldout_px:.3f} times that of the chosen one"
             if o.heldout_px < chosen.heldout_px:
                 more = o.count - chosen.count
                 reason += f", not significant for {'one more parameter' if more == 1 else f'{more} more parameters'}"

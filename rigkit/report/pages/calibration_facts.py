@@ -161,7 +161,8 @@ def _candidates(c: Calibration) -> Table:
     )
     none = cells("only what was requested", None, None, None, "", "")
     heads = columns("tried | parameters .0 | held-out RMS [px] .4 | training RMS [px] .4 | chosen | why")
-    return Table("candidates", "Models and board shapes tried", heads, rows or (none,))
+    note = "Models are compared with boards taken as flat, then board shapes with the chosen model."
+    return Table("candidates", "Models and board shapes tried", heads, rows or (none,), note if rows else "")
 
 
 def _boards(c: Calibration) -> Table:
