@@ -43,9 +43,8 @@ def html_of(result: Calibration | RigCalibration | Reconstruction | SceneReconst
         return _result_html(
             f"{result!r}\n  {rig_reach(result, ())}", most_severe_first(result.verdicts)[:2], rig_scene(result)
         )
-    metric = True
-    if isinstance(result, SceneReconstruction):
-        result, metric = result.reconstruction, result.metric
+    metric = not isinstance(result, SceneReconstruction) or result.metric
+    result = result.reconstruction if isinstance(result, SceneReconstruction) else result
     boards = f"{counted(len(result.boards), 'board')}, " if result.boards else ""
     baseline = measured_words(result.baseline_mm, result.baseline_sigma_mm, 2)
     lengths = f"baseline {baseline} mm" if metric else "lengths in baselines"
