@@ -49,7 +49,7 @@ def test_a_rejected_grid_is_reported_with_its_image(tmp_path: Path, monkeypatch:
         detect_in_images([tmp_path / "a.png"])
 
 
-@pytest.mark.parametrize("name", ["noise", "text", "texture"])
+@pytest.mark.parametrize("name", ["noise", "text", "texture", "panels", "windows"])
 def test_pictures_without_a_grid_have_no_finding(name: str) -> None:
     assert doubtful_grid(blank(name, np.random.default_rng(0))) is None
 
@@ -104,3 +104,14 @@ def test_a_row_that_motion_hides_is_found_on_its_side(name: str) -> None:
     assert len(found.grid) >= 50
     off = found.pixels - sharp.lattice()[found.grid[:, 1], found.grid[:, 0]]
     assert np.abs(off).max() < SMEARED_PX
+
+
+def test_a_grid_of_separate_squares_is_named(rng: np.random.Generator) -> None:
+    page = np.full((700, 1000), 245.0, np.float32)
+    for row in range(5):
+        for column in range(7):
+            page[60 + 120 * row : 120 + 120 * row, 100 + 120 * column : 160 + 120 * column] = 20.0
+    aslant = np.array([[0.6, 0.05, 10.0], [-0.02, 0.55, 60.0], [1e-4, -1e-4, 1.0]])
+    image = cv2.GaussianBlur(cv2.warpPerspective(page, aslant, (640, 480), borderValue=120.0), (0, 0), 0.7)
+    words = doubtful_grid(np.clip(image + rng.normal(0.0, 2.0, image.shape), 0.0, 255.0).astype(np.uint8))
+    assert words is not None and words.startswith("a grid of 7 x 5 separate squares is seen")
