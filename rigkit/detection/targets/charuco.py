@@ -30,7 +30,7 @@ from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_model import NEAR_PX, TAIL_SIGMAS
 from rigkit.detection.subpixel.refined import RefinedLattice
-from rigkit.detection.subpixel.scatter import scatter_factors, small_scatter
+from rigkit.detection.subpixel.scatter import scatter_factor
 from rigkit.detection.subpixel.subpixel import refine
 from rigkit.detection.subpixel.uncertain_corners import sigmas_beside_edges
 from rigkit.detection.subpixel.whole_board import placed_together
@@ -291,9 +291,7 @@ def _with_scatter(refined: RefinedLattice, drawn: float = 0.0) -> RefinedLattice
     `drawn` : relative shift by the markers around them (`_drawn_by_markers`), which their sigmas do not include yet.
     """
     alone = refined.sigma_px / refined.scatter / (1.0 + drawn)
-    every = (slice(0, alone.shape[0]), slice(0, alone.shape[1]))
-    scatter = float(scatter_factors(refined.lattice.pixels, alone, [every])[0])
-    scatter *= small_scatter(refined.lattice.pixels, scatter * alone)
+    scatter = scatter_factor(refined.lattice.pixels, alone)
     return replace(refined, sigma_px=scatter * alone, scatter=scatter)
 
 

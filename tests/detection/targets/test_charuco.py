@@ -86,9 +86,8 @@ def test_every_corner_has_its_own_number_and_is_finer_than_opencvs(lens: str) ->
 
 def test_sigmas_of_a_crumpled_print_include_the_scatter_of_its_corners() -> None:
     """Of large squares, so that markers lie outside of the windows; few rows, and more."""
-    errors = []
+    errors, rng = [], np.random.default_rng(0)
     for columns, rows in ((6, 5), (7, 6)):
-        rng = np.random.default_rng(0)
         scene = one_board(rng, board=replace(BOARD, columns=columns, rows=rows), max_tilt_deg=20.0)
         image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
         places = np.indices(image.shape)[::-1].astype(np.float32)
