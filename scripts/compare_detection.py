@@ -57,6 +57,8 @@ DEGRADATIONS = (
     *(("size", factor) for factor in (0.5, 1.0 / 3.0, 0.25)),
     *(("glare", levels) for levels in (200.0, 400.0)),
     *(("run over", px) for px in (1.0, 2.0, 3.0, -1.0, -2.0, -3.0)),
+    ("repeated", 1.5),
+    *(("hot columns", count) for count in (3.0, 20.0)),
     ("vignetting", 0.1),
     ("faint", 0.15),
     ("webcam", 6.0),

@@ -113,6 +113,13 @@ def covered(values: Values, most: float, rng: np.random.Generator) -> Values:
     return out
 
 
+def hot(values: Values, columns: float, rng: np.random.Generator) -> Values:
+    """Return the image of a sensor with so many columns that are always white."""
+    out = values.copy()
+    out[:, rng.choice(values.shape[1], int(columns), replace=False)] = 255.0
+    return out
+
+
 def inverted(values: Values, _: float, rng: np.random.Generator) -> Values:
     return np.float32(255.0) - values
 
@@ -146,6 +153,7 @@ LIGHT: dict[str, Callable[[Values, float, np.random.Generator], Values]] = {
     "salt": salted,
     "vignetting": vignetted,
     "covered": covered,
+    "hot columns": hot,
     "inverted": inverted,
     "run over": run_over,
 }
@@ -162,6 +170,12 @@ def resized(grey: Grey, factor: float) -> Degraded:
     out = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=how)
     # OpenCV scales by what it is told, whatever whole number of pixels comes out.
     return np.asarray(out), factor * SAME + np.array([[0.0, 0.0, 1.0]]) * (0.5 * factor - 0.5)
+
+
+def repeated(grey: Grey, factor: float) -> Degraded:
+    """Return the image enlarged by repeating lines, some more often than others."""
+    rows, columns = (((np.arange(int(side * factor)) + 0.5) / factor).astype(int) for side in grey.shape)
+    return np.ascontiguousarray(grey[rows][:, columns]), factor * SAME + np.array([[0, 0, 1]]) * (0.5 * factor - 0.5)
 
 
 def turned(grey: Grey, degrees: float) -> Degraded:
@@ -196,6 +210,7 @@ def deep(grey: Grey, bits: float) -> Degraded:
 FRAME: dict[str, Callable[[Grey, float, np.random.Generator], Degraded]] = {
     "jpeg": lambda grey, quality, _: compressed(grey, quality),
     "size": lambda grey, factor, _: resized(grey, factor),
+    "repeated": lambda grey, factor, _: repeated(grey, factor),
     "turned": lambda grey, degrees, _: turned(grey, degrees),
     "mirrored": lambda grey, _, __: mirrored(grey),
     "cut": cut,
