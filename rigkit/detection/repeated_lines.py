@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardDetection
 
-SAMPLED, STRETCH = 4, 128
-"""Number of places in each line, and number of lines in the middle of the image, by which repetition is detected before
-whole lines are compared."""
+SAMPLED, STRETCH, MORE_SAMPLED = 4, 128, 64
+"""Number of places in each line, and number of lines in the middle of the image, by which repetition is detected, and
+number of places that are compared before whole lines are: in large blurred images few places are often equal."""
 
 MIN_LINES = 32
 """Smallest number of lines that are left, and of copies: fewer may be equal by chance, as in a print of few modules."""
@@ -74,8 +74,11 @@ def _kept_rows(image: NDArray[np.generic]) -> _Lines | None:
     if not _as_before(sampled[max(0, (height - STRETCH) // 2) :][:STRETCH]).any():
         return None
     same = _as_before(sampled)
-    near = np.flatnonzero(same)
-    same[near] = (image[near + 1] == image[near]).reshape(len(near), -1).all(axis=1)
+    for places in (MORE_SAMPLED, width):
+        near, step = np.flatnonzero(same), max(1, width // places)
+        if len(near) < MIN_LINES:
+            return None
+        same[near] = (image[near + 1, ::step] == image[near, ::step]).reshape(len(near), -1).all(axis=1)
     # The first and the last run may be margins of one colour, and are kept as they are.
     starts = np.flatnonzero(~same) + 1
     lines = len(starts) - 1
