@@ -310,6 +310,33 @@ static int square_of(
     return isfinite(sum);
 }
 
+/* Add the brightness at `steps` + 1 places to `sums`, from (u - across_u, v - across_v) to (u + across_u, v + across_v). */
+INLINE void add_profile(
+    const image_t image, double u, double v, double across_u, double across_v, int64_t steps, double *restrict sums)
+{
+    const double each = 2.0 / (double)steps, reach_u = fabs(across_u), reach_v = fabs(across_v);
+    /* Within the image nothing needs to be clipped, and the loop is vectorised. */
+    if (u - reach_u > 0.0 && v - reach_v > 0.0 && u + reach_u < (double)(image.width - 2)
+        && v + reach_v < (double)(image.height - 2)) {
+        const int32_t width = (int32_t)image.width;
+        const float *restrict pixels = image.brightness;
+        for (int64_t s = 0; s <= steps; s++) {
+            const double step = each * (double)s - 1.0;
+            const float at_u = (float)(u + step * across_u), at_v = (float)(v + step * across_v);
+            const int32_t left = (int32_t)at_u, top = (int32_t)at_v, at = top * width + left;
+            const float right = at_u - (float)left, below = at_v - (float)top;
+            const float upper = pixels[at] + right * (pixels[at + 1] - pixels[at]);
+            const float lower = pixels[at + width] + right * (pixels[at + width + 1] - pixels[at + width]);
+            sums[s] += (double)(upper + below * (lower - upper));
+        }
+        return;
+    }
+    for (int64_t s = 0; s <= steps; s++) {
+        const double step = each * (double)s - 1.0;
+        sums[s] += (double)brightness_at(image, (float)(u + step * across_u), (float)(v + step * across_v));
+    }
+}
+
 /* Set `out` to the offsets of the edges of a lattice to the dark side of the line of their corners, at `parts` places `along` it,
  * each within its own `reach` (reference.lattice.shifts_of_edges). `sign` is that of the first corner; `sums` has room for parts x (steps + 1). */
 FOR_EACH_PROCESSOR
@@ -337,11 +364,7 @@ void edge_shifts(
                 for (int64_t k = 0; k < parts; k++) {
                     const double u = start[0] + along[k] * (end[0] - start[0]);
                     const double v = start[1] + along[k] * (end[1] - start[1]);
-                    for (int64_t s = 0; s <= steps; s++) {
-                        const double step = reach[k] * (2.0 * (double)s / (double)steps - 1.0);
-                        const float seen = brightness_at(image, (float)(u + step * across_u), (float)(v + step * across_v));
-                        sums[k * (steps + 1) + s] += (double)seen;
-                    }
+                    add_profile(image, u, v, reach[k] * across_u, reach[k] * across_v, steps, sums + k * (steps + 1));
                 }
             }
     for (int64_t k = 0; k < parts; k++) {

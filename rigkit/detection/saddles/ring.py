@@ -84,5 +84,9 @@ def ring_rules(max_odd: float = MAX_ODD, max_centre: float = MAX_CENTRE) -> Ring
 
 
 def line_vectors(angles: FloatArray) -> FloatArray:
-    """Return the unit vectors of the lines A and B (N, 2, 2); the other two arms of a corner are opposite."""
-    return np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    """Return the unit vectors of the lines A and B (N, 2, 2); the other two arms of a corner are opposite.
+
+    They are as exact as the ring, in float32, whose functions are vectorised.
+    """
+    fine = angles.astype(np.float32)
+    return np.stack([np.cos(fine), np.sin(fine)], axis=-1).astype(np.float64)

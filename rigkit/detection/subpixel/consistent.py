@@ -92,6 +92,9 @@ def without_unconfirmed_holes(item: RefinedLattice, start: Lattice, holes: BoolA
 def without_uncertain(item: RefinedLattice) -> RefinedLattice:
     """Return `item` without corners whose standard deviation exceeds LOCATED_CELLS."""
     known = item.lattice.known
+    # Cells of a pixel are the smallest.
+    if not np.fmax.reduce(item.sigma_px, axis=None, initial=0.0) > LOCATED_CELLS:
+        return item
     vague = np.zeros_like(known)
     cell_px = fit_cells(item.lattice.pixels, known, degree=1).cell_px()
     vague[known] = item.sigma_px[known] > LOCATED_CELLS * cell_px
