@@ -93,12 +93,17 @@ def find_lattices(
     criteria = BoardCriteria(min_corners, sizes, has_markers)
     searched = searched or SearchedImage.of(grey)
     plausible = _RejectionCounter(_is_plausible if has_markers is None else _plausible_or_marked(has_markers))
+    fitted: list[tuple[list[Lattice], list[RefinedLattice]]] = []
 
-    def search(at: SearchedImage, before: Sequence[RefinedLattice] = ()) -> list[RefinedLattice]:
+    def search(at: SearchedImage, before: Sequence[RefinedLattice] = (), more_than: int = 0) -> list[RefinedLattice]:
         boards = candidate_lattices(at, min_corners, _again_or(plausible, before) if before else plausible)
-        if sum(item.count for item in boards) <= corner_count(before):
+        if sum(item.count for item in boards) <= more_than:
             return []
-        out = fit_and_confirm(grey, boards, criteria)
+        # Often the same lattices grow from the corners of several levels.
+        out = next((done for same, done in fitted if _have_same_corners(same, boards)), None)
+        if out is None:
+            out = fit_and_confirm(grey, boards, criteria)
+            fitted.append((boards, out))
         if has_markers is None:
             # Large lattices were tested before they were fully grown. Of discs that nearly touch, coarser levels show
             # corners that hide how far the edges bow between them. Markers in the squares bow edges, too, but the
@@ -110,7 +115,7 @@ def find_lattices(
 
     found = search(searched)
     if _needs_second_search(searched, found, sizes):
-        found = max(search(searched.with_smeared()), found, key=corner_count)
+        found = max(search(searched.with_smeared(), found), found, key=corner_count)
     for k in range(1, 1 if searched.enlarged else len(searched.levels)):
         # Coarser levels help only where squares do not meet at their corners; those of clutter do.
         if _has_whole_board(found, sizes) or plausible.rejected >= MAX_FAILED_GROWTHS:
@@ -118,7 +123,7 @@ def find_lattices(
         coarser = searched.coarser(k)
         if coarser is None:
             break
-        found = max(found, search(coarser, found), key=corner_count)
+        found = max(found, search(coarser, found, corner_count(found)), key=corner_count)
     if min_corners < MIN_BOARD_CORNERS and has_markers is None:
         return found
     return [
@@ -153,6 +158,14 @@ def _again_or(plausible: IsPlausible, before: Sequence[RefinedLattice]) -> IsPla
         return 2 * int(np.count_nonzero(same)) > len(same) or plausible(grey, finest, lattice)
 
     return test
+
+
+def _have_same_corners(one: Sequence[Lattice], two: Sequence[Lattice]) -> bool:
+    """Return whether two searches gave the same lattices, but for the places of their first corners."""
+    if [item.count for item in one] != [item.count for item in two]:
+        return False
+    places = [[np.sort(item.pixels[item.known].view(np.complex128), axis=0) for item in found] for found in (one, two)]
+    return all(np.array_equal(*pair) for pair in zip(*places, strict=True))
 
 
 def corner_count(found: Sequence[RefinedLattice]) -> int:
