@@ -14,7 +14,7 @@ from rigkit.detection.searched_image import FINE_CORNERS, SearchedImage
 
 def squares(side_px: int, columns: int, rows: int) -> FloatArray:
     """Return the corners (N, 2) of a board with squares of `side_px`."""
-    return 200.0 + side_px * np.argwhere(np.ones((columns, rows)))
+    return 200.0 + side_px * np.argwhere(np.ones((columns, rows))).astype(np.float64)
 
 
 def test_a_finer_level_is_added_as_if_all_levels_were_searched_again(rng: np.random.Generator) -> None:
