@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,17 +93,13 @@ def find_lattices(
     criteria = BoardCriteria(min_corners, sizes, has_markers)
     searched = searched or SearchedImage.of(grey)
     plausible = _RejectionCounter(_is_plausible if has_markers is None else _plausible_or_marked(has_markers))
-    fitted: list[tuple[list[Lattice], list[RefinedLattice]]] = []
+    fitted = _Fitted()
 
     def search(at: SearchedImage, before: Sequence[RefinedLattice] = (), more_than: int = 0) -> list[RefinedLattice]:
         boards = candidate_lattices(at, min_corners, _again_or(plausible, before) if before else plausible)
         if sum(item.count for item in boards) <= more_than:
             return []
-        # Often the same lattices grow from the corners of several levels.
-        out = next((done for same, done in fitted if _have_same_corners(same, boards)), None)
-        if out is None:
-            out = fit_and_confirm(grey, boards, criteria)
-            fitted.append((boards, out))
+        out = fitted.confirmed(grey, boards, criteria)
         if has_markers is None:
             # Large lattices were tested before they were fully grown. Of discs that nearly touch, coarser levels show
             # corners that hide how far the edges bow between them. Markers in the squares bow edges, too, but the
@@ -146,6 +142,20 @@ class _RejectionCounter:
         passed = self.plausible(grey, finest, lattice)
         self.rejected += not passed
         return passed
+
+
+@dataclass(slots=True)
+class _Fitted:
+    """What `fit_and_confirm` gave for the lattices of earlier searches: the same often grow from several levels."""
+
+    every: list[tuple[list[Lattice], list[RefinedLattice]]] = field(default_factory=list)
+
+    def confirmed(self, grey: GreyImage, boards: list[Lattice], criteria: BoardCriteria) -> list[RefinedLattice]:
+        for same, out in self.every:
+            if _have_same_corners(same, boards):
+                return out
+        self.every.append((boards, fit_and_confirm(grey, boards, criteria)))
+        return self.every[-1][1]
 
 
 def _again_or(plausible: IsPlausible, before: Sequence[RefinedLattice]) -> IsPlausible:

@@ -236,6 +236,26 @@ INLINE void link_arms(
     }
 }
 
+/* The same for all corners, in the order of the grid: neighbours read the same corners and pixels. The edges of a corner are read
+ * after those of the next one were prefetched. */
+INLINE void link_each(
+    const corners_t *corners, const squares_t *squares, const places_t *places, const image_t image, double scale, double offset,
+    const link_rules_t *rules, const near_t *near, int64_t *nearest, float *farthest)
+{
+    const int64_t count = corners->count;
+    candidate_t candidates[2][MAX_CANDIDATES];
+    int64_t listed[2] = {0, 0};
+    for (int64_t k = 0; k <= count; k++) {
+        if (k < count)
+            listed[k % 2] = list_candidates(
+                corners, squares, places, k, image, scale, offset, rules, near, candidates[k % 2]);
+        if (k > 0)
+            link_arms(
+                corners, image, scale, offset, rules, squares->order[k - 1], candidates[(k - 1) % 2], listed[(k - 1) % 2], nearest,
+                farthest);
+    }
+}
+
 static double link_length(const double *pixels, int64_t i, int64_t to)
 {
     const double du = pixels[2 * (to / 4)] - pixels[2 * i], dv = pixels[2 * (to / 4) + 1] - pixels[2 * i + 1];
@@ -275,19 +295,7 @@ FOR_EACH_PROCESSOR int64_t find_links(
     float *farthest = (float *)(near.meets + room);
     for (int64_t k = 0; k < 4 * count; k++)
         nearest[k] = both[k] = -1;
-    /* In the order of the grid: neighbours read the same corners and pixels. The edges of a corner are read after those of the
-     * next one were prefetched. */
-    candidate_t candidates[2][MAX_CANDIDATES];
-    int64_t listed[2] = {0, 0};
-    for (int64_t k = 0; k <= count; k++) {
-        if (k < count)
-            listed[k % 2] = list_candidates(
-                corners, &squares, &places, k, image, scale, offset, rules, &near, candidates[k % 2]);
-        if (k > 0)
-            link_arms(
-                corners, image, scale, offset, rules, squares.order[k - 1], candidates[(k - 1) % 2], listed[(k - 1) % 2], nearest,
-                farthest);
-    }
+    link_each(corners, &squares, &places, image, scale, offset, rules, &near, nearest, farthest);
     free(memory);
     free(scratch);
     for (int64_t k = 0; k < 4 * count; k++)
