@@ -19,7 +19,14 @@ import numpy as np
 
 from rigkit.calibration.assemble import with_solution
 from rigkit.calibration.diagnosis.flipped import flipped_images
-from rigkit.calibration.diagnosis.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
+from rigkit.calibration.diagnosis.view_evidence import (
+    NO_CHANGE,
+    ViewChange,
+    ViewEvidence,
+    columns_of,
+    predicted_by_others,
+    view_evidence,
+)
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.solver import solve
@@ -55,6 +62,13 @@ LENS_ROUNDS, LENS_TOLERANCE = 2, 1e-6
 """The effect of a focal length that differs by a hundredth is not linear: two rounds are needed."""
 
 
+NOT_AS_ITS_MODEL = Finding.look(
+    "the lens is not as its model: one smooth distortion, the same in all images",
+    "calibrate without a window, dome or mirror before the lens; a lens that is tilted or not round itself remains "
+    "uncertain by what no model describes, which its sigmas include",
+)
+"""What is wrong in all images alike looks like a change of each: windows and tilted lenses, like motion with a rolling
+shutter. But a change is not predicted by other images."""
 CHANGES = {
     "focus": Finding.look(
         "the focal length differs from image to image",
@@ -141,8 +155,19 @@ def changing(
         return []
     if best in but:
         return []
+    if common := not_as_its_model(calibration, evidence):
+        return common
     message = f"{found.message}: explains {100.0 * changes[best].share:.0f} % of the sum of squared residuals"
     return [replace(found, message=message)]
+
+
+def not_as_its_model(calibration: Calibration, evidence: ViewEvidence | None) -> list[Finding]:
+    """Return a finding where one distortion of all images predicts most of the residuals of each."""
+    share = predicted_by_others(calibration, evidence) if evidence is not None else 0.0
+    if share < MIN_SHARE_EXPLAINED:
+        return []
+    message = f"{NOT_AS_ITS_MODEL.message}, predicts {100.0 * share:.0f} % of the squared residuals of images left out"
+    return [replace(NOT_AS_ITS_MODEL, message=message)]
 
 
 def _leads(changes: Mapping[str, ViewChange], kind: str, but: Collection[str] = ()) -> bool:

@@ -27,10 +27,11 @@ from rigkit.calibration.diagnosis.captured import (
     stretched_images,
     undistorted,
 )
-from rigkit.calibration.diagnosis.changing import CHANGES, changing
+from rigkit.calibration.diagnosis.changing import CHANGES, changing, not_as_its_model
 from rigkit.calibration.diagnosis.moved import moment, two_cameras
 from rigkit.calibration.diagnosis.pupil import modelled_pupil, moving_pupil
 from rigkit.calibration.diagnosis.two_kinds import KINDS_REMEDY, listed, min_of_a_kind
+from rigkit.calibration.diagnosis.view_evidence import view_evidence
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.views.observations import Observations
@@ -329,6 +330,8 @@ def _pattern(c: Calibration, in_force: Collection[str], named: bool) -> Iterator
         yield Finding.look(what + "the board is not flat, or the lens model does not fit", 'try board_shape = "auto"')
     elif "model" not in in_force:
         yield Finding.look(what + "the lens model or the board shape does not fit", 'try model = "auto"')
+    elif not named and (common := not_as_its_model(c, view_evidence(c))):
+        yield from common
     elif not named:
         yield Finding.look(
             what + "no lens model or board shape explains it, so something changes between images",

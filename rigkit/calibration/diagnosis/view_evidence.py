@@ -28,6 +28,9 @@ MIN_SHARE_LEFT = 0.5
 NO_CHANGE = "columns"
 """The control: no camera reads its image column by column, so what columns explain as well as rows may be an error of
 the lens or board model."""
+FIELD_DEGREE = 4
+"""Of the polynomials in u and v that displace the image alike in all images: distortions of lenses are of degree 3, and
+what models leave of windows, tilted lenses or sheared glass is as smooth."""
 CHANGE_COLUMNS = {"bend": 3, "focus": 1, "shift": 2, "rows": 6, NO_CHANGE: 6}
 """Number of rows of each kind of change in `rows_of`, in their order before the residual; bends are common, too."""
 COMMON = slice(6, -(sum(CHANGE_COLUMNS.values()) - CHANGE_COLUMNS["bend"] + 1))
@@ -164,6 +167,32 @@ def _evidence(calibration: Calibration, clusters: IntArray) -> ViewEvidence | No
         total=total,
         freedom=sum(2 * n - 6 for n in count[finite].tolist()) - len(step),
     )
+
+
+def predicted_by_others(calibration: Calibration, evidence: ViewEvidence) -> float:
+    """Return the part of the squares of each image that one smooth displacement predicts, which is fitted to all other
+    images: zero or less for a change between images, much for a lens that is not as its model."""
+    size = np.array(calibration.camera.size_px)
+
+    def rows_with_field(views: Sequence[ViewResult]) -> tuple[FloatArray, IntArray]:
+        rows, count = rows_of(calibration, views)
+        pixels = np.concatenate([(one.pixels - one.residuals_px)[one.kept] for one in views])
+        u, v = (2.0 * pixels / size - 1.0).T
+        terms = np.array([u**i * v**j for i in range(FIELD_DEGREE + 1) for j in range(FIELD_DEGREE + 1 - i) if i + j])
+        field = np.zeros((2, 2 * len(terms), len(u)))
+        field[0, : len(terms)] = field[1, len(terms) :] = terms
+        return np.concatenate([rows[:, :6], rows[:, COMMON], field, rows[:, -1:]], axis=1), count
+
+    products = products_of([calibration.views[k] for k in evidence.views], rows_with_field)
+    length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
+    own = without_pose(products, length)[:, 6:, 6:]
+    scale = np.sqrt(np.maximum(np.diag(own.sum(axis=0))[:-1], np.finfo(float).tiny))
+    gram, score = own[:, :-1, :-1] / np.outer(scale, scale), own[:, :-1, -1] / scale
+
+    others, by_others = gram.sum(axis=0) - gram, score.sum(axis=0) - score
+    step = (np.linalg.pinv(others, rcond=MIN_COMMON_PART, hermitian=True) @ by_others[..., None])[..., 0]
+    missed = own[:, -1, -1].sum() - 2.0 * (step * score).sum() + np.einsum("vi,vij,vj->", step, gram, step)
+    return float(1.0 - missed / evidence.total)
 
 
 def products_of(

@@ -378,6 +378,19 @@ def test_what_is_wrong_in_all_images_alike_changes_in_none(rng: np.random.Genera
         assert changing_in(calibrate(views, SIZE, model="brown", board=shape)) == []
 
 
+def test_a_window_before_the_lens_is_no_change_between_images(rng: np.random.Generator) -> None:
+    """It shears every board a little, as a rolling shutter does; but images left out are predicted."""
+    views = []
+    for view in random_views(lens("reg"), 20, rng, reach_deg=30.0, noise_px=0.02)[0]:
+        u, v = view.pixels.T / SIZE[0]
+        window = 2.0 * np.stack([np.sin(3.0 * v + 2.0 * u), np.cos(2.5 * u - v)], axis=-1)
+        views.append(replace(view, pixels=np.clip(view.pixels + window, -0.5, np.array(SIZE) - 0.5)))
+    result = calibrate(views, SIZE, model="brown", board="flat")
+    found = str(diagnose(result, in_force=("model", "board_shape")))
+    assert "one smooth distortion, the same in all images" in found
+    assert "rolling" not in found and "changes between images" not in found
+
+
 def test_a_lens_beyond_all_numbers_tells_nothing_of_what_changes(rng: np.random.Generator) -> None:
     result = calibrate(changed_views("rows", rng), SIZE, model="brown", board="flat")
     parameters = np.array(result.camera.parameters)
