@@ -11,7 +11,7 @@ import numpy as np
 
 from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.pupil import SolvedPupil, require_of_frame
-from rigkit.calibration.solving.clustered import effective_freedom, widening
+from rigkit.calibration.solving.clustered import QUOTED, effective_freedom, widening
 from rigkit.calibration.solving.solver import Convergence
 from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.cameras.base import Camera
@@ -347,7 +347,11 @@ class Calibration:
     @cached_property
     def widening(self) -> float:
         """Factor on quoted standard deviations, so that two of them contain 95 % of the errors."""
-        return widening(effective_freedom(self.freedom, self.overdispersion, len(self.covariance)))
+        return self.widening_of(QUOTED)
+
+    def widening_of(self, sigmas: float) -> float:
+        """Return the factor with which so many standard deviations contain as much as of a normal distribution."""
+        return widening(effective_freedom(self.freedom, self.overdispersion, len(self.covariance)), sigmas)
 
     @property
     def images_left_out(self) -> int:

@@ -50,7 +50,8 @@ SQUARE_WITHIN = 0.01
 Sensors have square pixels: of 309 calibrations of REAL and RENDERED images, all that state the ratio to 0.25 % have it
 within 0.4 % (stretched paper included). Resizing to another shape changes it by several per cent."""
 STRETCH_SIGMAS = 4.0
-"""The same in standard deviations. Boards that do not determine the ratio are called by other findings."""
+"""The same in standard deviations, as far as few images know them: 7.6 with eight degrees of freedom. Boards that do
+not determine the ratio are called by other findings."""
 
 MAX_AXIS_OFF = 0.06
 """Distance of the optical axis from the image's middle, as a part of the longer side, from which images are called
@@ -190,7 +191,7 @@ def stretched_images(c: Calibration, *, upright: bool) -> Iterator[Finding]:
     stretch = float(np.log(along_x / along_y))
     gradient = (d_pixels_d_parameters[0, 0] - d_pixels_d_parameters[1, 0]) / along_x
     gradient = gradient - (d_pixels_d_parameters[2, 1] - d_pixels_d_parameters[3, 1]) / along_y
-    sigma = c.widening * float(np.sqrt(max(gradient @ c.covariance @ gradient, 0.0)))
+    sigma = c.widening_of(STRETCH_SIGMAS) * float(np.sqrt(max(gradient @ c.covariance @ gradient, 0.0)))
     if abs(stretch) <= max(SQUARE_WITHIN, STRETCH_SIGMAS * sigma):
         return
     narrower, other = ("x", "y") if stretch < 0.0 else ("y", "x")
@@ -206,7 +207,9 @@ def cropped_images(c: Calibration) -> Iterator[Finding]:
     """Yield a finding where the optical axis is far from the middle of the images."""
     axis, valid, _, d_pixels_d_parameters = c.camera.project_with_jacobians(np.array([0.0, 0.0, 1.0]))
     off, size = axis - image_center(c.camera.size_px), max(c.camera.size_px)
-    sigma = c.widening * float(np.sqrt(np.trace(d_pixels_d_parameters @ c.covariance @ d_pixels_d_parameters.T)))
+    sigma = c.widening_of(STRETCH_SIGMAS) * float(
+        np.sqrt(np.trace(d_pixels_d_parameters @ c.covariance @ d_pixels_d_parameters.T))
+    )
     far = float(np.linalg.norm(off))
     if not valid or not far > max(MAX_AXIS_OFF * size, STRETCH_SIGMAS * sigma):
         return

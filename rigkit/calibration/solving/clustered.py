@@ -90,16 +90,16 @@ def effective_freedom(
     return min(1.0 / max(variance_of_ratio, 1.0 / LARGE_FREEDOM), LARGE_FREEDOM)
 
 
-def widening(freedom: float) -> float:
+def widening(freedom: float, sigmas: float = QUOTED) -> float:
     """Return the factor on quoted standard deviations with `effective_freedom` degrees of freedom.
 
-    Two of them then contain the probability of two of a normal distribution; one contains more than 68 %: 80 % with
-    three degrees of freedom, 72 % with ten.
+    Two of them, or so many `sigmas`, then contain the probability of as many of a normal distribution; one of them
+    contains more than 68 %: 80 % with three degrees of freedom, 72 % with ten.
     """
     # Imported here: reading and using a camera does not need scipy.
     from scipy.special import ndtr, stdtrit
 
-    return float(stdtrit(freedom, ndtr(QUOTED))) / QUOTED if freedom < LARGE_FREEDOM else 1.0
+    return -float(stdtrit(freedom, ndtr(-sigmas))) / sigmas if freedom < LARGE_FREEDOM else 1.0
 
 
 def reduced_by_cluster(

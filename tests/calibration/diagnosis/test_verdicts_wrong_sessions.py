@@ -57,6 +57,11 @@ def test_two_cameras_that_see_the_board_at_once(order: str, rng: np.random.Gener
     assert of_one.count("'a") > 9 > of_one.count("'b") == 0 or of_one.count("'b") > 9 > of_one.count("'a") == 0
     assert worst(result.verdicts) is Severity.BAD
     assert "mixed" not in str(calibrate(views, SIZE, model="brown", board="flat").verdicts)
+    # Of 11 images and 3 of the same moments by the other camera, each pair has the same motion.
+    also = {view.image[1:] for view in views[:11]} & {view.image[1:] for view in other}
+    three = [view for view in other if view.image[1:] in sorted(also)[:3]]
+    few = calibrate([*views[:11], *three], SIZE, model="brown", board="flat", folds=0)
+    assert len(three) == 3 and "and in 2 other pairs of images" in first(few)
 
 
 def test_a_board_moved_by_equal_steps_is_one_camera(rng: np.random.Generator) -> None:

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import REACH_DEG, lens, random_views
 from helpers.session_scenes import FAIR_PX, GOOD_PX, IMAGES_PX, disturbed, longer, sessions
+from scipy.special import ndtr, stdtr
 
 from rigkit.calibration.assemble import assemble
 from rigkit.calibration.compare import CameraVerdict, compare_calibrations
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving import clustered
-from rigkit.calibration.solving.clustered import clustered_covariance, with_block
+from rigkit.calibration.solving.clustered import clustered_covariance, widening, with_block
 from rigkit.calibration.solving.fit import fit_kept
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
@@ -155,3 +156,10 @@ def test_autocorrelated_frames_have_fewer_degrees_of_freedom(alike: float, low: 
     own = clustered_covariance(unit, information, score - score.mean(axis=0), np.zeros((2, 2)), 1.0)
     assert own.freedom == pytest.approx(count - 1.0)
     assert (np.median(freedom) < 0.7 * own.freedom) == (alike > 0.0)
+
+
+@pytest.mark.parametrize("sigmas", [2.0, 4.0])
+def test_widened_sigmas_contain_as_much_as_of_a_normal_distribution(sigmas: float) -> None:
+    reach = sigmas * widening(8.0, sigmas)
+    assert stdtr(8.0, -reach) == pytest.approx(ndtr(-sigmas))
+    assert widening(1e9, sigmas) == 1.0
