@@ -120,7 +120,7 @@ def test_truncated_image(write: Write, tmp_path: Path, capsys: pytest.CaptureFix
 def test_wrong_board_size(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
     # Larger ones may be seen in part: where they end is checked as the measurements are.
     folder = write(columns=11, rows=9)
-    assert main(["validate", str(folder), "-o", str(folder / "out"), "--no-pictures", "-j", "1"]) == 1
+    assert main(["validate", str(folder), "-o", str(folder / "larger"), "--no-pictures", "-j", "1"]) == 1
     assert "8 x 6 inner corners end: correct the board file" in "".join(capsys.readouterr())
     check(*run(write(columns=7, rows=5), capsys), 2, "7x5", "8x6", "board file")
 
