@@ -14,12 +14,12 @@ import pytest
 from rigkit.cli.console import add_options, options_of
 from rigkit.cli.main import VERBS, main
 from rigkit.io.disk.schema_builders import attributes_of
-from rigkit.workflows.options import cameras, check, clouds, coach, plan
+from rigkit.workflows.options import boards, cameras, clouds, coach
 from rigkit.workflows.options.base import WrittenFiles
 
 KINDS = [
     kind
-    for module in (cameras, check, clouds, coach, plan)
+    for module in (boards, cameras, clouds, coach)
     for name, kind in vars(module).items()
     if name.endswith("Options")
 ]
