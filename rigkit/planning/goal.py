@@ -91,10 +91,12 @@ class RemainingError:
         return f"{self.requirement.whose} {self.error:.2g} {self.requirement.goal.unit}".lstrip()
 
 
-def projection_goal(camera: Camera, field_deg: float | None = None) -> Goal:
+def projection_goal(camera: Camera, field_deg: float | None = None, pixels: Pixels | None = None) -> Goal:
     """Return the mean square error of the projection of points at infinity, after the best rotation: over the image, or
-    its part within a field of view of `field_deg`."""
-    rays = rays_within(camera, grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2), field_deg)
+    its part within a field of view of `field_deg`; or at `pixels` (N, 2)."""
+    if pixels is None:
+        pixels = grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2)
+    rays = rays_within(camera, pixels, field_deg)
     left = rotation_free_jacobian(camera, rays).reshape(-1, camera.parameters.size)
     return Goal(left.T @ left / len(rays), "px", "rms error of the projection over the image")
 
