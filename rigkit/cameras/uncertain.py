@@ -16,6 +16,9 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
 Moved = TypeVar("Moved")
+MAX_HALVINGS = 4
+"""Of a standard deviation that leaves the range of a parameter both ways, as that of alpha (0 to 1) of a double-sphere
+lens does that a few images determine together with xi only; a sixteenth, 256 times, is the most that is computed."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -101,11 +104,16 @@ class UncertainRig:
 
 def _either_way(moved: Callable[[FloatArray], Moved], covariance: FloatArray) -> list[Moved]:
     """Return what is `moved` along each principal axis, or against it where that leaves the range of a parameter: the
-    square of a change is the same."""
-    out = []
-    for axis in principal_axes(covariance):
-        try:
-            out.append(moved(axis))
-        except InputError:
-            out.append(moved(-axis))
-    return out
+    square of a change is the same. Where both leave it, what is moved by a half stands there four times, and so on: the
+    sum of squared changes is the same."""
+    return [one for axis in principal_axes(covariance) for one in _in_range(moved, axis)]
+
+
+def _in_range(moved: Callable[[FloatArray], Moved], axis: FloatArray) -> list[Moved]:
+    for halvings in range(MAX_HALVINGS + 1):
+        for signed in (axis, -axis):
+            try:
+                return [moved(signed / 2**halvings)] * 4**halvings
+            except InputError as error:
+                refused = error
+    raise refused

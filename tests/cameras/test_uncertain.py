@@ -73,3 +73,11 @@ def test_a_parameter_near_the_end_of_its_range_moves_the_other_way() -> None:
     both[:6, :6] = known.covariance
     (pair,) = UncertainPair(PosedPair(lens, lens, POSES[1]), both).moved()
     assert np.abs(pair.camera1.parameters - lens.parameters)[4] == pytest.approx(0.05)
+
+
+def test_a_parameter_uncertain_by_more_than_its_range_moves_by_parts() -> None:
+    """One sigma either way from alpha = 0.5 would be no camera; few images leave such a lens, well known in pixels."""
+    lens = EUCM((300, 225), np.array([262.5, 262.5, 149.5, 112.0, 0.5, 0.8]))
+    known = UncertainCamera(lens, np.diag([0.0, 0.0, 0.0, 0.0, 0.6, 0.0]) ** 2)
+    changes = np.array([moved.parameters - lens.parameters for moved in known.moved()])
+    assert np.sum(changes[:, 4] ** 2) == pytest.approx(0.36)
