@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
 
 def run(args: argparse.Namespace) -> int:
-    if not any(mark in str(path) for path in args.source for mark in ("camera:", "%")):
-        require_existing(*args.source, remedy="give a folder of images, a video or a session's file")
+    require_existing(*args.source, remedy="give a folder of images, a video or a session's file")
     sessions = len(args.source) > 1 and all(path.suffix == ".toml" for path in args.source)
     return _many(args) if sessions else _one(args)
 

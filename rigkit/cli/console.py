@@ -13,7 +13,7 @@ from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from rigkit.cli.progress import progress_on_stderr as progress_on_stderr
-from rigkit.core.errors import InputError, printable
+from rigkit.core.errors import IN_PYTHON, InputError, printable
 from rigkit.io.disk.schema_builders import attributes_of
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ IMAGE_SIZE = re.compile(r"([0-9]{1,6})[xX]([0-9]{1,6})")
 
 def note(text: str) -> None:
     """Log a message for the user, which goes to stderr."""
-    logging.getLogger("rigkit.cli").info("%s", printable(text))
+    logging.getLogger("rigkit.cli").info("%s", printable(text.replace(IN_PYTHON, "")))
 
 
 def note_written(paths: Iterable[Path]) -> None:
@@ -103,11 +103,15 @@ def page_path(text: str) -> Path:
     return path
 
 
-def require_existing(*paths: Path, remedy: str = "check the path") -> None:
-    """Raise InputError if there is nothing at a path; called before the work is imported, which takes a second."""
+def require_existing(*paths: str | Path | None, remedy: str = "check the path") -> None:
+    """Raise InputError if there is nothing at a path; called before the work is imported, which takes a second.
+
+    None, live cameras (camera:0) and numbered sequences (%04d.png) pass."""
     for path in paths:
+        if path is None or any(mark in str(path) for mark in ("camera:", "%")):
+            continue
         try:
-            path.lstat()
+            os.lstat(path)
         except FileNotFoundError as error:
             raise InputError(f"'{path}' does not exist; {remedy}") from error
         except (OSError, ValueError):

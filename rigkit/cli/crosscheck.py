@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import argparse
 
-from rigkit.cli.console import options_of, print_json, progress_on_stderr
-from rigkit.cli.dataset_arguments import add_dataset_arguments, exit_code_of, failed_pairs, results_folder
+from rigkit.cli.console import options_of, print_json, progress_on_stderr, require_existing
+from rigkit.cli.dataset_arguments import NO_DATASET, add_dataset_arguments, exit_code_of, failed_pairs, results_folder
 from rigkit.cli.validation_output import note_skipped
 from rigkit.core.errors import ExitCode
 from rigkit.workflows.options.clouds import DatasetOptions
@@ -23,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    require_existing(args.dataset, remedy=NO_DATASET)
     from rigkit.io.manifests.manifest import load_dataset
     from rigkit.report.tables import tables_to_text
     from rigkit.workflows.validation.crosscheck import crosscheck_dataset

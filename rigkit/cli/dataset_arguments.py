@@ -14,6 +14,9 @@ from rigkit.workflows.options.clouds import DatasetOptions
 if TYPE_CHECKING:
     from rigkit.workflows.reconstruction.datasets import PairFailure
 
+NO_DATASET = "write one, or let `rigkit init` start it"
+"""What to do about a data set that does not exist."""
+
 
 def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = False, several: bool = False) -> None:
     """Add the common arguments; `optional`: the data set may be missing; `several`: there may be more than one."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.aim_arguments import add_board_argument
-from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr
+from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr, require_existing
 from rigkit.core.errors import ExitCode, printable
 from rigkit.core.printing import counted
 from rigkit.workflows.options.cameras import DetectOptions
@@ -31,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    require_existing(*args.images, args.camera)
     from rigkit.workflows.detect import detect_in_images
 
     options = options_of(DetectOptions, args, boards=tuple(map(Path, args.board)))

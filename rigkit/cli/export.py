@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import add_options, file_path, options_of, progress_on_stderr, size_of_words
+from rigkit.cli.console import add_options, file_path, options_of, progress_on_stderr, require_existing, size_of_words
 from rigkit.cli.dataset_arguments import add_planes_argument
 from rigkit.core.errors import InputError
 from rigkit.workflows.inputs.formats import CAMERA_FORMATS, CLOUD_FORMATS, PLY_FORMATS, READ_FORMATS
@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
         return _export_cloud(args)
     if args.single_precision:
         raise InputError("export: --float is for clouds written as PLY; leave it out")
+    require_existing(args.source)
     import numpy as np
 
     from rigkit.rectification.targets import field_across

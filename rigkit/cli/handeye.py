@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 
-from rigkit.cli.console import add_options, note, options_of, pose_in_words, progress_on_stderr
+from rigkit.cli.console import add_options, note, options_of, pose_in_words, progress_on_stderr, require_existing
 from rigkit.core.errors import ExitCode
 from rigkit.workflows.options.cameras import HandEyeOptions
 
@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    require_existing(args.poses, *args.images, args.camera)
     import numpy as np
 
     from rigkit.workflows.handeye import POSE_NAMES, calibrate_hand_eye, hand_eye_text

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 from rigkit.cli.progress import end_bar
+from rigkit.core.errors import IN_PYTHON
 
 MAKE_ROOM, PATH = "make room or choose another folder", "correct the path"
 SYSTEM_ERRORS = {
@@ -40,7 +41,7 @@ def say(words: str, *, before: str = "") -> None:
     """Print the last line of a run to stderr, if that is open."""
     end_bar(last=True)
     with contextlib.suppress(OSError, ValueError):
-        print(f"{before}rigkit: {words}", file=sys.stderr, flush=True)
+        print(f"{before}rigkit: {words.replace(IN_PYTHON, '')}", file=sys.stderr, flush=True)
 
 
 def flush_stderr() -> None:

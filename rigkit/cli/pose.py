@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import argparse
 
+from rigkit.cli.console import pose_in_words, print_json, require_existing
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("image", metavar="IMAGE", help="an image that shows the board")
@@ -18,9 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    require_existing(args.image, args.camera)
     import numpy as np
 
-    from rigkit.cli.console import pose_in_words, print_json
     from rigkit.workflows.handeye import camera_on_board
 
     placed = camera_on_board(args.image, args.camera, args.board)

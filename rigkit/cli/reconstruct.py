@@ -12,8 +12,9 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from rigkit.cli.console import note, options_of, print_json, progress_on_stderr
+from rigkit.cli.console import note, options_of, print_json, progress_on_stderr, require_existing
 from rigkit.cli.dataset_arguments import (
+    NO_DATASET,
     add_dataset_arguments,
     add_direction_arguments,
     add_planes_argument,
@@ -50,6 +51,7 @@ def run(args: argparse.Namespace) -> int:
                 "reconstruct: --directions and --det-scale need boards, and a scene has none; leave them out"
             )
         return run_scene(args)
+    require_existing(args.dataset, remedy=NO_DATASET)
     from rigkit.io.manifests.manifest import load_dataset
     from rigkit.report.tables import measured_words
     from rigkit.workflows.reconstruction.reconstruct import reconstruct_dataset

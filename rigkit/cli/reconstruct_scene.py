@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr
+from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr, require_existing
 from rigkit.cli.dataset_arguments import results_folder
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.core.posetype import PoseType
@@ -58,6 +58,7 @@ def is_scene(args: argparse.Namespace) -> bool:
 
 
 def run_scene(args: argparse.Namespace) -> int:
+    require_existing(*args.images or (), args.correspondences, args.camera, args.camera2, args.rig, args.pose)
     if args.images and len(args.images) > 2:
         return _run_rig(args)
     from rigkit.workflows.reconstruction.reconstruct_scene import CLOUD, reconstruct_views

@@ -14,7 +14,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr, size_of_words
+from rigkit.cli.console import add_options, note, options_of, print_json, require_existing, size_of_words
+from rigkit.cli.progress import progress_on_stderr
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.workflows.options.cameras import RectifyOptions
 
@@ -56,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    require_existing(*args.images, args.camera, args.rig)
     from rigkit.workflows.rectify import holds_several, rectify_image, rectify_stereo_images
 
     options = options_of(
@@ -66,9 +68,7 @@ def run(args: argparse.Namespace) -> int:
     )
     if args.rig is None:
         if args.camera is None:
-            raise InputError(
-                "rectify: give --camera CALIBRATION.json, of one camera, or --rig RIG.json, of that of a stereo pair"
-            )
+            raise InputError("rectify: give --camera CALIBRATION.json, or --rig RIG.json of a stereo pair")
         done = rectify_image(args.images, args.camera, options, progress=progress_on_stderr())
         found = [_figures(one, args.projection) for one in done.images]
         result = {"images": found} if holds_several(args.images) else found[0]

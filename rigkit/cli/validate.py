@@ -14,8 +14,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import add_options, note, options_of, progress_on_stderr
+from rigkit.cli.console import add_options, note, options_of, progress_on_stderr, require_existing
 from rigkit.cli.dataset_arguments import (
+    NO_DATASET,
     add_dataset_arguments,
     add_direction_arguments,
     add_planes_argument,
@@ -53,6 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    require_existing(*args.dataset, remedy=NO_DATASET)
     from rigkit.io.manifests.manifest import load_dataset
     from rigkit.workflows.validation.paper import validate_as_paper
     from rigkit.workflows.validation.validate import validate_dataset

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+IN_PYTHON = " (force=True in Python)"
+"""Part of messages that the command line leaves out."""
+
 
 class ExitCode(IntEnum):
     """Exit codes of the command line."""

@@ -18,6 +18,8 @@ from rigkit.core.printing import digits
 from rigkit.geometry.rigid3 import Rigid3
 
 MM_PER_M = 1000.0
+EXACT_PX = 1e-3
+"""The note on a refit states no smaller errors: corners are seldom known to a hundredth of a pixel."""
 MIN_REPORTED_PX = 0.1
 """For refits with larger errors, the note names a model of the session without loss."""
 
@@ -81,8 +83,10 @@ def best_accepted(
             continue
         fewer = any(k.model == camera.model for k in accepted)
         lacks = f"{camera.model} model" + (" with these terms" if fewer else "")
-        note = f"{format_name} has no {lacks}: refitted as {kind.model}, off by {digits(c.max_px)} px at most"
-        if outline is not None:
+        note = f"{format_name} has no {lacks}: refitted as {kind.model}, "
+        exact = max(c.max_px, c.outside_px) <= EXACT_PX
+        note += f"within {EXACT_PX:g} px" if exact else f"off by {digits(c.max_px)} px at most"
+        if outline is not None and not exact:
             note += f" where boards were and {digits(c.outside_px)} px elsewhere"
         if c.covered < 1.0:
             reach = min(np.degrees(c.reach_rad), np.degrees(c.camera.max_angle_rad))

@@ -87,7 +87,8 @@ def test_from_pictures_to_a_page_and_two_formats_in_one_command(
     folder = of_one_camera(pictures, tmp_path / "my [photos]")
     command = ["calibrate", str(folder), "--board", "9x6x30", "-r", "--export", "opencv", "ros"]
     assert main(command) == 0
-    assert "held-out RMS" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "held-out RMS" in said.out and "session.toml, corners.json written" in said.err
     cameras = [
         load_calibration(folder / "calibration.json").camera,
         read_opencv((folder / "calibration-opencv.yaml").read_text(), ""),
@@ -139,7 +140,8 @@ def test_a_session_of_a_person_is_not_replaced(
     session = folder / "session.toml"
     session.write_text("# mine\n")
     assert main(["calibrate", str(folder), "--board", "9x6x30"]) == 2
-    assert "session.toml' exists" in capsys.readouterr().err
+    refusal = capsys.readouterr().err
+    assert "session.toml' exists" in refusal and "use --force to replace" in refusal
     assert session.read_text() == "# mine\n" and not (folder / "board-9x6x30.toml").exists()
     session.unlink()
     # Nothing comes out, nothing is left.

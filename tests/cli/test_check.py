@@ -293,6 +293,7 @@ def test_exit_codes_of_unchanged_and_changed_cameras(
         (["{cam}", "{same}", "--scene"], "--scene needs a rig"),
         (["{cam}", "{same}", "--length", "3"], "belong together"),
         (["{cam}", "{home}/nothing.png"], "does not exist"),
+        (["{cam}", "{cam}"], "rigkit: check: image '"),
         (["{cam}", "{same}", "--board", "8x5x25"], "9 x 6 inner corners are seen in 3 of 3 images, 8 x 5 are declared"),
         (
             ["{cam}", "{same}", "--board", "aprilgrid:5x4x25,spacing=0.3"],

@@ -218,7 +218,8 @@ def cropped_images(c: Calibration) -> Iterator[Finding]:
     side = (("right", "left"), ("bottom", "top"))[along][int(off[along] < 0.0)]
     yield Finding.look(
         f"the optical axis is {far:.0f} px from the middle of the images ({100.0 * far / size:.0f} % of their longer "
-        f"side), although cameras have it there: all images seem cropped, most at the {side}, or the lens is shifted",
+        f"side), although cameras have it there: all images seem cropped, most at the {side}, or the lens is shifted "
+        "or tilted",
         "give the images as the sensor has them, or use the calibration only for images cropped in the same way",
     )
 

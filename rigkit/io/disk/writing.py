@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.errors import InputError
+from rigkit.core.errors import IN_PYTHON, InputError
 from rigkit.io.disk.reading import usable_path
 
-FORCE = "use --force (force=True in Python)"
+FORCE = f"use --force{IN_PYTHON}"
 """Part of messages about existing files."""
 
 

@@ -98,12 +98,14 @@ def _sentence(finding: Finding) -> str:
 
 
 def causes_table(certificate: Certificate) -> Table:
-    """Return the standard deviation from each cause, and its part of the variance at the worst place."""
+    """Return the standard deviation from each cause that is not treated as exact, and its part of the variance at the
+    worst place."""
     unit, shares = certificate.task.unit, certificate.shares()
     row, column = certificate.worst_place
     rows = tuple(
         cells(cause, float(np.median(sigma[certificate.places])), float(sigma[row, column]), 100.0 * shares[cause])
         for cause, sigma in certificate.sigma.items()
+        if np.any(sigma[certificate.places] > 0.0)
     )
     heads = columns(
         f"cause | median sigma [{unit}] .4 | sigma where worst [{unit}] .4 | share of the variance there [%] .1"

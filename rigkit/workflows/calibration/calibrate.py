@@ -64,7 +64,7 @@ class SessionCalibration:
     session : the session.
     calibration : camera, covariance and verdicts.
     unreadable : errors by name of images that cannot be read.
-    written : files written: the calibration, then exports and the page.
+    written : files written: the calibration, exports and the page; of folders then those of the new session.
     plan : images to take next, if the options ask for them and there is a plan.
     """
 

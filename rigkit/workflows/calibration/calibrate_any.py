@@ -140,14 +140,17 @@ def calibrate_folders(
     before = {path: read_bytes(path, "session") for path in new if path.exists()}
     write_together(new, force=options.force)
     made, missing = list(set(new) - set(before)), [path for path in results if not path.exists()]
+    caches: list[Path] = []
     try:
         with _errors_about(folders, session):
             if session in made:
-                caches = [own.corners_path for own in load_any_session(session).cameras.values()]
-                made += [path for path in caches if not path.exists()]
+                corner_paths = (own.corners_path for own in load_any_session(session).cameras.values())
+                caches = [path for path in corner_paths if not path.exists()]
+                made += caches
             if corners and options.cache is Cache.UPDATE and options.corners is None:
                 _keep_corners(session, corners)
-            return calibrate_session_file(session, options, progress=progress)
+            done = calibrate_session_file(session, options, progress=progress)
+        return replace(done, written=(*done.written, *new, *filter(Path.exists, caches)))
     except BaseException:
         if before:
             write_together(before, force=True)

@@ -114,10 +114,11 @@ def check_pictures(
     boards = _replaced_by_known(options.boards, known) or known
     pictures = _Pictures(source=source, monitored=monitored, boards=boards, known=known, own=own, progress=progress)
     pictures.left_out.extend((f"{path}", NO_PARTNER) for path in (*single, *alone))
+    look, views = pictures.seen(now, scene=options.scene)
+    then = pictures.seen(before, scene=options.scene)[0] if before else None
     with about(source):
-        look, views = pictures.seen(now, scene=options.scene)
-        if before:
-            check = check_since(monitored, pictures.seen(before, scene=options.scene)[0], look, goals)
+        if then is not None:
+            check = check_since(monitored, then, look, goals)
         else:
             check = evaluate_evidence(monitored, look, goals)
         if views and not check.holds:

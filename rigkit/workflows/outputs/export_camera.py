@@ -132,6 +132,7 @@ def foreign_rig_files(rig: Rig, result: Path, kinds: Sequence[str], outlines: Ou
     Notes for their users go to the log; so does a warning about a format that cannot represent this rig.
     """
     files: dict[Path, str] = {}
+    said: set[str] = set()
     for kind, places in foreign_rig_paths(list(rig), result, kinds).items():
         try:
             foreign = write_rig(rig, kind, outlines)
@@ -139,8 +140,9 @@ def foreign_rig_files(rig: Rig, result: Path, kinds: Sequence[str], outlines: Ou
             _log.warning(f"no {kind} file of the rig: {error}")
             continue
         files |= dict(zip(places, foreign.files.values(), strict=True))
-        if foreign.notes:
-            _log.info(f"{', '.join(map(str, places))}: {'; '.join(foreign.notes)}")
+        if notes := [note for note in foreign.notes if note not in said]:
+            _log.info(f"{', '.join(map(str, places))}: {'; '.join(notes)}")
+        said |= set(notes)
     return files
 
 

@@ -228,6 +228,9 @@ def test_the_causes_add_up_and_the_worst_is_named_first(rng: np.random.Generator
     advice = certificate.findings[-1]
     assert "to halve the worst error: board scale makes" in advice.message
     assert 0.0 < certificate.share_within(certificate.median) < certificate.share_within(certificate.worst) == 1.0
+    exact = certify(replace(rig, scale_sigma=0.0), certificate.task, cells=(9, 7))
+    rows = [str(certificate_page.causes_table(one).rows) for one in (certificate, exact)]
+    assert ["board scale" in words for words in rows] == [True, False]
 
 
 def test_what_is_said_of_the_worst_place_is_said_of_a_certified_one(rng: np.random.Generator) -> None:
