@@ -31,7 +31,10 @@ def identify(args: argparse.Namespace) -> int:
     found = identify_board(images, progress=progress_on_stderr())
     board = found.board
     print(f"{board.pattern.type}: {without_scale(board.describe())}")
-    print(f"seen in {len(found.seen)} of {len(found.looked_at)} images")
+    looked_at = len(found.looked_at)
+    print(
+        f"seen in {len(found.seen)} of {looked_at} images" + (f" (of {len(images)})" if looked_at < len(images) else "")
+    )
     print(f"--board {found.words}   (replace MM by {board.pattern.size_meaning}, measured with a ruler)")
     if found.beside:
         seen = "" if board.identified else "   (as far as it is seen)"

@@ -22,7 +22,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a session file; or one folder of images (or video, or camera:0) per camera",
     )
     parser.add_argument(
-        "-o", "--output", type=_output, help="file; default: calibration.json (rig.json) beside the session"
+        "-o",
+        "--output",
+        type=_output,
+        help="file; .json is added to a name without ending (default: calibration.json, rig.json, beside the session)",
     )
     parser.add_argument(
         "-r",

@@ -51,8 +51,8 @@ def describe(calibration: Calibration) -> str:
     lines = [
         f"{camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px: {headline}",
         f"training RMS {calibration.rms_px:.4f} px (2-D per corner, {calibration.corner_count} corners in "
-        f"{len(calibration.views)} views{note and f'; {note}'}), {len(calibration.outliers)} outliers, "
-        f"{calibration.images_left_out} images left out",
+        f"{len(calibration.views)} views{note and f'; {note}'}), {counted(len(calibration.outliers), 'outlier')}, "
+        f"{counted(calibration.images_left_out, 'image')} left out",
         f"focal length on the axis {focal_words(calibration)} px, horizontal field of view {across_deg:.1f} degrees",
     ]
     words = rounded_parameters(camera, calibration.parameter_sigmas)

@@ -57,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
     require_existing(args.source)
     import numpy as np
 
+    from rigkit.core.printing import digits
     from rigkit.rectification.targets import field_across
     from rigkit.workflows.inputs.camera_files import is_rig
     from rigkit.workflows.outputs.export_camera import export_camera, export_rig
@@ -66,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     options = options_of(ExportCameraOptions, args, **passed_on)
     if args.source_format is None and is_rig(args.source):
         rig = export_rig(args.source, options, tuple(args.names or ()))
-        print(f"{', '.join(map(str, rig.written))}: {rig.kind}, at most {rig.max_error_px:.4g} px from the input")
+        print(f"{', '.join(map(str, rig.written))}: {rig.kind}, at most {digits(rig.max_error_px)} px from the input")
         return 0
     done = export_camera(args.source, options)
     if done.kind == "rigkit":
@@ -74,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         width, height = done.camera.size_px
         print(f"{args.output}: {done.camera.model}, {width}x{height} px, sees {across:.1f} degrees across")
     else:
-        print(f"{args.output}: {done.kind}, at most {done.max_error_px:.4g} px from the input")
+        print(f"{args.output}: {done.kind}, at most {digits(done.max_error_px)} px from the input")
     return 0
 
 
