@@ -19,8 +19,8 @@ NO_DATASET = "write one, or let `rigkit init` start it"
 
 
 def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = False, several: bool = False) -> None:
-    """Add the common arguments; `optional`: the data set may be missing; `several`: there may be more than one."""
-    number = "?" if optional else "+" if several else None
+    """Add the common arguments; `optional`: the verb refuses no or several data sets itself; `several`: it uses all."""
+    number = "*" if optional else "+" if several else None
     parser.add_argument(
         "dataset", metavar="DATASET", nargs=number, help="folder with a dataset.toml, or the file itself"
     )

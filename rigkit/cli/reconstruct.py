@@ -51,12 +51,12 @@ def run(args: argparse.Namespace) -> int:
                 "reconstruct: --directions and --det-scale need boards, and a scene has none; leave them out"
             )
         return run_scene(args)
-    require_existing(args.dataset, remedy=NO_DATASET)
+    require_existing(args.dataset[0], remedy=NO_DATASET)
     from rigkit.io.manifests.manifest import load_dataset
     from rigkit.report.tables import measured_words
     from rigkit.workflows.reconstruction.reconstruct import reconstruct_dataset
 
-    dataset = load_dataset(args.dataset)
+    dataset = load_dataset(args.dataset[0])
     out = results_folder(args, dataset.name)
     options = options_of(ReconstructOptions, args, output=out)
     done = reconstruct_dataset(dataset, options, progress=progress_on_stderr())

@@ -42,9 +42,9 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
 def is_scene(args: argparse.Namespace) -> bool:
     """Return whether a scene is given; raises InputError for both or neither of scene and data set."""
     scene = bool(args.images or args.correspondences)
-    if scene and args.dataset:
+    if args.dataset and (scene or len(args.dataset) > 1):
         raise InputError(
-            f"reconstruct: give either a DATASET or a scene: '{args.dataset}' is taken for a DATASET; images follow "
+            f"reconstruct: give either a DATASET or a scene: '{args.dataset[0]}' is taken for a DATASET; images follow "
             "--images together, and the second image's camera is --camera2"
         )
     if scene == bool(args.dataset):

@@ -45,10 +45,11 @@ def diagnose_boards(c: Calibration, provided: str, *, sure: bool) -> Iterator[Fi
             )
         if sure and abs(board.aspect) > ASPECT:
             longer, other = ("x", "y") if board.aspect > 0 else ("y", "x")
+            word = board.board.pattern.size_word
             yield Finding.look(
-                f"{name} has squares {100 * abs(board.aspect):.2f} % longer in {longer} relative to {other} than "
+                f"{name} has {word}s {100 * abs(board.aspect):.2f} % longer in {longer} relative to {other} than "
                 f"declared{provided}",
-                "measure square_x_mm and square_y_mm again",
+                f"measure {word}_x_mm and {word}_y_mm again",
             )
         yield from _spacing(name, board)
 
