@@ -12,7 +12,7 @@ separates more clearly than all of those is of two lenses.
 
 Two cameras on one mount see each board in two poses with always the same motion in between. In images of one camera no
 motion between poses occurs twice, unless the board was moved by equal steps: then an image is the end of one step and
-the start of the next.
+the start of the next, or there are other motions that occur as often. Images in which the board hardly moved are one.
 """
 
 from __future__ import annotations
@@ -72,6 +72,10 @@ MIN_SHARE_PAIRED = 1.0 / 3.0
 """Part of all images that must be in such pairs: many images may be of a video, in which a board glides evenly."""
 MAX_SHARE_CHAINED = 0.2
 """Part of these images that may be both start and end; more is a board moved by equal steps."""
+MAX_SHARE_OTHER = 0.5
+"""Largest number of pairs with another motion, as a part of theirs; more are equal steps."""
+OTHER_MOTION = 3.0
+"""Multiple of the distance of equal motions from which two are different: nearer ones may be equal, but less exact."""
 MAX_STARTS = 24
 """Number of views from which motions are tried, spread over the places of the boards, whatever their order."""
 
@@ -297,26 +301,28 @@ def _places(observations: Observations, state: State) -> FloatArray:
 def two_cameras(calibration: Calibration, number: IntArray) -> Iterator[Finding]:
     """Yield a finding if the images are of two synchronous cameras; `number` (V,) are the `cluster_numbers` of the
     views' images."""
-    views = calibration.views
-    images = [view.image for view in views]
-    _, first = np.unique(number, return_index=True)
+    images = [view.image for view in calibration.views]
+    first = dict(zip(number[::-1].tolist(), images[::-1], strict=True))
     if len(first) < 2 * MIN_PARTNERS:
         return
-    rotation, centre = calibration.corners.rotation, calibration.corners.translation_mm
-    boards = np.unique([view.board_id for view in views], return_inverse=True)[1]
-    start, end = _partners(rotation, centre, boards, number)
-    if len(start) < MIN_PARTNERS:
-        return
-    alike = len(np.unique(number[start]))
-    together = np.unique(np.concatenate([number[start], number[end]]))
-    chained = np.intersect1d(number[start], number[end])
-    enough = len(together) >= MIN_SHARE_PAIRED * len(first)
-    of_one = list(dict.fromkeys(images[k] for k in sorted(start.tolist())))
-    if alike >= MIN_PARTNERS and enough and len(chained) <= MAX_SHARE_CHAINED * len(together):
+    one = np.array([k for k, image in enumerate(images) if image == first[int(number[k])]])
+    number = number[one]
+    rotation, centre = calibration.corners.rotation[one], calibration.corners.translation_mm[one]
+    boards = np.unique([calibration.views[k].board_id for k in one], return_inverse=True)[1]
+    start, end, weight, others = _partners(rotation, centre, boards, number)
+
+    def places(views: IntArray) -> float:
+        return float(weight[views[np.unique(number[views], return_index=True)[1]]].sum())
+
+    together = places(np.concatenate([start, end]))
+    enough = round(places(start)) >= MIN_PARTNERS and together >= MIN_SHARE_PAIRED * places(np.arange(len(one)))
+    chained = places(start[np.isin(number[start], number[end])])
+    if enough and chained <= MAX_SHARE_CHAINED * together and others <= MAX_SHARE_OTHER:
+        of_one = list(dict.fromkeys(images[k] for k in sorted(one[start].tolist())))
         yield Finding.bad(
-            f"images of two cameras are mixed: the board moves in the same way between '{images[start[0]]}' and "
-            f"'{images[end[0]]}' and in {alike - 1} other pairs of images, as in stereo pairs, of which one camera "
-            f"took {listed(of_one)}",
+            f"images of two cameras are mixed: the board moves in the same way between '{images[one[start[0]]]}' and "
+            f"'{images[one[end[0]]]}' and in {len(of_one) - 1} other pairs of images, as in stereo pairs, of which one "
+            f"camera took {listed(of_one)}",
             "calibrate each camera from its own images, or both as a rig with [[cameras]]; leave out images "
             "that a program made from others",
         )
@@ -324,13 +330,16 @@ def two_cameras(calibration: Calibration, number: IntArray) -> Iterator[Finding]
 
 def _partners(
     rotation: FloatArray, centre: FloatArray, boards: IntArray, number: IntArray
-) -> tuple[IntArray, IntArray]:
+) -> tuple[IntArray, IntArray, FloatArray, float]:
     """Return start and end of the pairs of views with the most common motion of the board, from poses (V, 3, 3) and
-    (V, 3) mm."""
+    (V, 3) mm; the weight (V,) of each view, one over the number at its place; and the number of pairs with the next
+    most common motion, as a part of that with this one."""
     distance = float(np.linalg.norm(centre, axis=1).mean())
     # A pose as four points: the board's origin, and the ends of axes of half the distance.
     frame = 0.5 * distance * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    points = (frame @ np.swapaxes(rotation, -1, -2) + centre[:, None]).reshape(-1, 12)
     reach = SAME_MOTION * distance * 2.0
+    weight = 1.0 / _near(points, reach, np.ones(len(points)))
     along = np.lexsort(centre.T)
     starts = along[np.unique(np.linspace(0, len(centre) - 1, min(MAX_STARTS, len(centre))).astype(np.int64))]
     # Displacement of a frame at the boards' mean place by each motion, as products of all ends and starts: coordinates
@@ -343,28 +352,29 @@ def _partners(
     chosen = (number[:, None] != number[starts]) & (boards[:, None] == boards[starts])
     chosen &= (moved * moved).sum(axis=0).max(axis=-1) > (0.5 * MIN_MOTION * reach) ** 2
     i, j = np.nonzero(chosen.T)
+    if not len(i):
+        return i, j, weight, 0.0
     moved = np.moveaxis(moved[:, j, i], 0, 1).reshape(-1, 12)
-    alike = _neighbours(moved, reach) if len(moved) else np.zeros(0, np.int64)
-    if alike.max(initial=0) < 2:
-        # No motion occurs twice.
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    near = np.linalg.norm(moved - moved[int(np.argmax(alike))], axis=1) <= reach
-    best = np.flatnonzero(near)
-    points = frame @ np.swapaxes(rotation, -1, -2) + centre[:, None]
+    alike = _near(moved, reach, weight[starts[i]] * weight[j])
+    best = np.flatnonzero(np.linalg.norm(moved - moved[int(np.argmax(alike))], axis=1) <= reach)
     # The motion closest to the median of those.
     middle = best[int(np.argmin(np.linalg.norm(moved[best] - np.median(moved[best], axis=0), axis=1)))]
     start, end = starts[i[middle]], j[middle]
-    landed = (points - centre[start]) @ (rotation[end] @ rotation[start].T).T + centre[end]
-    one, other = landed.reshape(-1, 12), points.reshape(-1, 12)
+    turn = rotation[end] @ rotation[start].T
+    back = (typical - centre[end]) @ turn + centre[start] - typical
+    off = np.minimum(*(np.linalg.norm(moved - one, axis=1) for one in (moved[middle], back.T.ravel())))
+    others = float(alike[off > OTHER_MOTION * reach].max(initial=0.0) / alike.max())
+    landed = ((points.reshape(-1, 4, 3) - centre[start]) @ turn.T + centre[end]).reshape(-1, 12)
     # |a - b|^2 - |a|^2, all of them as one product.
-    end = ((other**2).sum(axis=1) - 2.0 * one @ other.T).argmin(axis=1)
-    found = np.flatnonzero(((one - other[end]) ** 2).sum(axis=1) < reach**2)
-    found = found[(boards[found] == boards[end[found]]) & (number[found] != number[end[found]])]
-    return found, end[found]
+    to = ((points**2).sum(axis=1) - 2.0 * landed @ points.T).argmin(axis=1)
+    found = np.flatnonzero(((landed - points[to]) ** 2).sum(axis=1) < reach**2)
+    found = found[(boards[found] == boards[to[found]]) & (number[found] != number[to[found]])]
+    return found, to[found], weight, others
 
 
-def _neighbours(points: FloatArray, reach: float) -> IntArray:
-    """Return for each of the points (N, 12) the number within `reach` of it, (N,), itself included."""
+def _near(points: FloatArray, reach: float, weight: FloatArray) -> FloatArray:
+    """Return for each of the points (N, 12) the sum of the weights (N,) of those within `reach`, itself included."""
     i, j = close_pairs(points, reach)
     near = np.linalg.norm(points[i] - points[j], axis=1) <= reach
-    return np.asarray(1 + np.bincount(np.concatenate([i[near], j[near]]), minlength=len(points)))
+    i, j = np.concatenate([i[near], j[near]]), np.concatenate([j[near], i[near]])
+    return np.asarray(weight + np.bincount(i, weight[j], minlength=len(points)))

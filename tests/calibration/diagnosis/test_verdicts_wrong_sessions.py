@@ -63,6 +63,22 @@ def test_a_board_moved_by_equal_steps_is_one_camera(rng: np.random.Generator) ->
     assert "mixed" not in str(calibrate(views, SIZE, model="brown", board="flat").verdicts)
 
 
+def test_a_robot_or_a_board_held_still_is_one_camera(rng: np.random.Generator) -> None:
+    """Motions between the same two places come again with every tilt, and with every image of a still board."""
+    places = np.array([[0.0, 0.0, 900.0], [160.0, 30.0, 950.0], [-120.0, 90.0, 1000.0], [60.0, -130.0, 850.0]])
+    tilts = exp_so3(np.array([[0.0, 0.1, 0.0], [0.4, 0.2, 0.0], [-0.3, 0.3, 0.5]]))
+    robot = np.tile(tilts, (4, 1, 1)), np.repeat(places, 3, axis=0)
+    counts = [7, 7, 1, 1]
+    still = exp_so3(0.001 * rng.normal(size=(16, 3))) @ np.repeat(
+        exp_so3(0.3 * rng.normal(size=(4, 3))), counts, axis=0
+    )
+    held = still, np.repeat(places, counts, axis=0) + rng.normal(size=(16, 3))
+    for rotation, centre in (robot, held):
+        views = seen(lens("reg"), rotation, centre - rotation @ BOARD.points().mean(axis=0), rng)
+        result = calibrate(views, SIZE, model="brown", board="flat", folds=0)
+        assert len(result.views) == len(centre) and "mixed" not in str(result.verdicts)
+
+
 @pytest.mark.parametrize("count", [7, 40])
 def test_boards_parallel_to_each_other(count: int, rng: np.random.Generator) -> None:
     """Said before seven images in place of eight."""
