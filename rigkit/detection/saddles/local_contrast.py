@@ -21,6 +21,10 @@ keep their contrast."""
 MIN_DEVIATION = 0.02
 """Smallest local deviation that is normalised, over the largest: smaller ones are noise of uniform areas."""
 
+SAMPLES_A_WINDOW = 16.0
+"""Samples of the local means in one standard deviation of the window, between which they are interpolated to a
+two-thousandth of their change: at every pixel of an image of 8 MP they take 22 s."""
+
 MIDDLE, GAIN = 127.5, 50.0
 """Grey levels of the local mean, and of one local deviation."""
 
@@ -32,10 +36,19 @@ def equalised(grey: GreyImage) -> FloatImage:
     """Return `grey` with equal local mean and deviation everywhere, in grey levels 0..255."""
     values = grey.astype(np.float32)
     window = WINDOW_PART * min(values.shape)
-    off = values - cv2.GaussianBlur(values, (0, 0), window)
-    deviation = np.sqrt(cv2.GaussianBlur(off * off, (0, 0), window))
+    off = values - _local_mean(values, window)
+    deviation = np.sqrt(_local_mean(off * off, window))
     least = max(MIN_DEVIATION * float(deviation.max()), 1e-6)
     return np.asarray(np.clip(MIDDLE + GAIN * off / np.maximum(deviation, least), 0.0, 255.0), np.float32)
+
+
+def _local_mean(values: FloatImage, window: float) -> FloatImage:
+    """Return the means of `values` in a Gaussian window with this standard deviation (px)."""
+    height, width = values.shape
+    step = max(1.0, window / SAMPLES_A_WINDOW)
+    small = cv2.resize(values, (round(width / step), round(height / step)), interpolation=cv2.INTER_AREA)
+    means = cv2.GaussianBlur(small, (0, 0), window * small.shape[1] / width, sigmaY=window * small.shape[0] / height)
+    return np.asarray(cv2.resize(means, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def stretched(grey: GreyImage, boards: list[FloatArray]) -> GreyImage:
