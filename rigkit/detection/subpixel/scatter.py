@@ -34,6 +34,12 @@ LOWER_ORDER = 4
 a lens and not scatter: of REAL boards with irregular prints 0.7 to 1.3 times, of fisheyes (REAL and RENDERED) 2.1 to 7
 times."""
 
+THIRD, BEND_DIFFERENCES, BEND_SURFACES = 3, 3.0, 12.0
+"""Order of the differences that show the bend of a lens, and largest factors of small boards, over these differences
+times the change of successive steps, that the bend may explain; the MIXED differences then decide. Of SIMULATED boards
+of 7 x 5 that face an equidistant, equisolid or stereographic fisheye they are 0.9 to 2.0 for differences of order 5 and
+5.2 to 8.3 for surfaces; of scatter alone, whose differences of all orders are alike, mostly 15 to 30."""
+
 SURFACES, AS_ROUGH, MIN_TERM = (3, 4), 1.5, 1e-6
 EVEN_STEPS = 0.12
 """Degrees of the surfaces that are fitted to small boards, largest ratio of the residuals of the first to the second if
@@ -60,14 +66,16 @@ def excess_scatter(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tup
 def scatter_factors(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tuple[slice, slice]]) -> FloatArray:
     """Return the factors (P,) of the sigmas of each part: `excess_scatter`, for strong lenses also mixed differences.
 
-    Differences along rows do not remove the curvature of strong lenses; the smallest of all ratios is returned.
+    Differences along rows do not remove the curvature of strong lenses, nor those of order 5 that of a fisheye that a
+    small board faces; the smallest of all ratios is returned.
     """
     factors = excess_scatter(pixels, sigma_px, parts)
     for k in np.flatnonzero(factors > UNEXPLAINED_SCATTER).tolist():
         part = parts[k]
-        if any(change.every > STRONG_CURVATURE for change in spacing_changes(pixels[part])):
-            calmest = np.fmin.reduce([_mixed_roughness(pixels[part], sigma_px[part], *orders) for orders in MIXED])
-            factors[k] = max(np.fmin(factors[k], calmest), 1.0)
+        strong = any(change.every > STRONG_CURVATURE for change in spacing_changes(pixels[part]))
+        small = np.isfinite(native.surface_scatter(pixels[part], sigma_px[part], _rules())[1])
+        if strong or (small and factors[k] < BEND_DIFFERENCES * _bend(pixels[part], sigma_px[part])):
+            factors[k] = _calmest(factors[k], pixels[part], sigma_px[part])
     return factors
 
 
@@ -93,7 +101,25 @@ def small_scatter(pixels: FloatArray, sigma_px: FloatArray) -> float:
     cubic, quartic = native.surface_scatter(pixels, sigma_px, _rules())
     if not (cubic < AS_ROUGH * quartic and quartic > UNEXPLAINED_SCATTER):
         return 1.0
-    return 1.0 if any(change.every > EVEN_STEPS for change in spacing_changes(pixels)) else quartic
+    if any(change.every > EVEN_STEPS for change in spacing_changes(pixels)):
+        return 1.0
+    # The bend of a board that faces the lens is odd, and the quartic terms are even.
+    explained = quartic < BEND_SURFACES * _bend(pixels, sigma_px)
+    return _calmest(quartic, pixels, sigma_px) if explained else quartic
+
+
+def _calmest(factor: float, pixels: FloatArray, sigma_px: FloatArray) -> float:
+    """Return the smallest of `factor` and the MIXED differences of a board (R, C, 2), at least 1."""
+    return float(max(np.fmin.reduce([factor, *(_mixed_roughness(pixels, sigma_px, *o) for o in MIXED)]), 1.0))
+
+
+def _bend(pixels: FloatArray, sigma_px: FloatArray) -> float:
+    """Return the differences of order THIRD of a board (R, C, 2), over the expected ones, times the change of its
+    steps: what a lens adds to differences of order 5 is a small multiple of it."""
+    every = [(slice(0, pixels.shape[0]), slice(0, pixels.shape[1]))]
+    third = float(native.excess_scatter(pixels, sigma_px, every, _rules((THIRD, THIRD)))[0])
+    changes = (change.every for change in spacing_changes(pixels))
+    return third * max((change for change in changes if np.isfinite(change)), default=0.0)
 
 
 def _mixed_roughness(pixels: FloatArray, sigma_px: FloatArray, down: int, along: int) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rigkit.detection.subpixel.scatter import small_scatter
+from rigkit.detection.subpixel.scatter import scatter_factors, small_scatter
 
 SIGMA_PX = 0.02
 
@@ -41,6 +41,22 @@ def test_lens_distortion_does_not_raise_sigmas() -> None:
     sigma_px = np.full((6, 4), 0.001)
     bent = corners(4, 6, bend=2.0) + 0.001 * np.random.default_rng(1).standard_normal((6, 4, 2))
     assert small_scatter(bent, sigma_px) == 1.0
+
+
+@pytest.mark.parametrize(("times", "low", "high"), [(1.0, 1.0, 2.0), (6.0, 4.0, 8.0)])
+def test_a_small_board_that_faces_a_fisheye(times: float, low: float, high: float) -> None:
+    """Its bend is odd, so that quartic surfaces fit no better than cubic ones, and as smooth as scatter of order 5."""
+    rng = np.random.default_rng(3)
+    sigma_px, whole = np.full((5, 7), 0.004), [(slice(0, 5), slice(0, 7))]
+    factors = []
+    for _ in range(10):
+        u, v = (0.17 * (part + rng.uniform(-0.5, 0.5)) for part in np.meshgrid(np.arange(7) - 3.0, np.arange(5) - 2.0))
+        tangent = np.hypot(u, v)
+        pixels = 600.0 * np.stack([u, v], axis=-1) * (np.arctan(tangent) / tangent)[..., None]
+        pixels += times * 0.004 * rng.standard_normal((5, 7, 2))
+        factor = float(scatter_factors(pixels, sigma_px, whole)[0])
+        factors.append(factor * small_scatter(pixels, factor * sigma_px))
+    assert low <= np.median(factors) <= high
 
 
 def test_boards_of_many_or_hardly_any_corners_are_left_to_others() -> None:
