@@ -48,7 +48,7 @@ def doubtful_grid(image: NDArray[np.generic]) -> str | None:
 def _separate_squares(grey: GreyImage) -> str | None:
     """Return a message on a whole grid of squares that do not meet; None if there is none."""
     least, most = SQUARES_CORNERS
-    for grid in CircleSearch(grey).seen(coarse=True):
+    for grid in CircleSearch(grey).seen(coarse=True, whole=True):
         rows, columns = sorted((np.ptp(grid.label, axis=0) + 1).tolist())
         evidence = grid.evidence
         regular = evidence.misshapen < MISSHAPEN and evidence.displaced < DISPLACED

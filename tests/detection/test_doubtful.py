@@ -14,6 +14,7 @@ from helpers.data import shared_data
 from rigkit import detect_boards
 from rigkit.core.boards import Board
 from rigkit.core.errors import CheckFailed
+from rigkit.detection.circles import search
 from rigkit.detection.doubtful import doubtful_grid
 from rigkit.io.media.images import read_image
 from rigkit.workflows.detect import detect_in_images
@@ -106,12 +107,24 @@ def test_a_row_that_motion_hides_is_found_on_its_side(name: str) -> None:
     assert np.abs(off).max() < SMEARED_PX
 
 
-def test_a_grid_of_separate_squares_is_named(rng: np.random.Generator) -> None:
+def separate_squares(rng: np.random.Generator, *, missing: bool) -> np.ndarray:
     page = np.full((700, 1000), 245.0, np.float32)
     for row in range(5):
         for column in range(7):
             page[60 + 120 * row : 120 + 120 * row, 100 + 120 * column : 160 + 120 * column] = 20.0
+    if missing:
+        page[300:360, 460:520] = 245.0
     aslant = np.array([[0.6, 0.05, 10.0], [-0.02, 0.55, 60.0], [1e-4, -1e-4, 1.0]])
     image = cv2.GaussianBlur(cv2.warpPerspective(page, aslant, (640, 480), borderValue=120.0), (0, 0), 0.7)
-    words = doubtful_grid(np.clip(image + rng.normal(0.0, 2.0, image.shape), 0.0, 255.0).astype(np.uint8))
+    return np.clip(image + rng.normal(0.0, 2.0, image.shape), 0.0, 255.0).astype(np.uint8)
+
+
+def test_a_grid_of_separate_squares_is_named(rng: np.random.Generator) -> None:
+    words = doubtful_grid(separate_squares(rng, missing=False))
     assert words is not None and words.startswith("a grid of 7 x 5 separate squares is seen")
+
+
+def test_squares_with_gaps_are_not_fitted(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which takes most of the time in pictures of keyboards and windows."""
+    monkeypatch.setattr(search, "grid_of", lambda *_, **__: pytest.fail("fitted"))
+    assert doubtful_grid(separate_squares(rng, missing=True)) is None

@@ -46,6 +46,11 @@ class LabelledBlobs:
     label: IntArray
     hexagonal: bool
 
+    @property
+    def whole(self) -> bool:
+        """Whether they are a rectangle without gaps."""
+        return not self.hexagonal and len(self.label) == int((np.ptp(self.label, axis=0) + 1).prod())
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Neighbours:

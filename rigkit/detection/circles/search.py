@@ -36,10 +36,12 @@ class CircleSearch:
         found = [grid for grid in seen if len(grid) >= min_circles and grid.evidence.convincing]
         return sorted(found, key=lambda grid: -len(grid))
 
-    def seen(self, *, quick: bool = False, coarse: bool = False) -> list[CircleGrid]:
-        """Return all lattices that may be grids, with their evidence."""
+    def seen(self, *, quick: bool = False, coarse: bool = False, whole: bool = False) -> list[CircleGrid]:
+        """Return all lattices, or those that are `whole`, that may be grids, with their evidence."""
         out = []
         for found in self._labelled(coarse=coarse):
+            if whole and not found.whole:
+                continue
             own = self._blobs[coarse].chosen(found.index)
             earlier = [grid for blobs, fast, grid in self._seen if fast == quick and _same(blobs, own)]
             grid = earlier[0] if earlier else grid_of(self.grey, own, found, quick=quick)
