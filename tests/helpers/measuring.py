@@ -11,9 +11,11 @@ from rigkit.core.measurement_task import Quantity
 def read_off(quantity: Quantity, points: FloatArray) -> FloatArray:
     """The quantity measured from points (N, K, 3) by its definition, (N, ways)."""
     if quantity is Quantity.ANGLE:
-        a, b = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
-        cosine = np.sum(a * b, axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
-        return np.asarray(np.rad2deg(np.arccos(cosine)))[:, None]
+        a = points[:, 1:] - points[:, :1]
+        a /= np.linalg.norm(a, axis=-1, keepdims=True)
+        # Edges go round the vertex in equal steps: a quarter of them on is the other edge.
+        cosine = np.sum(a * np.roll(a, -(a.shape[1] // 4), axis=1), axis=-1)
+        return np.asarray(np.rad2deg(np.arccos(cosine)))
     if quantity is Quantity.PLANE:
         centred = points - points.mean(axis=1, keepdims=True)
         normals = np.linalg.svd(centred)[2][:, 2]

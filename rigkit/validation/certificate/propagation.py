@@ -30,7 +30,7 @@ import numpy as np
 from rigkit.calibration.rig.certainty.uncertainty import RigProjection
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays, scaled_pinv
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points, Rays, scaled_pinv
 from rigkit.core.errors import DegenerateError
 from rigkit.core.measurement_task import Quantity, Task
 from rigkit.geometry.rigid3 import Rigid3
@@ -38,6 +38,9 @@ from rigkit.validation.monitoring.evidence import Monitored
 
 PLANE_POINTS = 5
 """Points along each side of a measured plane."""
+ANGLE_TURNS = 8
+"""Orientations of a measured right angle about its vertex, a multiple of four: half right angles apart, so that an
+error that shears a square and one that stretches it are both seen (at one orientation the other is missed)."""
 OF_CORNERS, OF_LENSES, OF_MOUNTS, OF_SCALE, OF_DISTANCE = "corners", "lenses", "mounts", "board scale", "distance"
 """Causes of error."""
 
@@ -59,10 +62,15 @@ def measured_points(rays: Rays, task: Task, is_rig: bool) -> tuple[Points, Float
         points = np.stack([middle - half * rays, middle + half * rays], axis=1)
         return points, np.stack([-rays, rays], axis=1)[:, None]
     if task.quantity is Quantity.ANGLE:
-        points = np.stack([middle, middle + task.size_mm * level, middle + task.size_mm * upright], axis=1)
+        turn = 2.0 * np.pi / ANGLE_TURNS * np.arange(ANGLE_TURNS)[:, None]
+        edges = np.cos(turn) * level[:, None] + np.sin(turn) * upright[:, None]
+        points = middle[:, None] + task.size_mm * np.concatenate([np.zeros_like(rays)[:, None], edges], axis=1)
         # cos = a . b with unit edges a and b: at a right angle d angle = -(da . b + db . a).
-        turned = -np.stack([-(upright + level), upright, level], axis=1) / task.size_mm
-        return points, turned[:, None]
+        turned = np.zeros((len(rays), ANGLE_TURNS, 1 + ANGLE_TURNS, 3))
+        one, other = np.arange(ANGLE_TURNS), _other_edges()
+        turned[:, one, 0] = edges + edges[:, other]
+        turned[:, one, 1 + one], turned[:, one, 1 + other] = -edges[:, other], -edges
+        return points, turned / task.size_mm
     if task.quantity is Quantity.PLANE:
         steps = np.linspace(-half, half, PLANE_POINTS)
         x, y = (side.ravel() for side in np.meshgrid(steps, steps))
@@ -90,18 +98,20 @@ def measured_points(rays: Rays, task: Task, is_rig: bool) -> tuple[Points, Float
 def hessians(points: Points, quantity: Quantity) -> FloatArray:
     """Return the Hessians (N, M, 3 K, 3 K) of M lengths, depths or angles by their `measured_points` (N, K, 3)."""
     count = points.shape[1]
+    each = []
     if quantity is Quantity.ANGLE:
         edges = points[:, 1:] - points[:, :1]
         square = np.sum(edges[:, 0] ** 2, axis=-1)[:, None, None]
-        a, b = np.moveaxis(edges / np.sqrt(square), 1, 0)
-        along = np.cross(a, b)
-        # angle = -(da . r)(db . r) + (da . a)(da . b) + (db . a)(db . b) over the square, with r across both edges.
-        own = (a[:, :, None] * b[:, None, :] + b[:, :, None] * a[:, None, :]) / square
-        both = -along[:, :, None] * along[:, None, :] / square
-        by_edge = np.block([[own, both], [both, own]])
-        out = _differences([(0, 1), (0, 2)], count)
-        return np.asarray(out.T @ by_edge @ out)[:, None]
-    each = []
+        for one, other in enumerate(_other_edges()):
+            a, b = (edges[:, end] / np.sqrt(square[:, 0]) for end in (one, other))
+            along = np.cross(a, b)
+            # angle = -(da . r)(db . r) + (da . a)(da . b) + (db . a)(db . b) over the square, with r across both edges.
+            own = (a[:, :, None] * b[:, None, :] + b[:, :, None] * a[:, None, :]) / square
+            both = -along[:, :, None] * along[:, None, :] / square
+            by_edge = np.block([[own, both], [both, own]])
+            out = _differences([(0, 1 + one), (0, 1 + other)], count)
+            each.append(out.T @ by_edge @ out)
+        return np.asarray(np.stack(each, axis=1))
     for first in range(0, count, 2):
         direction = points[:, first + 1] - points[:, first]
         length = np.linalg.norm(direction, axis=-1)[:, None, None]
@@ -110,6 +120,11 @@ def hessians(points: Points, quantity: Quantity) -> FloatArray:
         out = _differences([(first, first + 1)], count)
         each.append(out.T @ across @ out)
     return np.asarray(np.stack(each, axis=1))
+
+
+def _other_edges() -> IntArray:
+    """Return the index of the second edge of the right angle that begins with each edge, (ANGLE_TURNS,)."""
+    return np.roll(np.arange(ANGLE_TURNS), -(ANGLE_TURNS // 4))
 
 
 def _differences(pairs: Sequence[tuple[int, int]], count: int) -> FloatArray:

@@ -155,7 +155,9 @@ def test_what_noise_along_the_rays_does_to_second_order_is_counted(
         error = (moved - read_off(quantity, points)) * (np.radians(1.0) if quantity is Quantity.ANGLE else 1.0)
         return np.asarray((error**2).mean(axis=0))
 
-    np.testing.assert_allclose(squares(off), stated, rtol=0.08)
+    # The third order, which is not counted, makes errors of angles smaller by up to a twentieth at some orientations.
+    rtol = 0.12 if quantity is Quantity.ANGLE else 0.08
+    np.testing.assert_allclose(squares(off), stated, rtol=rtol)
     first = rig.sigma_px**2 * (found.by_corner**2).sum(axis=(-1, -2))
     # What does not face the first order at all: depths, of which ends nearer or farther are that.
     assert (first < (1.0 if quantity is Quantity.DEPTH else 0.9) * stated).all()
@@ -164,9 +166,30 @@ def test_what_noise_along_the_rays_does_to_second_order_is_counted(
     by_calibration = found.points_by_calibration * sigmas
     off += np.einsum("nkip,sp->snki", by_calibration, rng.normal(size=(8000, len(sigmas))))
     of_both = sum(variances(replace(rig, covariance=np.diag(sigmas**2)), task, points, found).values())
-    np.testing.assert_allclose(squares(off), of_both, rtol=0.08)
+    np.testing.assert_allclose(squares(off), of_both, rtol=rtol)
     linear = np.sum((found.by_calibration * sigmas) ** 2, axis=-1)
     assert quantity is not Quantity.ANGLE or (stated + linear < 0.9 * of_both).all()
+
+
+def test_bounds_of_angles_hold_however_these_lie(rng: np.random.Generator) -> None:
+    """The stated variance at the worst orientation is that of any other to a tenth: also of those between the ones
+    that are looked at."""
+    rig = rig_of("kannala_brandt", rig_covariance(lens("kannala_brandt"), rng))
+    certificate = certify(rig, Task(quantity=Quantity.ANGLE, size_mm=150.0, distance_mm=1500.0), cells=(7, 5))
+    stated = sum(s**2 for s in certificate.sigma.values())[certificate.in_view]
+    rays, _ = rig.cameras[0].unproject(certificate.pixels[certificate.in_view])
+    level = np.cross([0.0, 1.0, 0.0], rays)
+    level /= np.linalg.norm(level, axis=1, keepdims=True)
+    upright = np.cross(rays, level)
+    for turn in np.linspace(0.0, 2.0 * np.pi, 23):
+        a, b = (np.cos(t) * level + np.sin(t) * upright for t in (turn, turn + 0.5 * np.pi))
+        points = 1500.0 * rays[:, None] + 150.0 * np.stack([np.zeros_like(a), a, b], axis=1)
+        weights = np.stack([a + b, -b, -a], axis=1)[:, None] / 150.0
+        found = gradients(rig.cameras, rig.cam_from_rig, points, weights)
+        noise = rig.sigma_px**2 * (found.by_corner**2).sum(axis=(-1, -2))
+        lenses = np.einsum("nmi,ij,nmj->nm", found.by_calibration, rig.covariance, found.by_calibration)
+        variance = np.rad2deg(1.0) ** 2 * (noise + lenses)[:, 0]
+        assert (variance <= 1.1 * stated).all()
 
 
 def test_bounds_of_one_camera_hold_as_often_as_they_say(rng: np.random.Generator) -> None:
