@@ -49,6 +49,26 @@ def test_a_folder_becomes_a_manifest_that_loads(tmp_path: Path, capsys: pytest.C
     assert (tmp_path / "dataset.toml").read_text() == before
 
 
+def test_a_board_in_words_stands_for_its_copies(tmp_path: Path) -> None:
+    shutil.copytree(IMAGES / "fisheye-general", tmp_path / "first")
+    options = ["--pose-type", "general", "--calibration", str(CALIBRATION), "--angle-deg", "90+-0.3"]
+    assert main(["init", str(tmp_path), "--board", "8x6x50", *options]) == 0
+    dataset = load_dataset(tmp_path)
+    assert [(b.board_id, b.size, b.squares_mm) for b in dataset.boards] == [
+        (f"plane{k}", (8, 6), (50.0, 50.0)) for k in (1, 2, 3)
+    ]
+    assert len(dataset.pair("first").truth.angles) == 3
+
+
+def test_an_angle_needs_two_boards(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(IMAGES / "fisheye-general", tmp_path / "first")
+    board = REPOSITORY / "calib" / "boards" / "a8x6_50.toml"
+    options = ["--pose-type", "general", "--calibration", str(CALIBRATION), "--angle-deg", "90+-0.3"]
+    assert main(["init", str(tmp_path), "--board", str(board), *options]) == 2
+    assert "--angle-deg is between two boards, but pair 'first' has one" in capsys.readouterr().err
+    assert not (tmp_path / "dataset.toml").exists()
+
+
 def test_folders_of_two_sides_and_names_with_quotes(tmp_path: Path) -> None:
     root = tmp_path / 'the "lab"'
     for side, number in (("left", 1), ("right", 2)):

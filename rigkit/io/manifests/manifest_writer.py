@@ -6,13 +6,14 @@ import json
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
+from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.io.boards.board_file import board_values
 from rigkit.io.disk.toml_reader import relative_path, toml_text
 from rigkit.io.manifests.manifest import DATASET_SCHEMA
@@ -199,6 +200,7 @@ def manifest_text(new: NewManifest, root: Path) -> str:
             out += [f"square_mm = {declared:g}", ""]
         ids = [f"plane{number}" for number in range(1, len(most) + 1)]
     else:
+        declared = with_copies(declared, most)
         out += [line for board in declared for line in board.lines(root)]
         ids = [board.board.board_id for board in declared]
     size = pairs[0].first.size_px
@@ -208,10 +210,30 @@ def manifest_text(new: NewManifest, root: Path) -> str:
         out += ["# with its own calibration, and name it in camera2 below."]
     for camera, calibration in new.calibrations.items():
         out += ["[[cameras]]", f"id = {toml_text(camera)}", f"calibration = {toml_text(calibration)}", ""]
+    alone = next((name for name in new.angles if len(ids) < 2), None)
+    if alone is not None:
+        raise InputError(f"init: --angle-deg is between two boards, but pair '{alone}' has one; give each with --board")
     for pair in pairs:
         out += _pair_lines(pair, root, new.cameras[pair.name], new.pose_types[pair.name], ids)
         out += _truth_lines(new.baselines.get(pair.name), new.angles.get(pair.name), ids)
     return "\n".join(out)
+
+
+def with_copies(declared: Sequence[DeclaredBoard], seen: Sequence[tuple[int, int]]) -> list[DeclaredBoard]:
+    """Return the boards, a chessboard in words declared once followed by its copies among the sizes `seen` in an image.
+
+    Copies of a marked board cannot be told apart; those of a board's file are a person's to name.
+    """
+    sizes = Counter((max(b.board.size), min(b.board.size)) for b in declared)
+    out = list(declared)
+    for one in declared:
+        size = (max(one.board.size), min(one.board.size))
+        if one.file is None and isinstance(one.board.pattern, Chessboard) and sizes[size] == 1:
+            out += [one] * (Counter(seen)[size] - 1)
+    return [
+        one if k < len(declared) else replace(one, board=replace(one.board, board_id=f"plane{k + 1}"))
+        for k, one in enumerate(out)
+    ]
 
 
 def _pair_lines(
