@@ -176,7 +176,7 @@ def test_bounds_of_angles_hold_however_these_lie(rng: np.random.Generator) -> No
     that are looked at."""
     rig = rig_of("kannala_brandt", rig_covariance(lens("kannala_brandt"), rng))
     certificate = certify(rig, Task(quantity=Quantity.ANGLE, size_mm=150.0, distance_mm=1500.0), cells=(7, 5))
-    stated = sum(s**2 for s in certificate.sigma.values())[certificate.in_view]
+    stated = np.sum([s**2 for s in certificate.sigma.values()], axis=0)[certificate.in_view]
     rays, _ = rig.cameras[0].unproject(certificate.pixels[certificate.in_view])
     level = np.cross([0.0, 1.0, 0.0], rays)
     level /= np.linalg.norm(level, axis=1, keepdims=True)
