@@ -125,7 +125,8 @@ def mounts_of(views: RigViews) -> tuple[list[Rigid3], tuple[Finding, ...]]:
                 "boards of each size with their own squares, or mark one of them"
                 if alike
                 else "take frames in which both see a whole board, and check that simultaneous images have the same "
-                "name or number"
+                "name or number; cameras that never see one board need boards mounted to each other, declared as "
+                "[[rigid_boards]] in a session, and images that show these together"
             )
             raise InputError(
                 f"rig: camera '{names[j]}' shares no board in any frame with '{names[0]}' or the cameras connected to "
