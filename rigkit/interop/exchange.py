@@ -16,10 +16,9 @@ from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.errors import InputError
 from rigkit.core.printing import digits
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.interop.nearest import EXACT_PX
 
 MM_PER_M = 1000.0
-EXACT_PX = 1e-3
-"""The note on a refit states no smaller errors: corners are seldom known to a hundredth of a pixel."""
 MIN_REPORTED_PX = 0.1
 """For refits with larger errors, the note names a model of the session without loss."""
 

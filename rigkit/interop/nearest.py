@@ -27,7 +27,7 @@ NEAREST = (
 """Models in the order in which they are tried, with their orders. Polynomials have the highest degree, because there is
 no noise to overfit; the last models have few terms, and are the original models of some lenses."""
 EXACT_PX = 0.01
-"""A camera with a smaller error is accepted at once: corners are no more accurate."""
+"""A camera with a smaller error is accepted at once, and notes state none: corners are no more accurate."""
 MIN_SEEN = 0.99
 """Fraction of the lens's rays that a camera must see."""
 AZIMUTHS, ANGLES = 144, 120

@@ -390,11 +390,9 @@ def test_words_that_are_nearly_right_are_proposed(capsys: pytest.CaptureFixture[
 
 
 def test_a_camera_too_many_is_no_data_set(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["reconstruct", "--images", "a.png", "b.png", "--camera", "a.json", "b.json"]) == 2
-    printed = capsys.readouterr().err
-    assert "'b.json' is taken for a DATASET" in printed and "the second image's camera is --camera2" in printed
-    assert main(["reconstruct", "a.png", "b.png", "--rig", "rig.json"]) == 2
-    assert "'a.png' is taken for a DATASET; images follow --images together" in capsys.readouterr().err
+    for words in ("--images a.png b.png --camera a.json b.json", "b.json a.png --rig rig.json"):
+        assert main(["reconstruct", *words.split()]) == 2
+        assert "'b.json' is taken for a DATASET; images follow --images" in capsys.readouterr().err
 
 
 def test_a_folder_behind_r_is_not_taken_for_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
