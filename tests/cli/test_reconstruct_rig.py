@@ -90,7 +90,7 @@ def test_views_that_cannot_be_fused_are_named(
     ):
         assert run(folder, *more, "--no-pictures") == 2, more
         assert words in capsys.readouterr().err
-    assert main(["reconstruct", "--camera", "c.json", "--images", *images]) == 2
+    assert main(["reconstruct", "--camera", str(folder / "rig.json"), "--images", *images]) == 2
     assert "need --rig" in capsys.readouterr().err
 
 
