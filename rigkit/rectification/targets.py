@@ -49,7 +49,7 @@ def target_camera(
     if not 0.0 < hfov <= WIDEST_RAD[projection]:
         raise InputError(
             f"field of view of {np.degrees(hfov):g} degrees: a {projection} image shows more than 0 and at most "
-            f"{np.degrees(WIDEST_RAD[projection]):g}"
+            f"{np.degrees(WIDEST_RAD[projection]):g}; for more take another projection ({', '.join(PROJECTIONS)})"
         )
     perspective = projection == "perspective"
     # Width in px per px of focal length; the image reaches half a pixel beyond the outermost pixels' centres.

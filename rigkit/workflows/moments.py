@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rigkit.core.errors import InputError
+from rigkit.core.printing import counted
 from rigkit.io.manifests.rig_session import frames_of_images
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.folder_session import cameras_in, images_of_camera
@@ -93,6 +94,12 @@ def _by_names(names: Sequence[str], images: Sequence[Path]) -> ImagesByMoment:
         if name in found.setdefault(moment, {}):
             return []
         found[moment][name] = image
+    missing = [name for name in names if not any(name in moment for moment in found.values())]
+    # A camera may be called as images are numbered.
+    if missing and not any(name.isdigit() for name in names):
+        raise InputError(
+            f"by their names no image is of camera '{missing[0]}'; give images of each of {', '.join(names)}"
+        )
     if any(len(moment) < len(names) for moment in found.values()):
         return []
     return [[moment[name] for name in names] for moment in found.values()]
@@ -112,7 +119,7 @@ def _sides(names: Sequence[str], text: str, other: str) -> dict[str, tuple[str, 
 def _in_order(names: Sequence[str], images: Sequence[Path]) -> ImagesByMoment:
     if len(images) % len(names):
         raise InputError(
-            f"{len(images)} different images, which are not moments of {len(names)} cameras each ({', '.join(names)}); "
-            "give as many of each camera"
+            f"{counted(len(images), 'different image')} of {len(names)} cameras ({', '.join(names)}); give as many of "
+            "each camera"
         )
     return [list(images[k : k + len(names)]) for k in range(0, len(images), len(names))]

@@ -100,8 +100,16 @@ def test_images_are_sorted_by_the_cameras_in_their_folders_names(tmp_path: Path)
 def test_other_names_leave_images_moment_by_moment(names: tuple[str, ...], tmp_path: Path) -> None:
     images = _images(tmp_path, *names)
     assert moments_of(NAMES, images)[0] == [images[:2], images[2:]]
-    with pytest.raises(InputError, match="3 different images, which are not moments of 2 cameras"):
+    with pytest.raises(InputError, match="3 different images of 2 cameras"):
         moments_of(NAMES, images[:3])
+
+
+def test_two_images_of_one_camera_are_no_moment_of_two(tmp_path: Path) -> None:
+    images = _images(tmp_path, "left10", "left11")
+    with pytest.raises(InputError, match="by their names no image is of camera 'right'; give images of each of left"):
+        moments_of(NAMES, images)
+    # Cameras called 0 and 1 are not told from numbers.
+    assert moments_of(("0", "1"), _images(tmp_path, "at_0_a", "at_0_b"))[0]
 
 
 @pytest.mark.parametrize(

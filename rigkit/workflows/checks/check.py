@@ -355,8 +355,9 @@ def _require_right_order(check: CalibrationCheck, views: Sequence[FreshView]) ->
         if exchanged.holds or (check.unexplained and not exchanged.unexplained):
             # Two cameras with equal lenses, both turned upside down, look as if exchanged.
             how = f"exchanged, or {check.flipped}" if check.flipped else "exchanged"
+            undone = "they fit" if exchanged.holds else "a change explains them"
             raise InputError(
-                f"check: the images of '{names[i]}' and '{names[j]}' are {how}: undoing that, they fit; give them in "
+                f"check: the images of '{names[i]}' and '{names[j]}' are {how}: undoing that, {undone}; give them in "
                 f"the rig's order, {', '.join(names)}"
             )
 

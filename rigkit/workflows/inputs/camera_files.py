@@ -103,8 +103,8 @@ def require_covariance(source: Path) -> None:
     """Raise InputError for another program's camera file, which has no covariance."""
     if source.is_file() and camera_format(camera_text(source)) not in (None, "rigkit"):
         raise InputError(
-            f"'{source}': a file of another program has no covariance, so its own error cannot be separated from a "
-            "change; run `rigkit calibrate` on images from the time when it held, and give its result"
+            f"'{source}': a file of another program has no covariance, so its own error is unknown; run `rigkit "
+            "calibrate` on images of boards, and give its result"
         )
 
 
