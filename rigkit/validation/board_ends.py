@@ -49,7 +49,8 @@ def contradicted_counts(pair: MatchedPair, images: Sequence[NDArray[Any]]) -> tu
     """Return a failed check for every chessboard with fewer or more columns or rows than declared.
 
     Fewer: both ends of its columns (rows) must be visible in at least one of the two images (H, W), and no image that
-    has room for more may show anything else there. More: squares go on where the declared ones all have their corners.
+    has room for more may show anything else there. More: in one image squares go on where the declared ones all have
+    their corners.
     """
     moves = Rigid3.identity(), pair.identity.cam2_from_cam1
     cameras = pair.camera1, pair.camera2
@@ -109,6 +110,9 @@ def _side(
     places[..., axis] = (edge + out * np.array([0.5, 1.0 - BESIDE_LINE, 1.0 + BESIDE_LINE]))[:, None]
     points = np.concatenate([places * board.squares_mm, np.zeros((*places.shape[:-1], 1))], axis=-1)
     found = {_side_in(image, *camera.project(pose.apply(points))) for image, camera, pose in views} - {None}
+    if BeyondCorners.GOES_ON in found:
+        # Of a larger board the two images may show different columns: where one ends, the other goes on.
+        return BeyondCorners.GOES_ON
     return found.pop() or BeyondCorners.UNKNOWN if len(found) == 1 else BeyondCorners.UNKNOWN
 
 

@@ -99,6 +99,21 @@ def test_squares_that_go_on_beyond_the_declared_ones_fail() -> None:
     assert f"{COLUMNS} x {ROWS} inner corners or more" in check.how
 
 
+def test_images_that_show_different_columns_of_a_larger_board_fail() -> None:
+    """Taken for the same corners, they make the baseline a square longer or shorter."""
+    scene, images = shown()
+    declared = replace(BOARDS[0], columns=COLUMNS - 1)
+
+    def columns_from(first: int, found: BoardDetection) -> list[BoardDetection]:
+        seen = (found.grid[:, 0] >= first) & (found.grid[:, 0] < COLUMNS - 1 + first)
+        grid = found.grid[seen] - np.array([first, 0])
+        return [BoardDetection(found.board_id, COLUMNS - 1, ROWS, grid, found.pixels[seen], found.sigma_px[seen])]
+
+    first, second = (columns_from(k, found[0]) for k, found in enumerate(scene.detections()))
+    (check,) = contradicted_counts(match_pair("made", scene.camera1, scene.camera2, first, second, [declared]), images)
+    assert (check.measured, check.ours) == (COLUMNS - 1, COLUMNS)
+
+
 def test_what_is_left_may_lie_on_the_board_the_other_way_round() -> None:
     """Of a square part, the ends of the rows are no ends of columns."""
     ends, unknown = (BeyondCorners.ENDS, BeyondCorners.ENDS), (BeyondCorners.ENDS, BeyondCorners.UNKNOWN)
