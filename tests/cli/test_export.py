@@ -29,7 +29,7 @@ from rigkit.io.calibrations.calibration_file import camera_to_json, load_calibra
 from rigkit.io.ply import read_ply
 from rigkit.workflows.inputs.camera_files import import_rig
 from rigkit.workflows.options.cameras import ExportCameraOptions
-from rigkit.workflows.outputs.export_camera import export_camera, foreign_files
+from rigkit.workflows.outputs.export_camera import export_camera, foreign_files, foreign_rig_files
 from rigkit.workflows.reconstruction.pairs import find_boards
 
 CAMERAS = REPOSITORY / "calib" / "cameras"
@@ -321,3 +321,12 @@ def test_a_camera_of_py_ocamcalib_needs_the_size_of_its_images(
     camera = load_camera(ours)
     assert camera.size_px == (1280, 960)
     np.testing.assert_allclose(camera.project(np.array([0.0, 0.0, 1.0]))[0], [640.5, 480.25], atol=1e-9)
+
+
+def test_a_refit_is_stated_once_for_opencv_and_ros(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    known = load_calibration(CALIBRATION)
+    foreign_files(known, Path("x.json"), ["opencv", "ros"])
+    rig = {name: (known.camera, Rigid3(np.eye(3), [x, 0.0, 0.0])) for name, x in (("left", 0.0), ("right", -90.0))}
+    foreign_rig_files(rig, Path("rig.json"), ["opencv", "ros"], {})
+    assert ["refitted" in line for line in caplog.messages] == [True, False, True, False]

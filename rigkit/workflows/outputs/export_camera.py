@@ -169,6 +169,7 @@ def foreign_files(calibration: Calibration, result: Path, kinds: Sequence[str]) 
     Raises InputError for a format that cannot represent the camera.
     """
     files = {}
+    said: dict[str, Path] = {}
     paths = foreign_paths(result, kinds)
     outline = outline_of_corners(calibration) if kinds else None
     if paths:
@@ -176,8 +177,10 @@ def foreign_files(calibration: Calibration, result: Path, kinds: Sequence[str]) 
     for kind, path in zip(kinds, paths, strict=True):
         done = _written_camera(calibration.camera, kind, outline)
         files[path] = done.text
+        # OpenCV and ROS have the same models.
+        same = said.setdefault(done.note.partition(" has no ")[2] or done.note, path)
         if done.note:
-            _log.info(f"{path}: {done.note}")
+            _log.info(f"{path}: {done.note if same == path else f'the same lens as in {same}'}")
     return files
 
 
