@@ -1,6 +1,7 @@
 """Regression of each image's residuals on possible changes between images: focal length, shift, bend of the board ...
 
-At first order, with each image's pose and everything common to all images eliminated.
+At first order, with each image's pose and everything common to all images eliminated. What the other images predict of
+an image's residuals (`predicted_by_others`) is no change.
 """
 
 from __future__ import annotations
