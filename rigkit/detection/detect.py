@@ -13,7 +13,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.fields import of_one_moment
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.repeated_lines import LEGIBLE, without_repeated_lines
+from rigkit.detection.repeated_lines import without_repeated_lines
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import grey_image
@@ -63,9 +63,7 @@ def detect_boards(
     before = without_repeated_lines(image) if isinstance(image, np.ndarray) and image.ndim > 1 else None
     if before is None:
         return found
-    fewer = _detected(before.image, boards or (), min_corners, None, quick)
-    all_lines, once = (sum(len(item.grid) for item in items) for items in (found, fewer))
-    return tuple(map(before.restored, fewer)) if once > LEGIBLE * all_lines else found
+    return before.better(found, _detected(before.image, boards or (), min_corners, None, quick))
 
 
 def _detected(

@@ -6,13 +6,14 @@ ways that look like a lens. The lines repeat exactly, so that leaving the copies
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, median_of
 from rigkit.core.detections import BoardDetection
 
 SAMPLED, STRETCH, MORE_SAMPLED = 4, 128, 64
@@ -24,6 +25,11 @@ MIN_LINES = 32
 
 REGULAR = 2.0
 """Range, in lines, of the distances of the first copies from a regular step, which rounding keeps below this."""
+
+EVEN_FACTOR, MUCH_SURER = 1e-6, 0.4
+"""Largest difference of the factor of lines that are all repeated as often from a whole number, and largest sigma of
+corners in a drawing, over that without the copies: with modules of 2 to 10 px 0.2 at most, in 28 REAL images enlarged
+twice 0.66 and more."""
 
 LEGIBLE = 0.5
 """A print drawn with modules of a few pixels repeats lines, too, but is not legible without the copies: unless they are
@@ -38,6 +44,22 @@ class Repeated:
     image: NDArray[np.generic]
     factor: FloatArray
     offset: FloatArray
+
+    def better(self, found: Sequence[BoardDetection], fewer: Sequence[BoardDetection]) -> tuple[BoardDetection, ...]:
+        """Return the boards `found` with all lines, or those of `fewer`, which were found in this image.
+
+        Where all lines are repeated as often, no edge is moved, and boards drawn with modules of a few pixels are much
+        more certain with all lines.
+        """
+        restored = tuple(map(self.restored, fewer))
+        all_lines, once = (
+            np.concatenate([np.zeros(0), *(item.sigma_px for item in items)]) for items in (found, restored)
+        )
+        if not len(once) > LEGIBLE * len(all_lines):
+            return tuple(found)
+        even = bool((np.abs(self.factor - np.rint(self.factor)) < EVEN_FACTOR).all())
+        exact = even and len(all_lines) and median_of(all_lines) < MUCH_SURER * median_of(once)
+        return tuple(found) if exact else restored
 
     def restored(self, item: BoardDetection) -> BoardDetection:
         """Return `item`, detected in this image, in pixels of the one with repeated lines."""

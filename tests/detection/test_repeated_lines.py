@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from detection_bench.blanks import BLANKS, blank
 from detection_bench.scenes import one_board
 
 from rigkit import detect_boards
+from rigkit.core.boards import Board
+from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.repeated_lines import without_repeated_lines
 
 FACTORS = [(1.5, 1.5), (1.25, 1.25), (2.0, 2.0), (1.0, 2.0), (1.1, 1.0)]
@@ -53,3 +56,13 @@ def test_a_drawing_of_squares_of_a_few_pixels_is_found() -> None:
     assert not detect_boards(repeated.image)
     (found,) = detect_boards(image)
     assert (found.columns, found.rows, found.complete) == (49, 39, True)
+
+
+def test_a_drawing_whose_markers_are_legible_either_way_stays_exact() -> None:
+    """Modules of 4 px are enlarged pixels, too, but their edges are where they were drawn."""
+    opencv = cv2.aruco.CharucoBoard((11, 8), 8.0, 6.0, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+    image = np.pad(opencv.generateImage((11 * 32, 8 * 32)), 20, constant_values=255)
+    assert without_repeated_lines(np.dstack([image] * 3)) is not None
+    (found,) = detect_boards(image, [Board("c", 10, 7, 8.0, 8.0, pattern=Charuco("DICT_4X4_50", 6.0))])
+    assert len(found.grid) == 70
+    assert np.abs(found.pixels - (32.0 * (found.grid + 1) + 19.5)).max() < 0.002
