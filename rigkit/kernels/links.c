@@ -247,8 +247,7 @@ INLINE void link_each(
     int64_t listed[2] = {0, 0};
     for (int64_t k = 0; k <= count; k++) {
         if (k < count)
-            listed[k % 2] = list_candidates(
-                corners, squares, places, k, image, scale, offset, rules, near, candidates[k % 2]);
+            listed[k % 2] = list_candidates(corners, squares, places, k, image, scale, offset, rules, near, candidates[k % 2]);
         if (k > 0)
             link_arms(
                 corners, image, scale, offset, rules, squares->order[k - 1], candidates[(k - 1) % 2], listed[(k - 1) % 2], nearest,
