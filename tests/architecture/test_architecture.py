@@ -339,33 +339,6 @@ def test_help_and_version_import_nothing_heavy(option: str, shown: str) -> None:
     assert shown in done.stdout
 
 
-def test_missing_files_are_refused_before_the_work_is_imported() -> None:
-    calls = [
-        "calibrate n",
-        "certify n --length 1 --distance 1",
-        "check n n",
-        "crosscheck n",
-        "detect n",
-        "diff n n",
-        "export n --to ros -o o",
-        "handeye n n --camera n --board n",
-        "plan n",
-        "pose n --camera n --board n",
-        "reconstruct n",
-        "reconstruct --images n n --rig n",
-        "rectify n --camera n -o o",
-        "validate n",
-    ]
-    code = (
-        "import sys; from rigkit.cli.main import main\n"
-        f"for words in {calls!r}:\n    assert main(words.split()) == 2, words\n"
-        "    assert 'cv2' not in sys.modules, words"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.count("'n' does not exist") == len(calls)
-
-
 def test_verbs_begin_without_scipy() -> None:
     """It takes a quarter of a second, and most sessions have no use for it."""
     verbs = ("calibration.calibrate_any", "detect", "reconstruction.reconstruct_scene", "validation.validate")
