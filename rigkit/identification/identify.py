@@ -167,7 +167,7 @@ def _shared(match: BoardMatch, views: tuple[ImageObservations, ImageObservations
         placement.grid_of(view.detections[index])
         for placement, view, index in zip(match.placement, views, match.index, strict=True)
     )
-    return len(set(map(tuple, first.tolist())) & set(map(tuple, second.tolist())))
+    return len(first) + len(second) - len(np.unique(np.concatenate([first, second]), axis=0))
 
 
 def _roll_rad(assignment: Assignment) -> float:

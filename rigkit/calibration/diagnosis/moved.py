@@ -113,7 +113,7 @@ def moved_lens(observations: Observations, fit: Fit, *, tests: int = 1) -> tuple
     message = (
         f"the lens (or the board) changed at image '{images[first]}' ({apart.sigmas:.0f} standard deviations, p <= "
         f"{chance:.2g} for a split at any image): another camera, focus, zoom or mount, or images that a program "
-        f"changed"
+        "changed"
     )
     remedy = "calibrate the images before it and those from it on separately, or retake all"
     return (Finding.contradicting(message, remedy),)
