@@ -19,7 +19,7 @@ import numpy as np
 from rigkit.calibration.solving.clustered import Clustered, clustered_covariance, effective_freedom, widening
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
-from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.arrays import FloatArray, IntArray, root_diagonal
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
@@ -251,7 +251,7 @@ def _by_image(problem: DenseProblem, image: IntArray) -> Clustered:
     np.add.at(information, image, np.einsum("nka,nkb->nab", rows, rows))
     np.add.at(score, image, np.einsum("nka,nk->na", rows, residual))
     total = information.sum(axis=0)
-    scale = np.sqrt(np.maximum(np.diag(total), np.finfo(float).tiny))
+    scale = root_diagonal(total)
     scaled = total / np.outer(scale, scale)
     if not np.linalg.eigvalsh(scaled)[0] > OPEN_PART:
         return Clustered(np.diag(np.full(UNKNOWNS, np.inf)), 1.0, float("inf"))

@@ -198,6 +198,11 @@ def sampling_step(count: int, max_samples: int) -> int:
     return max(1, math.ceil(count / max_samples))
 
 
+def spread_indices(count: int, max_samples: int) -> IntArray:
+    """Return the indices of at most `max_samples` of `count` items, evenly spread from the first to the last."""
+    return np.linspace(0, count - 1, min(max_samples, count)).astype(np.int64)
+
+
 def rows_where(values: FloatArray, which: BoolArray) -> FloatArray:
     """Return the rows (M, K) of `values` (..., K) where `which` (...) is true. values[which] takes five times as
     long."""
@@ -219,6 +224,12 @@ def quantiles_of(values: FloatArray, shares: Sequence[float]) -> list[float]:
         low, high = ordered[int(below)], ordered[min(int(below) + 1, len(ordered) - 1)]
         out.append(float(low + part * (high - low)))
     return out
+
+
+def root_diagonal(matrices: FloatArray) -> FloatArray:
+    """Return the roots (..., n) of the diagonals of information matrices (..., n, n), at least that of the smallest
+    number: divided by them on both sides, matrices of unknowns with different units have a unit diagonal."""
+    return np.asarray(np.sqrt(np.maximum(np.diagonal(matrices, axis1=-2, axis2=-1), np.finfo(float).tiny)))
 
 
 def symmetric_pinv(matrix: FloatArray, rcond: float = 1e-15) -> FloatArray:

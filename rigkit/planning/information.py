@@ -32,7 +32,7 @@ from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.registry import camera_model
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points, root_diagonal
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
@@ -299,7 +299,7 @@ def median_motion(motions: Sequence[Rigid3]) -> Rigid3:
 
 def _inverse(matrices: FloatArray) -> FloatArray:
     """Return the inverses of matrices (..., 6, 6), scaled first: radians and millimetres differ in magnitude."""
-    scale = 1.0 / np.sqrt(np.maximum(np.einsum("...ii->...i", matrices), np.finfo(float).tiny))
+    scale = 1.0 / root_diagonal(matrices)
     unit = matrices * scale[..., :, None] * scale[..., None, :]
     return np.asarray(np.linalg.pinv(unit, hermitian=True) * scale[..., :, None] * scale[..., None, :])
 

@@ -31,7 +31,17 @@ from rigkit.calibration.result import Calibration, CalibrationCorners, Rival
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.cameras.moving_pupil import NearCamera
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Rays, scaled_pinv, symmetric_pinv
+from rigkit.core.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Mat3,
+    Pixels,
+    Rays,
+    scaled_pinv,
+    spread_indices,
+    symmetric_pinv,
+)
 from rigkit.geometry.rotation import exp_so3
 
 CORNERS = 400
@@ -371,7 +381,7 @@ def _spread(corners: CalibrationCorners) -> IntArray:
     rank = np.zeros(len(corners.count), np.int64)
     rank[shown[np.lexsort(corners.pixels[chosen[first]].T)]] = np.arange(len(shown))
     chosen = chosen[np.argsort(rank[view], kind="stable")]
-    return chosen[np.linspace(0, len(chosen) - 1, min(CORNERS, len(chosen))).astype(np.int64)]
+    return chosen[spread_indices(len(chosen), CORNERS)]
 
 
 def uncertainty_map(calibration: Calibration, *, grid: tuple[int, int] = (40, 30)) -> Uncertainty:

@@ -30,7 +30,7 @@ from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import far_camera, with_pupil_of
-from rigkit.core.arrays import FloatArray, Rays
+from rigkit.core.arrays import FloatArray, Rays, spread_indices
 from rigkit.core.errors import DegenerateError, InputError
 
 MIN_LIKELY = 0.05
@@ -140,5 +140,5 @@ def between_models(
 def spread_rays(points_in_cam: FloatArray) -> Rays:
     """Return unit rays (M, 3) to up to 400 of the points (N, 3), spread over their angles with the axis."""
     rays = points_in_cam / np.linalg.norm(points_in_cam, axis=-1, keepdims=True)
-    chosen = np.linspace(0, len(rays) - 1, min(RAYS, len(rays))).astype(np.int64)
+    chosen = spread_indices(len(rays), RAYS)
     return np.asarray(rays[np.argsort(rays[:, 2])[chosen]])

@@ -44,7 +44,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.moving_pupil import far_camera
 from rigkit.cameras.scaramuzza import Scaramuzza
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, spread_indices
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
 
@@ -341,7 +341,7 @@ def _partners(
     reach = SAME_MOTION * distance * 2.0
     weight = 1.0 / _near(points, reach, np.ones(len(points)))
     along = np.lexsort(centre.T)
-    starts = along[np.unique(np.linspace(0, len(centre) - 1, min(MAX_STARTS, len(centre))).astype(np.int64))]
+    starts = along[spread_indices(len(centre), MAX_STARTS)]
     # Displacement of a frame at the boards' mean place by each motion, as products of all ends and starts: coordinates
     # first, then start, end and point.
     typical = frame + centre.mean(axis=0)

@@ -37,7 +37,7 @@ from rigkit.calibration.diagnosis.view_evidence import (
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.solving.clustered import MIN_LEFT
-from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.arrays import FloatArray, IntArray, root_diagonal
 from rigkit.core.findings import Finding
 from rigkit.kernels.departures import displacements
 
@@ -100,7 +100,7 @@ class MovingPupil:
         # Rows common to all images, then the pupil and the residual.
         products, image, p, residuals = found
         whole = products.sum(axis=0)
-        scale = np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
+        scale = root_diagonal(whole)
         gram = whole / np.outer(scale, scale)
         pupil = len(gram) - 2
         common = np.arange(pupil)
@@ -189,7 +189,7 @@ def _products(calibration: Calibration) -> tuple[FloatArray, IntArray, int, int]
     products = products_of(views, lambda some: _rows(calibration, some))
     if not np.isfinite(products).all():
         return None
-    length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
+    length = root_diagonal(products)
     image = np.unique([view.image for view in views], return_inverse=True)[1]
     residuals = sum(2 * int(np.count_nonzero(view.kept)) - 6 for view in views)
     return without_pose(products, length)[:, 6:, 6:], image, calibration.camera.parameters.size, residuals

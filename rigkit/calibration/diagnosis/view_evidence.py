@@ -13,7 +13,7 @@ import numpy as np
 
 from rigkit.calibration.certainty.departures import rotation_derivatives
 from rigkit.calibration.result import Calibration, ViewResult
-from rigkit.core.arrays import FloatArray, IntArray, Points
+from rigkit.core.arrays import FloatArray, IntArray, Points, root_diagonal
 
 MIN_INFORMATIVE_CORNERS = 20
 """A view with fewer corners has too few degrees of freedom after its pose."""
@@ -145,11 +145,11 @@ def _evidence(calibration: Calibration, clusters: IntArray) -> ViewEvidence | No
         return None
     products = products[finite]
     count = np.array([np.count_nonzero(calibration.views[k].kept) for k in informative])
-    length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
+    length = root_diagonal(products)
     own = without_pose(products, length)
     residual = -1
     gram, score = own[:, COMMON, COMMON].sum(axis=0), own[:, COMMON, residual].sum(axis=0)
-    scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    scale = root_diagonal(gram)
     scaled = gram / np.outer(scale, scale)
     step = np.linalg.lstsq(scaled, score / scale, rcond=MIN_OWN_PART)[0] / scale
     before = float(own[:, residual, residual].sum())
@@ -185,9 +185,9 @@ def predicted_by_others(calibration: Calibration, evidence: ViewEvidence) -> flo
         return np.concatenate([rows[:, :6], rows[:, COMMON], field, rows[:, -1:]], axis=1), count
 
     products = products_of([calibration.views[k] for k in evidence.views], rows_with_field)
-    length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
+    length = root_diagonal(products)
     own = without_pose(products, length)[:, 6:, 6:]
-    scale = np.sqrt(np.maximum(np.diag(own.sum(axis=0))[:-1], np.finfo(float).tiny))
+    scale = root_diagonal(own.sum(axis=0))[:-1]
     gram, score = own[:, :-1, :-1] / np.outer(scale, scale), own[:, :-1, -1] / scale
 
     others, by_others = gram.sum(axis=0) - gram, score.sum(axis=0) - score

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.solving.normal_equations import pose_inverses
-from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
+from rigkit.core.arrays import FloatArray, IntArray, root_diagonal, scaled_pinv
 from rigkit.kernels.linearise import chebyshev_series
 
 MIN_CLUSTERS = 2
@@ -161,12 +161,13 @@ def clustered_covariance(
     return Clustered(0.5 * (covariance + covariance.T), float(np.sqrt(factor)), freedom)
 
 
-def root_of_inverse(information: FloatArray) -> FloatArray:
-    """Return R (n, r) with R R^T the inverse of an information (n, n) of rank r, in the directions that it has."""
+def root_of_inverse(information: FloatArray, rank: float = RANK) -> FloatArray:
+    """Return R (n, r) with R R^T the inverse of an information (n, n) of rank r, in the directions that it has: those
+    with eigenvalues above `rank` times the largest."""
     # Scaled to a unit diagonal: parameters differ by many powers of ten.
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    scale = 1.0 / root_diagonal(information)
     values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
-    known = values > RANK * values[-1]
+    known = values > rank * values[-1]
     return np.asarray(scale[:, None] * vectors[:, known] / np.sqrt(values[known]))
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from rigkit.calibration.solving.clustered import LARGE_FREEDOM, widening
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, root_diagonal
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.planning.goal import Goal
 from rigkit.validation.monitoring.evidence import FreshEvidence, FreshView, Monitored, evidence_of
@@ -321,7 +321,7 @@ def _fit_hypothesis(whitened: Whitened, hypothesis: Hypothesis) -> Change | None
     by_amount = whitened.by_theta @ hypothesis.directions
     weighed = np.linalg.solve(whitened.covariance, np.column_stack([by_amount, whitened.score]))
     normal, right = by_amount.T @ weighed[:, :-1], by_amount.T @ weighed[:, -1]
-    size = np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
+    size = root_diagonal(normal)
     if np.linalg.cond(normal / np.outer(size, size)) > 1.0 / NULL_RANK:
         return None
     covariance = np.linalg.inv(normal / np.outer(size, size)) / np.outer(size, size)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.solving.clustered import effective_freedom
-from rigkit.core.arrays import FloatArray
+from rigkit.calibration.solving.clustered import effective_freedom, root_of_inverse
+from rigkit.core.arrays import FloatArray, root_diagonal
 from rigkit.core.errors import DegenerateError
 from rigkit.validation.monitoring.evidence import FreshEvidence, Monitored
 
@@ -41,7 +41,7 @@ class Whitened:
         information = evidence.information.sum(axis=0) / evidence.variance_px2
         score = evidence.score.sum(axis=0) / evidence.variance_px2
         # Scaled to a unit diagonal: parameters differ by many orders of magnitude.
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+        scale = 1.0 / root_diagonal(information)
         with np.errstate(over="ignore", invalid="ignore"):
             scaled = information * scale[:, None] * scale
         if not np.isfinite(scaled).all():
@@ -71,10 +71,7 @@ def disagreement(information: FloatArray, score: FloatArray) -> tuple[float, flo
     """Return the variance of the parts (K, T, T), (K, T) of an image over that of independent matches, at least 1, and
     its degrees of freedom. The estimate common to all parts is subtracted first."""
     whole = information.sum(axis=0)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(whole * scale[:, None] * scale)
-    seen = values > NULL_RANK * values[-1]
-    root = vectors[:, seen] * scale[:, None] / np.sqrt(values[seen])
+    root = root_of_inverse(whole, NULL_RANK)
     common = root @ (root.T @ score.sum(axis=0))
     left = (score - information @ common) @ root
     # The common estimate uses each part by its share B: the residuals of parts k and l have the covariance

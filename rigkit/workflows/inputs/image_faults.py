@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.calibration.result import Calibration
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, spread_indices
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
@@ -67,7 +67,7 @@ def _some_images(names: Sequence[str], images: Mapping[str, Path]) -> Iterator[t
     """Yield the indices of up to MAX_CHECKED of the `names`, spread over those that have a file, and these images;
     unreadable ones are skipped."""
     there = [k for k, name in enumerate(names) if name in images]
-    for place in np.unique(np.linspace(0, len(there) - 1, min(MAX_CHECKED, len(there))).astype(int)).tolist():
+    for place in spread_indices(len(there), MAX_CHECKED).tolist():
         try:
             image = read_image(images[names[there[place]]])
         except InputError:

@@ -19,7 +19,7 @@ from rigkit.calibration.certainty.uncertainty import worst_direction
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, Points
+from rigkit.core.arrays import BoolArray, FloatArray, Points, spread_indices
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
@@ -45,7 +45,7 @@ def transfer_uncertainty(rig: RigCalibration, a: str, b: str) -> Transfer | None
     shown = {shape.board_id: shape.points_mm[:: max(1, len(shape.points_mm) // 8)] for shape in calibration.boards}
     boards = [shown[view.board_id] for view in calibration.views]
     end = np.cumsum([len(points) for points in boards])
-    chosen = np.linspace(0, end[-1] - 1, min(TRANSFER_POINTS, end[-1])).astype(np.int64)
+    chosen = spread_indices(end[-1], TRANSFER_POINTS)
     view = np.searchsorted(end, chosen, side="right")
     on_board = np.array([boards[v][k] for v, k in zip(view, chosen - end[view], strict=True)])
     corners = calibration.corners

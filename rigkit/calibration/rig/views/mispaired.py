@@ -33,7 +33,7 @@ from rigkit.calibration.rig.views.observations import FrameObservations, RigView
 from rigkit.calibration.views.flips import FLIP_SIGNS, Flip
 from rigkit.calibration.views.repeats import close_pairs, places_of
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, spread_indices
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
@@ -335,7 +335,7 @@ def slipped_camera(views: RigViews) -> Finding | None:
     if not len(splits) or (whole := _solved(views, frames)) is None:
         return None
     found = []
-    for at in splits[np.unique(np.linspace(0, len(splits) - 1, min(MAX_SPLITS, len(splits))).astype(int))].tolist():
+    for at in splits[spread_indices(len(splits), MAX_SPLITS)].tolist():
         parts = [_solved(views, part) for part in (frames[:at], frames[at:])]
         if parts[0] is not None and parts[1] is not None:
             both = parts[0][1] | parts[1][1]
