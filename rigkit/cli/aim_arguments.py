@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from rigkit.cli.console import add_options
 from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
     from rigkit.core.measurement_task import Task
-    from rigkit.core.reach import Reach
 
 
 def add_board_argument(parser: argparse._ActionsContainer, words: str, *, required: bool = False) -> None:
@@ -20,19 +20,10 @@ def add_board_argument(parser: argparse._ActionsContainer, words: str, *, requir
 
 
 def add_reach_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the limits of the positions of boards."""
-    parser.add_argument("--near", type=float, default=0.0, metavar="MM", help="smallest distance of the board")
-    parser.add_argument("--far", type=float, default=float("inf"), metavar="MM", help="largest distance of the board")
-    parser.add_argument(
-        "--field", type=float, metavar="DEG", help="full field of view of the lens, where boards can be seen"
-    )
-
-
-def reach_of(args: argparse.Namespace) -> Reach:
-    """Return the limits of the positions of boards."""
+    """Add the limits of the positions of boards, which `options_of(Reach, args)` reads."""
     from rigkit.core.reach import Reach
 
-    return Reach(nearest_mm=args.near, farthest_mm=args.far, field_deg=args.field)
+    add_options(parser, Reach, nearest_mm="--near MM", farthest_mm="--far MM", field_deg="--field DEG")
 
 
 def length_of(args: argparse.Namespace, verb: str) -> Task | None:

@@ -6,13 +6,13 @@ import argparse
 import re
 from pathlib import Path
 
-from rigkit.core.errors import ExitCode, InputError
+from rigkit.core.errors import InputError
 from rigkit.core.patterns.circles import Circles
 
 
 def identify(args: argparse.Namespace) -> int:
     """Print which board the images show, write its file if requested, and return the exit code."""
-    from rigkit.cli.console import note, progress_on_stderr
+    from rigkit.cli.console import note, note_left_out, progress_on_stderr
     from rigkit.detection.duplicate_marks import DUPLICATES_REMEDY
     from rigkit.io.boards.board_file import board_text
     from rigkit.io.disk.writing import ensure_writable, write_atomic
@@ -59,9 +59,7 @@ def identify(args: argparse.Namespace) -> int:
             'stagger = "left": every second row begins half a step further left, as BoofCV prints them; if the rows of '
             "the print begin further right, as OpenCV's do, the images are mirrored"
         )
-    for error in found.unreadable:
-        note(f"left out: {error}")
-    return ExitCode.BAD_INPUT if found.unreadable else ExitCode.WELL
+    return note_left_out(found.unreadable)
 
 
 def without_scale(words: str) -> str:

@@ -59,18 +59,14 @@ def _many(args: argparse.Namespace) -> int:
 
 
 def _one(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, print_json
+    from rigkit.cli.console import note, note_left_out, print_json
 
     started = time.monotonic()
     done = _calibrated(args)
     summary, words, passed = _summary(done, json=args.json)
     note(f"{_listed(done.written)} written, {time.monotonic() - started:.1f} s")
     print_json(summary) if args.json else print(words)
-    for reason in done.unreadable.values():
-        note(f"left out: {reason}")
-    if done.unreadable:
-        return ExitCode.BAD_INPUT
-    return ExitCode.WELL if passed else ExitCode.CHECK_FAILED
+    return note_left_out(done.unreadable.values()) or (ExitCode.WELL if passed else ExitCode.CHECK_FAILED)
 
 
 def _listed(files: Sequence[Path]) -> str:

@@ -19,6 +19,7 @@ from rigkit.cli.aim_arguments import add_board_argument, length_of
 from rigkit.cli.console import (
     add_options,
     note,
+    note_left_out,
     note_written,
     options_of,
     print_json,
@@ -71,14 +72,10 @@ def run(args: argparse.Namespace) -> int:
         print_statement(done.facts)
         if not (check.holds or check.unexplained):
             print(tables_to_text([check_table(check)]))
-    for image, reason in done.left_out:
-        note(f"left out: {image}: {reason}")
-    for reason in done.unreadable:
-        note(f"left out: {reason}")
+    note_left_out([f"{image}: {reason}" for image, reason in done.left_out])
+    code = note_left_out(done.unreadable)
     note_written(done.written)
     if args.fix is not None and args.fix not in done.written:
         why = "the images were flipped" if check.flipped else "no change of camera or rig explains the images"
         note(f"{args.fix} not written: {'nothing changed' if check.holds else why}")
-    if not check.holds:
-        return ExitCode.CHECK_FAILED
-    return ExitCode.BAD_INPUT if done.unreadable else ExitCode.WELL
+    return code if check.holds else ExitCode.CHECK_FAILED

@@ -11,10 +11,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.aim_arguments import add_board_argument, add_reach_arguments, length_of, reach_of
+from rigkit.cli.aim_arguments import add_board_argument, add_reach_arguments, length_of
 from rigkit.cli.console import add_options, options_of, progress_on_stderr
 from rigkit.coach.guide import GuideOptions
 from rigkit.core.errors import ExitCode, InputError
+from rigkit.core.reach import Reach
 from rigkit.workflows.options.coach import CoachOptions
 
 MAX_CAMERAS = 8
@@ -50,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     if args.goal_mm is not None and not 0.0 < args.goal_mm < float("inf"):
         raise InputError(f"--goal-mm {args.goal_mm}: it must be positive")
     boards = tuple(board_of_words(words) for words in args.board)
-    guide = options_of(GuideOptions, args, boards=boards, measured=None, reach=reach_of(args))
+    guide = options_of(GuideOptions, args, boards=boards, measured=None, reach=options_of(Reach, args))
     known = {"boards": tuple(args.board), "guide": guide, "length": length_of(args, "coach")}
     options = options_of(CoachOptions, args, **known)
     run_coach(options, lambda words: print(words, flush=True), progress_on_stderr())

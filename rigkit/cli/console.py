@@ -13,11 +13,11 @@ from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from rigkit.cli.progress import progress_on_stderr as progress_on_stderr
-from rigkit.core.errors import IN_PYTHON, InputError, printable
+from rigkit.core.errors import IN_PYTHON, ExitCode, InputError, printable
 from rigkit.io.disk.schema_builders import attributes_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
 
     from rigkit.core.arrays import FloatArray
     from rigkit.geometry.rigid3 import Rigid3
@@ -32,6 +32,13 @@ IMAGE_SIZE = re.compile(r"([0-9]{1,6})[xX]([0-9]{1,6})")
 def note(text: str) -> None:
     """Log a message for the user, which goes to stderr."""
     logging.getLogger("rigkit.cli").info("%s", printable(text.replace(IN_PYTHON, "")))
+
+
+def note_left_out(reasons: Collection[object]) -> ExitCode:
+    """Log why images, or the like, are left out; return the exit code, that of bad input if any are."""
+    for reason in reasons:
+        note(f"left out: {reason}")
+    return ExitCode.BAD_INPUT if reasons else ExitCode.WELL
 
 
 def note_written(paths: Iterable[Path]) -> None:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.aim_arguments import add_board_argument
-from rigkit.cli.console import add_options, note, options_of, print_json, progress_on_stderr, require_existing
-from rigkit.core.errors import ExitCode, printable
+from rigkit.cli.console import add_options, note_left_out, options_of, print_json, progress_on_stderr, require_existing
+from rigkit.core.errors import printable
 from rigkit.core.printing import counted
 from rigkit.workflows.options.cameras import DetectOptions
 
@@ -36,8 +36,7 @@ def run(args: argparse.Namespace) -> int:
 
     options = options_of(DetectOptions, args, boards=tuple(map(Path, args.board)))
     done = detect_in_images(args.images, options, progress=progress_on_stderr())
-    for error in done.failures.values():
-        note(f"left out: {error}")
+    code = note_left_out(done.failures.values())
     if args.json:
         print_json({image: [_summary(item) for item in items] for image, items in done.found.items()})
     else:
@@ -49,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
         total = len(done.found) + len(done.failures)
         left_out = f"; {len(done.failures)} cannot be used" if done.failures else ""
         print(f"{counted(sum(map(len, done.found.values())), 'board')} in {shown} of {total} images{left_out}")
-    return ExitCode.BAD_INPUT if done.failures else ExitCode.WELL
+    return code
 
 
 def _words(found: BoardDetection) -> str:

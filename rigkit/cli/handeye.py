@@ -9,8 +9,14 @@ from __future__ import annotations
 
 import argparse
 
-from rigkit.cli.console import add_options, note, options_of, pose_in_words, progress_on_stderr, require_existing
-from rigkit.core.errors import ExitCode
+from rigkit.cli.console import (
+    add_options,
+    note_left_out,
+    options_of,
+    pose_in_words,
+    progress_on_stderr,
+    require_existing,
+)
 from rigkit.workflows.options.cameras import HandEyeOptions
 
 
@@ -33,9 +39,7 @@ def run(args: argparse.Namespace) -> int:
     options = options_of(HandEyeOptions, args)
     done = calibrate_hand_eye(args.poses, args.images, options, progress=progress_on_stderr())
     result = done.result
-    for error in done.unreadable:
-        note(f"left out: {error}")
-    code = ExitCode.BAD_INPUT if done.unreadable else ExitCode.WELL
+    code = note_left_out(done.unreadable)
     if args.json:
         print(hand_eye_text(result, options), end="")
         return code

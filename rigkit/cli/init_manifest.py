@@ -12,7 +12,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from rigkit.core.errors import ExitCode, InputError
+from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.core.posetype import PoseType
 from rigkit.io.disk.reading import usable_path
@@ -26,7 +26,7 @@ ONE_CAMERA, TWO_CAMERAS = ("camera",), ("camera1", "camera2")
 
 
 def run_manifest(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, progress_on_stderr
+    from rigkit.cli.console import note, note_left_out, progress_on_stderr
     from rigkit.io.disk.writing import ensure_writable
     from rigkit.io.manifests.manifest_writer import NewManifest, find_images
     from rigkit.workflows.capture.new_manifest import find_pairs, name_of_folder, write_manifest
@@ -47,8 +47,7 @@ def run_manifest(args: argparse.Namespace) -> int:
     ensure_writable(target, force=args.force, inputs=read)
     _require_answers(args)
     found = find_pairs(root, images, [one.board for one in declared], progress=progress_on_stderr())
-    for error in found.unreadable:
-        note(f"left out: {error}")
+    code = note_left_out(found.unreadable)
     names = [pair.name for pair in found.pairs]
     for pair in found.pairs:
         note(f"pair '{pair.name}': {pair.first.image.name}, {pair.second.image.name}")
@@ -71,7 +70,7 @@ def run_manifest(args: argparse.Namespace) -> int:
     print(target)
     if incomplete is not None:
         note(f"to be completed: {incomplete}")
-    return ExitCode.BAD_INPUT if found.unreadable else ExitCode.WELL
+    return code
 
 
 def _require_answers(args: argparse.Namespace) -> None:

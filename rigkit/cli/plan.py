@@ -14,9 +14,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigkit.cli.aim_arguments import add_board_argument, add_reach_arguments, length_of, reach_of
+from rigkit.cli.aim_arguments import add_board_argument, add_reach_arguments, length_of
 from rigkit.cli.console import add_options, options_of, progress_on_stderr, require_existing, size_of_words
 from rigkit.core.errors import ExitCode, InputError
+from rigkit.core.reach import Reach
 from rigkit.workflows.options.boards import TYPICAL_SIGMA_PX, LensOptions, PlanOptions
 
 if TYPE_CHECKING:
@@ -112,4 +113,4 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
 def _options(args: argparse.Namespace) -> PlanOptions:
     if args.count is not None and not 1 <= args.count <= MAX_VIEWS:
         raise InputError(f"--views {args.count}: 1 to {MAX_VIEWS}")
-    return options_of(PlanOptions, args, length=length_of(args, "plan"), reach=reach_of(args))
+    return options_of(PlanOptions, args, length=length_of(args, "plan"), reach=options_of(Reach, args))

@@ -14,9 +14,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigkit.cli.console import add_options, note, options_of, print_json, require_existing, size_of_words
+from rigkit.cli.console import add_options, note_left_out, options_of, print_json, require_existing, size_of_words
 from rigkit.cli.progress import progress_on_stderr
-from rigkit.core.errors import ExitCode, InputError
+from rigkit.core.errors import InputError
 from rigkit.workflows.options.cameras import RectifyOptions
 
 if TYPE_CHECKING:
@@ -81,8 +81,7 @@ def run(args: argparse.Namespace) -> int:
         result = {"images": [_figures(one, args.projection) for one in done.images]}
         if done.pair is not None:
             result["rect2_from_rect1_mm"] = done.pair.rect2_from_rect1.translation_mm.tolist()
-    for error in done.failures.values():
-        note(f"left out: {error}")
+    code = note_left_out(done.failures.values())
     if args.json:
         print_json(result)
     else:
@@ -94,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
             print(f"{place}: {words}")
         if done.pair is not None:
             print(f"baseline {abs(done.pair.rect2_from_rect1.translation_mm[0]):.3f} mm along the rows")
-    return ExitCode.BAD_INPUT if done.failures else ExitCode.WELL
+    return code
 
 
 def _figures(one: RectifiedImage, projection: str) -> dict[str, Any]:

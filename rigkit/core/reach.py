@@ -11,8 +11,14 @@ from rigkit.core.printing import brief
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """Where boards can be held: between `nearest_mm` and `farthest_mm` from the camera, the depth of field, and within
-    `field_deg` of a lens whose image does not fill the sensor (None: the field of view of the model)."""
+    """Where boards can be held: within the depth of field, and within that of view of a lens.
+
+    Attributes
+    ----------
+    nearest_mm : smallest distance of the board (default: any).
+    farthest_mm : largest distance of the board (default: any).
+    field_deg : full field of view of the lens, where boards can be seen (default: that of the model).
+    """
 
     nearest_mm: float = 0.0
     farthest_mm: float = math.inf
