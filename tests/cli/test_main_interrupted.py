@@ -257,4 +257,4 @@ def test_an_interrupted_pool_leaves_no_thread() -> None:
         waiting = [pool.submit(time.sleep, 600) for _ in range(8)]
         raise KeyboardInterrupt
     assert all(future.done() for future in waiting)
-    assert set(threading.enumerate()) == before
+    assert set(threading.enumerate()) <= before  # a thread of an earlier test may end meanwhile
