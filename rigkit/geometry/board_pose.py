@@ -81,14 +81,12 @@ def board_poses(
     weight = 1.0 / sigma
     plane_from_target, flat = _flatten(points)
     bases = tangent_bases(f) if bases is None else as_array(bases, (n, 2, 3), "bases")
-    rotation, translation = _pose_from_homography(_homography(f, flat, weight))
-    rotation, translation = _both_tilts(rotation, translation)
-    rotation, translation, cost = _refine(f, bases, flat, weight, rotation, translation)
+    start = _both_tilts(*_pose_from_homography(_homography(f, flat, weight)))
+    seen = _SeenPlane(f, bases, flat, weight, plane_from_target)
+    rotation, translation, cost = seen.refined(*start)
     order = [int(np.argmin(cost)), 1 - int(np.argmin(cost))]
     keep = order if _differ(rotation, translation, flat, cost) else order[:1]
-    variance = None if sigma_rad is None else 1.0
-    found = (rotation[keep], translation[keep], cost[keep])
-    return _poses(f, bases, flat, weight, *found, plane_from_target, variance)
+    return seen.poses(rotation[keep], translation[keep], cost[keep], None if sigma_rad is None else 1.0)
 
 
 def moved_board_poses(rays: Rays, points_mm: Points, start: Rigid3) -> tuple[BoardPose, ...]:
@@ -99,36 +97,59 @@ def moved_board_poses(rays: Rays, points_mm: Points, start: Rigid3) -> tuple[Boa
     f = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     plane_from_target, flat = _flatten(as_array(points_mm, (f.shape[1], 3), "points_mm"))
     cam_from_plane = start @ plane_from_target.inverse()
-    bases, weight = tangent_bases(f), np.ones(len(flat))
+    seen = _SeenPlane(f, tangent_bases(f), flat, np.ones(len(flat)), plane_from_target)
     rotation = np.broadcast_to(cam_from_plane.rotation, (len(f), 3, 3))
     translation = np.broadcast_to(cam_from_plane.translation_mm, (len(f), 3))
-    found = _refine(f, bases, flat, weight, rotation, translation)
-    return _poses(f, bases, flat, weight, *found, plane_from_target, None)
+    return seen.poses(*seen.refined(rotation, translation), None)
 
 
-def _poses(
-    rays: Rays,
-    bases: FloatArray,
-    flat: FloatArray,
-    weight: FloatArray,
-    rotation: FloatArray,
-    translation: FloatArray,
-    cost: FloatArray,
-    plane_from_target: Rigid3,
-    variance: float | None,
-) -> tuple[BoardPose, ...]:
-    """Return the poses of a target, with rms and covariance, from those of its plane (M, ...)."""
-    residual, jacobian = ray_residuals(rays, bases, flat, rotation, translation)
-    rms = np.sqrt((residual**2).sum(axis=-1).mean(axis=-1))
-    jacobian = jacobian * weight[:, None, None]
-    poses = []
-    for k, cam_from_plane in enumerate(Rigid3.stack(rotation, translation)):
-        covariance = _covariance(jacobian[k], cost[k], variance)
-        # t = t_plane + R_plane m, so a rotation changes t, too: v = v_plane - [R_plane m]x w.
-        shift = np.eye(6)
-        shift[3:, :3] = -skew(rotation[k] @ plane_from_target.translation_mm)
-        poses.append(BoardPose(cam_from_plane @ plane_from_target, float(rms[k]), shift @ covariance @ shift.T))
-    return tuple(poses)
+@dataclass(frozen=True, eq=False, slots=True)
+class _SeenPlane:
+    """N points of a target on rays of one view (N, 3), or of several (M, N, 3).
+
+    Attributes
+    ----------
+    rays, bases : unit rays, and rows (..., 2, 3) perpendicular to them.
+    flat, weight : (N, 3) the points in a frame centred on them with z = 0, and (N,) their weights.
+    plane_from_target : that frame.
+    """
+
+    rays: Rays
+    bases: FloatArray
+    flat: FloatArray
+    weight: FloatArray
+    plane_from_target: Rigid3
+
+    def refined(self, rotation: FloatArray, translation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the refined poses and costs (K,) of K initial poses of the plane: Levenberg-Marquardt on weighted ray
+        residuals, in units of the bases."""
+        n = len(self.flat)
+        return kernel.refine(
+            self.rays.reshape(-1, n, 3),
+            (self.bases * self.weight[:, None, None]).reshape(-1, n, 2, 3),
+            self.flat,
+            rotation,
+            translation,
+            max_steps=MAX_POSE_STEPS,
+            tolerance=POSE_STEP_TOLERANCE,
+        )
+
+    def poses(
+        self, rotation: FloatArray, translation: FloatArray, cost: FloatArray, variance: float | None
+    ) -> tuple[BoardPose, ...]:
+        """Return the poses of the target, with rms and covariance, from those of its plane (M, ...)."""
+        residual, jacobian = ray_residuals(self.rays, self.bases, self.flat, rotation, translation)
+        rms = np.sqrt((residual**2).sum(axis=-1).mean(axis=-1))
+        jacobian = jacobian * self.weight[:, None, None]
+        poses = []
+        for k, cam_from_plane in enumerate(Rigid3.stack(rotation, translation)):
+            covariance = _covariance(jacobian[k], cost[k], variance)
+            # t = t_plane + R_plane m, so a rotation changes t, too: v = v_plane - [R_plane m]x w.
+            shift = np.eye(6)
+            shift[3:, :3] = -skew(rotation[k] @ self.plane_from_target.translation_mm)
+            cam_from_target = cam_from_plane @ self.plane_from_target
+            poses.append(BoardPose(cam_from_target, float(rms[k]), shift @ covariance @ shift.T))
+        return tuple(poses)
 
 
 def tangent_bases(rays: Rays) -> FloatArray:
@@ -215,24 +236,6 @@ def _both_tilts(rotation: FloatArray, translation: FloatArray) -> tuple[FloatArr
     axes = rotation[:, :2] - 2.0 * np.outer(sight, sight @ rotation[:, :2])
     other = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
     return np.stack([rotation, other]), np.stack([translation, translation])
-
-
-def _refine(
-    rays: Rays, bases: FloatArray, flat: FloatArray, weight: FloatArray, rotation: FloatArray, translation: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the refined poses and costs (K,) of K initial poses: Levenberg-Marquardt on weighted ray residuals."""
-    n = len(flat)
-    # Residuals are in units of the bases.
-    weighted = bases * weight[:, None, None]
-    return kernel.refine(
-        rays.reshape(-1, n, 3),
-        weighted.reshape(-1, n, 2, 3),
-        flat,
-        rotation,
-        translation,
-        max_steps=MAX_POSE_STEPS,
-        tolerance=POSE_STEP_TOLERANCE,
-    )
 
 
 def after_pose_step(poses: tuple[FloatArray, ...], step: FloatArray) -> tuple[FloatArray, ...]:
