@@ -47,15 +47,13 @@ REPORTED_FIELDS = (
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class IndependentMethod:
-    """The result of another method, and its difference to the reconstruction.
+    """The result of another method, and its difference to our reconstruction.
 
     Attributes
     ----------
     name : "pycolmap two-view", "pycolmap bundle adjustment", "planar PnP", "rectified chain".
-    cam2_from_cam1 : its relative pose, mm.
+    ours, cam2_from_cam1 : our relative pose, and its own, mm; both are scaled by the squares.
     covariance : (6, 6) of (left rotation perturbation rad, translation mm), NaN if the method has none.
-    rotation_difference_deg, direction_difference_deg : angle to the reconstruction's rotation, translation direction.
-    baseline_mm : its baseline, scaled by the squares.
     angles_deg : (a, b) -> (angle between the faces, sigma).
     rms_px : its RMS reprojection error, 2-D per observation; NaN if the method has none.
     used, excluded : number of matches used, and of those that the method cannot represent.
@@ -63,16 +61,29 @@ class IndependentMethod:
     """
 
     name: str
+    ours: Rigid3
     cam2_from_cam1: Rigid3
     covariance: FloatArray
-    rotation_difference_deg: float
-    direction_difference_deg: float
-    baseline_mm: float
     angles_deg: AnglesDeg
     rms_px: float
     used: int
-    excluded: int
+    excluded: int = 0
     variance_factor: float = np.nan
+
+    @property
+    def rotation_difference_deg(self) -> float:
+        """The angle between both rotations."""
+        return float(np.rad2deg(rotation_angle(self.cam2_from_cam1.rotation @ self.ours.rotation.T)))
+
+    @property
+    def direction_difference_deg(self) -> float:
+        """The angle between both translations."""
+        return float(np.rad2deg(angle_between(self.cam2_from_cam1.translation_mm, self.ours.translation_mm)))
+
+    @property
+    def baseline_mm(self) -> float:
+        """Its baseline."""
+        return float(np.linalg.norm(self.cam2_from_cam1.translation_mm))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -195,8 +206,15 @@ def crosscheck(
 
 def compare_chains(reconstruction: Reconstruction, other: Reconstruction, name: str) -> IndependentMethod:
     """Return another reconstruction of the same pair as an independent method."""
-    angles, rms = _angles(measure(other)), other.sampson_rms_px
-    return _method(name, reconstruction, other.cam2_from_cam1, _covariance(other), angles, rms, len(other.cloud), 0)
+    return IndependentMethod(
+        name=name,
+        ours=reconstruction.cam2_from_cam1,
+        cam2_from_cam1=other.cam2_from_cam1,
+        covariance=_covariance(other),
+        angles_deg=_angles(measure(other)),
+        rms_px=other.sampson_rms_px,
+        used=len(other.cloud),
+    )
 
 
 def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[IndependentMethod]:
@@ -207,7 +225,6 @@ def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[Independe
         )
     pixels = (reconstruction.pixels1, reconstruction.pixels2)
     pair = colmap_pair(reconstruction.camera1, reconstruction.camera2, *pixels)
-    excluded = int((~pair.used).sum())
     result = solve_pair(pair, seed=seed)
     adjusted = colmap_reconstruction(reconstruction, pair, result)
     baseline = adjusted.baseline_mm
@@ -222,19 +239,34 @@ def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[Independe
     # The change by bundle adjustment is an error of the two-view estimate itself.
     step = two_view.step_from(own)
     of_two_view = covariance + np.outer(step, step) if settled else np.full((6, 6), np.nan)
-    counts = result.inliers, excluded
-    return [
-        _method(TWO_VIEW, reconstruction, two_view, of_two_view, {}, np.nan, *counts),
-        _method(ADJUSTED, reconstruction, own, covariance, _angles(measure(adjusted)), result.rms_px, *counts),
-    ]
+    bundle = IndependentMethod(
+        name=ADJUSTED,
+        ours=reconstruction.cam2_from_cam1,
+        cam2_from_cam1=own,
+        covariance=covariance,
+        angles_deg=_angles(measure(adjusted)),
+        rms_px=result.rms_px,
+        used=result.inliers,
+        excluded=int((~pair.used).sum()),
+    )
+    before = replace(
+        bundle, name=TWO_VIEW, cam2_from_cam1=two_view, covariance=of_two_view, angles_deg={}, rms_px=np.nan
+    )
+    return [before, bundle]
 
 
 def _pnp_method(reconstruction: Reconstruction, shapes: Mapping[str, BoardShape] | None) -> IndependentMethod:
     found = planar_pnp(reconstruction, shapes)
-    rms = found.rms_rad * reconstruction.camera1.focal_px
-    pose, covariance = found.cam2_from_cam1, found.covariance
-    method = _method(PNP, reconstruction, pose, covariance, found.angles_deg, rms, found.count, 0)
-    return replace(method, variance_factor=found.variance_factor)
+    return IndependentMethod(
+        name=PNP,
+        ours=reconstruction.cam2_from_cam1,
+        cam2_from_cam1=found.cam2_from_cam1,
+        covariance=found.covariance,
+        angles_deg=found.angles_deg,
+        rms_px=found.rms_rad * reconstruction.camera1.focal_px,
+        used=found.count,
+        variance_factor=found.variance_factor,
+    )
 
 
 def sigma_of_difference(ours: float, theirs: float, freedom: int) -> float:
@@ -248,31 +280,6 @@ def sigma_of_difference(ours: float, theirs: float, freedom: int) -> float:
     """
     a, b = ours**2, theirs**2
     return float(np.sqrt(abs(a - b) + np.sqrt(2.0 / max(freedom, 2)) * max(a, b)))
-
-
-def _method(
-    name: str,
-    reconstruction: Reconstruction,
-    pose: Rigid3,
-    covariance: FloatArray,
-    angles: AnglesDeg,
-    rms_px: float,
-    used: int,
-    excluded: int,
-) -> IndependentMethod:
-    ours = reconstruction.cam2_from_cam1
-    return IndependentMethod(
-        name=name,
-        cam2_from_cam1=pose,
-        covariance=covariance,
-        rotation_difference_deg=float(np.rad2deg(rotation_angle(pose.rotation @ ours.rotation.T))),
-        direction_difference_deg=float(np.rad2deg(angle_between(pose.translation_mm, ours.translation_mm))),
-        baseline_mm=float(np.linalg.norm(pose.translation_mm)),
-        angles_deg=angles,
-        rms_px=rms_px,
-        used=used,
-        excluded=excluded,
-    )
 
 
 def _covariance(reconstruction: Reconstruction) -> FloatArray:
