@@ -96,6 +96,9 @@ from rigkit.workflows.checks.history import show_history as show_history
 from rigkit.workflows.demo import run_demo as run_demo
 from rigkit.workflows.detect import DetectionResult as DetectionResult
 from rigkit.workflows.detect import detect_in_images as detect_in_images
+from rigkit.workflows.fetch import FetchedSet as FetchedSet
+from rigkit.workflows.fetch import fetch_public_set as fetch_public_set
+from rigkit.workflows.fetch import public_sets as public_sets
 from rigkit.workflows.handeye import HandEyeCalibration as HandEyeCalibration
 from rigkit.workflows.handeye import PlacedCamera as PlacedCamera
 from rigkit.workflows.handeye import calibrate_hand_eye as calibrate_hand_eye
@@ -147,9 +150,6 @@ from rigkit.workflows.rectify import rectify_stereo_images as rectify_stereo_ima
 from rigkit.workflows.study import StudyResult as StudyResult
 from rigkit.workflows.study import run_studies as run_studies
 from rigkit.workflows.study import run_study as run_study
-from rigkit.workflows.truth import FetchedSet as FetchedSet
-from rigkit.workflows.truth import fetch_public_set as fetch_public_set
-from rigkit.workflows.truth import public_sets as public_sets
 from rigkit.workflows.validation.crosscheck import DatasetCrossCheck as DatasetCrossCheck
 from rigkit.workflows.validation.crosscheck import crosscheck_dataset as crosscheck_dataset
 from rigkit.workflows.validation.paper import PaperValidation as PaperValidation

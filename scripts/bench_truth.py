@@ -24,7 +24,7 @@ from truth.singles import aprilgrid
 from truth.table import Bench, Row, as_json, long_table, merged, short_table, with_table
 
 from rigkit.core.errors import RigkitError
-from rigkit.workflows.truth import fetch_public_set, public_sets
+from rigkit.workflows.fetch import fetch_public_set, public_sets
 
 BENCHES: Mapping[str, Callable[[Bench], Iterator[Row]]] = {
     "caliper-board": caliper_board,

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, print_json, progress_on_stderr
     from rigkit.core.errors import ExitCode, InputError
-    from rigkit.workflows.truth import fetch_public_set, public_sets
+    from rigkit.workflows.fetch import fetch_public_set, public_sets
 
     known = public_sets(args.catalogue)
     for name in args.names:

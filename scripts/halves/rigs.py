@@ -27,10 +27,10 @@ from rigkit.core.identifiers import natural_key
 from rigkit.io.corners.corner_cache import source_hash
 from rigkit.io.manifests.rig_session import RigSession, frames_of_images
 from rigkit.io.manifests.session import Session
+from rigkit.workflows.fetch import public_sets
 from rigkit.workflows.inputs.corners import session_corners, session_views
 from rigkit.workflows.inputs.frames import with_frames
 from rigkit.workflows.options.cameras import Cache
-from rigkit.workflows.truth import public_sets
 
 RigViews = dict[str, list[tuple[str, BoardView]]]
 RIGS: Mapping[str, tuple[str, Mapping[str, str]]] = {

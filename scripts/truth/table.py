@@ -21,9 +21,9 @@ from rigkit.workflows.calibration.calibrate import (
     calibrate_rig_session,
     calibrate_session,
 )
+from rigkit.workflows.fetch import FetchedSet
 from rigkit.workflows.inputs.frames import with_frames
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions
-from rigkit.workflows.truth import FetchedSet
 
 RIGKIT, OPENCV, MRCAL, COLMAP = "rigkit", "OpenCV", "mrcal", "COLMAP"
 TOOLS = (RIGKIT, OPENCV, MRCAL, COLMAP)

@@ -17,7 +17,7 @@ from helpers.data import REPOSITORY, shared_data
 from rigkit.cli.main import main
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.io.manifests.public_set import load_public_set
-from rigkit.workflows.truth import fetch_public_set, public_sets
+from rigkit.workflows.fetch import fetch_public_set, public_sets
 
 CONTENT = b"an image"
 
