@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import ast
 import itertools
+import os
 import re
 import shutil
 import subprocess
@@ -20,6 +21,7 @@ import round_trips
 
 import rigkit
 from rigkit.cameras.pinhole import Pinhole
+from rigkit.cli.main import VERBS
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.sampson import epipolar_normals
 from rigkit.io.schema import SCHEMAS, key_rows, schema_text
@@ -175,15 +177,22 @@ def api_page() -> str:
     return "\n".join(parts)
 
 
+def commands_page() -> str:
+    """Return the page with the help of every verb."""
+    parts = ["# All commands\n\nWhat `rigkit VERB --help` prints.\n"]
+    for verb in VERBS:
+        command = [sys.executable, "-m", "rigkit", verb, "--help"]
+        words = subprocess.run(command, env=os.environ | {"COLUMNS": "100"}, capture_output=True, text=True, check=True)
+        parts.append(f"## {verb}\n\n```text\n{words.stdout}```\n")
+    return "\n".join(parts)
+
+
 def code_page() -> str:
     """Return the page that says of every module in a line what it is about, by room, from the top layer down."""
     layers = re.findall(r"^ {4,5}\d+ {2,}(\w.*?)(?: {2,}|$)", str(rigkit.__doc__), re.MULTILINE)
     parts = ["# Every module in a line\n\nMade of their first lines, from the command line down.\n"]
     for room in (name for row in layers for name in row.split(" | ")):
-        for folder in (
-            ROOT / "rigkit" / room,
-            *sorted(p.parent for p in (ROOT / "rigkit" / room).glob("*/__init__.py")),
-        ):
+        for folder in sorted(path.parent for path in (ROOT / "rigkit" / room).rglob("__init__.py")):
             parts.append(
                 f"## {folder.relative_to(ROOT / 'rigkit').as_posix()}\n\n{_first_line(folder / '__init__.py')}\n"
             )
@@ -204,6 +213,7 @@ def main() -> int:
     args = parser.parse_args()
     made_pictures()
     (PAGES / "keys.md").write_text(keys_page(), encoding="utf-8")
+    (PAGES / "commands.md").write_text(commands_page(), encoding="utf-8")
     (PAGES / "api.md").write_text(api_page(), encoding="utf-8")
     (PAGES / "code.md").write_text(code_page(), encoding="utf-8")
     command = [

@@ -17,7 +17,7 @@ from rigkit.cli.main import main
 FRAMES = 6
 """Photos that a page starts with: enough to calibrate."""
 PAGES = REPOSITORY / "docs" / "pages"
-MADE_BY_THE_BUILD = ("made/", "api.md", "code.md", "keys.md")
+MADE_BY_THE_BUILD = ("made/", "api.md", "code.md", "commands.md", "keys.md")
 BLOCK = re.compile(r"^( *)```(console|python)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 NEEDS = re.compile(r"<!-- with: ([a-z ]+) -->")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
