@@ -7,17 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
-from rigkit.cameras.base import RadialCurve
-from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, fit_shape
+from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
-
-DOUBLE_SPHERE_STARTS = ((0.0, 0.1), (0.0, 0.5), (0.0, 0.6), (0.0, 0.7), (-0.2, 0.6), (0.3, 0.6))
-"""(xi, alpha) from a nearly perspective lens to a fisheye."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
@@ -29,13 +25,11 @@ class DoubleSphere(FocalCamera):
 
     model: ClassVar[str] = "double_sphere"
     closed_ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"alpha": (0.0, 1.0)}
-
-    @classmethod
-    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
-        return fit_shape(cls, size_px, curve, DOUBLE_SPHERE_STARTS)
-
-    def parameter_names(self) -> tuple[str, ...]:
-        return ("fx", "fy", "cx", "cy", "xi", "alpha")
+    shape_names: ClassVar[tuple[str, ...]] = ("xi", "alpha")
+    shape_starts: ClassVar[tuple[tuple[float, ...], ...]] = (
+        *((0.0, 0.1), (0.0, 0.5), (0.0, 0.6), (0.0, 0.7)),
+        *((-0.2, 0.6), (0.3, 0.6)),
+    )
 
     def _prepare(self) -> None:
         xi, alpha = self._shape()

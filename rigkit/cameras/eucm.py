@@ -8,17 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
-from rigkit.cameras.base import RadialCurve
-from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, fit_shape
+from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
-
-EUCM_STARTS = ((0.1, 1.0), (0.5, 1.0), (0.6, 1.0), (0.7, 1.0))
-"""(alpha, beta) from a nearly perspective lens to a fisheye."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
@@ -31,18 +27,8 @@ class EUCM(FocalCamera):
 
     model: ClassVar[str] = "eucm"
     closed_ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"alpha": (0.0, 1.0)}
-
-    @classmethod
-    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
-        count = len(cls.shape_names())
-        return fit_shape(cls, size_px, curve, [start[:count] for start in EUCM_STARTS])
-
-    @classmethod
-    def shape_names(cls) -> tuple[str, ...]:
-        return ("alpha", "beta")
-
-    def parameter_names(self) -> tuple[str, ...]:
-        return ("fx", "fy", "cx", "cy", *self.shape_names())
+    shape_names: ClassVar[tuple[str, ...]] = ("alpha", "beta")
+    shape_starts: ClassVar[tuple[tuple[float, ...], ...]] = ((0.1, 1.0), (0.5, 1.0), (0.6, 1.0), (0.7, 1.0))
 
     def _shape(self) -> tuple[float, float]:
         alpha, beta = self.parameters[4:6].tolist()

@@ -42,9 +42,6 @@ class Pinhole(FocalCamera):
     def max_angle_rad(self) -> float:
         return float(np.pi / 2)
 
-    def parameter_names(self) -> tuple[str, ...]:
-        return ("fx", "fy", "cx", "cy")
-
     def _scale(self, r2: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:
         return 1.0 / z, (z > 0.0) & (r2 + z < np.inf)
 

@@ -7,9 +7,8 @@ implements s with its derivatives and the inverse profile; everything else is he
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -78,6 +77,43 @@ class CompiledCamera(RadialCamera):
 class FocalCamera(RadialCamera):
     """Radial models whose parameters are fx, fy, cx, cy in px and then the shape."""
 
+    shape_names: ClassVar[tuple[str, ...]] = ()
+    shape_starts: ClassVar[tuple[tuple[float, ...], ...]] = ((),)
+    """Initial values of the shape from a nearly perspective lens to a fisheye, of which the best result is used."""
+
+    @classmethod
+    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
+        """Return the camera that fits the curve best: one focal length and its shape, by least squares.
+
+        Raises InputError where the field of view of none includes the whole curve.
+        """
+        theta, centre = curve.theta_rad, curve.centre_px
+        points = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], axis=-1)
+        pixels = centre + np.stack([curve.radius_px, np.zeros_like(theta)], axis=-1)
+        best: tuple[Self, float] | None = None
+        for start in cls.shape_starts:
+            camera = cls(size_px, np.array([1.0, 1.0, *centre, *start]))
+            reached, valid = camera.project(points)
+            if not valid.all():
+                continue
+            radius = reached[:, 0] - centre[0]
+            focal = float(radius @ curve.radius_px / (radius @ radius))
+            # One focal length for both axes, and the shape; the centre is held.
+            free = np.eye(camera.parameters.size)[:, [0, *range(4, camera.parameters.size)]]
+            free[1, 0] = 1.0
+            camera = camera.with_parameters([focal, focal, *camera.parameters[2:]])
+            found = nearest_camera(camera, points, pixels, free, STOP_OF_SHAPE)
+            if best is None or found[1] < best[1]:
+                best = found
+        if best is None:
+            raise InputError(
+                f"radial curve: no {cls.model} camera sees all of it, out to {np.degrees(theta[-1]):.1f} deg"
+            )
+        return best[0]
+
+    def parameter_names(self) -> tuple[str, ...]:
+        return ("fx", "fy", "cx", "cy", *self.shape_names)
+
     @abstractmethod
     def _scale(self, r2: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Return s and valid from r^2 and z."""
@@ -112,39 +148,3 @@ class FocalCamera(RadialCamera):
             for k, by in enumerate(d.by_shape, start=4):
                 d_pixels_d_parameters[0, k], d_pixels_d_parameters[1, k] = lx * by, ly * by
         return fx * mx + cx, fy * my + cy, d.valid
-
-
-_Focal = TypeVar("_Focal", bound=FocalCamera)
-
-
-def fit_shape(
-    model: type[_Focal], size_px: tuple[int, int], curve: RadialCurve, starts: Sequence[Sequence[float]]
-) -> _Focal:
-    """Return the camera of `model` that fits the curve best: one focal length and its shape, by least squares.
-
-    `starts` are initial shapes, of which the best result is returned. Raises InputError where the field of view of none
-    includes the whole curve.
-    """
-    theta, centre = curve.theta_rad, curve.centre_px
-    points = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], axis=-1)
-    pixels = centre + np.stack([curve.radius_px, np.zeros_like(theta)], axis=-1)
-    best: tuple[_Focal, float] | None = None
-    for start in starts:
-        camera = model(size_px, np.array([1.0, 1.0, *centre, *start]))
-        reached, valid = camera.project(points)
-        if not valid.all():
-            continue
-        radius = reached[:, 0] - centre[0]
-        focal = float(radius @ curve.radius_px / (radius @ radius))
-        # One focal length for both axes, and the shape; the centre is held.
-        free = np.eye(camera.parameters.size)[:, [0, *range(4, camera.parameters.size)]]
-        free[1, 0] = 1.0
-        camera = camera.with_parameters([focal, focal, *camera.parameters[2:]])
-        found = nearest_camera(camera, points, pixels, free, STOP_OF_SHAPE)
-        if best is None or found[1] < best[1]:
-            best = found
-    if best is None:
-        raise InputError(
-            f"radial curve: no {model.model} camera sees all of it, out to {np.degrees(theta[-1]):.1f} deg"
-        )
-    return best[0]

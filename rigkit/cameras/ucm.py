@@ -20,10 +20,8 @@ class UCM(EUCM):
     """
 
     model: ClassVar[str] = "ucm"
-
-    @classmethod
-    def shape_names(cls) -> tuple[str, ...]:
-        return ("alpha",)
+    shape_names: ClassVar[tuple[str, ...]] = ("alpha",)
+    shape_starts: ClassVar[tuple[tuple[float, ...], ...]] = ((0.1,), (0.5,), (0.6,), (0.7,))
 
     def _shape(self) -> tuple[float, float]:
         return float(self.parameters[4]), 1.0
