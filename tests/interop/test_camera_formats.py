@@ -24,7 +24,7 @@ from rigkit.interop.colmap_cameras import (
     write_colmap_cameras,
 )
 from rigkit.interop.kalibr import read_kalibr, write_kalibr
-from rigkit.interop.opencv import read_opencv, write_opencv
+from rigkit.interop.opencv import camera_from_arrays, read_opencv, write_opencv
 from rigkit.interop.ros import read_camera_info
 from rigkit.workflows.inputs.camera_files import camera_format, import_camera, import_rig, is_rig
 from rigkit.workflows.inputs.formats import FOREIGN_ENDINGS, READ_FORMATS
@@ -198,6 +198,14 @@ def test_a_transposed_matrix_is_not_a_camera_with_its_centre_at_the_first_pixel(
     assert turned != text
     with pytest.raises(InputError, match="transpose it"):
         read_opencv(turned)
+
+
+@pytest.mark.parametrize("term", [8, 12])
+def test_one_term_of_opencv_beyond_eight_is_not_lost(term: int) -> None:
+    d = np.zeros(14)
+    d[[0, term]] = -0.1, 1e-3
+    with pytest.raises(InputError, match="more than 8"):
+        camera_from_arrays((640, 480), np.diag([500.0, 500.0, 1.0]).ravel(), d, fisheye=False, name="a.yml")
 
 
 @pytest.mark.parametrize("label", ["pinhole", "brown", "brown_rational", "kannala_brandt", "eucm", "ucm"])

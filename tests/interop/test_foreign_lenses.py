@@ -129,6 +129,35 @@ def test_models_of_colmap_that_are_not_ours(
         assert off < 1.1 * float(stated[1]) + SAME_PX
 
 
+def test_lenses_of_colmap_and_opencv_are_theirs(rng: np.random.Generator) -> None:
+    """To the last digits, with every term, where the camera of ours above is a refit."""
+    import cv2
+
+    rays, core = rays_within(np.radians(80.0), 100, rng), np.array([250.0, 251.0, 320.0, 240.0])
+    thin = np.array([-0.02, 0.004, 0.01, -0.02, -0.001, 1e-4, 0.03, -0.04])
+    tangential = np.array([-0.02, 0.004, 0.003, -0.002, 0.001, -5e-4, 0.01, -0.02, 0.03, -0.01, -0.02, 0.015])
+    for kind, lens, terms in (
+        ("FOV", foreign_lenses.fov_lens(core, 0.9), [0.9]),
+        ("THIN_PRISM_FISHEYE", foreign_lenses.thin_prism_fisheye_lens(core, thin), thin),
+        ("RAD_TAN_THIN_PRISM_FISHEYE", foreign_lenses.fisheye_prism_lens(core, tangential[:6], tangential[6:]),
+         tangential),
+    ):  # fmt: skip
+        theirs = pycolmap.Camera(model=kind, width=640, height=480, params=[*core, *terms])
+        np.testing.assert_allclose(lens(rays)[0], theirs.img_from_cam(rays), atol=SAME_PX)
+    d, K = np.array([-0.05, 0.01, 0.02, -0.03]), np.array([[250.0, 0.0, 320.0], [0.0, 251.0, 240.0], [0.0, 0.0, 1.0]])
+    for xi in (0.8, 1.2):
+        pixels, seen = foreign_lenses.unified_brown_lens(core, xi, d)(rays)
+        still = np.zeros(3)
+        np.testing.assert_allclose(
+            pixels, cv2.omnidir.projectPoints(rays[None], still, still, K, xi, d[None])[0][0], atol=SAME_PX
+        )
+        assert seen.all()
+    # The tangent from the eye at xi touches the unit sphere where z = -1 / xi.
+    edge = np.arccos(-1.0 / 1.2) + np.array([-0.01, 0.01])
+    _, seen = foreign_lenses.unified_brown_lens(core, 1.2, d)(np.stack([np.sin(edge), 0.0 * edge, np.cos(edge)], 1))
+    assert seen.tolist() == [True, False]
+
+
 @pytest.mark.parametrize("line", ["FOV 640 480 400 402 320.5 240.5 0", "DIVISION 640 480 -500 505 320.5 240.5 -0.25"])
 def test_values_that_no_lens_has_are_refused(line: str) -> None:
     with pytest.raises(InputError, match=r"cameras\.txt, line 1': ") as caught:

@@ -14,7 +14,7 @@ from rigkit.cameras.convert import fit_camera
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.interop.mrcal import _spline_project, read_cameramodel, write_cameramodel
+from rigkit.interop.mrcal import _spline_of, _spline_project, read_cameramodel, write_cameramodel
 
 CAMERAS = sample_cameras()
 SAME_PX = 1e-9
@@ -84,6 +84,16 @@ def test_mrcal_spline_is_mrcals() -> None:
     ]
     assert inside.all()
     assert np.abs(pixels - theirs).max() < SAME_PX
+
+
+def test_a_spline_projects_as_its_camera() -> None:
+    """The spline that is written, without the refit by which it comes back."""
+    camera = CAMERAS["scaramuzza"]
+    pixels = np.stack(np.meshgrid(*(np.linspace(0.0, n - 1.0, 23) for n in camera.size_px)), axis=-1).reshape(-1, 2)
+    rays, valid = camera.unproject(pixels)
+    projected, inside = _spline_project(rays[valid], *_spline_of(camera))
+    assert valid.mean() > 0.5 and inside.all()
+    assert np.abs(projected - pixels[valid]).max() < SPLINE_PX
 
 
 def test_mrcal_pose_is_in_metres() -> None:
