@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rigkit.rectification.crop import largest_rectangle
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.rectification.crop import cropped, largest_rectangle
+from rigkit.rectification.rectify import RectifyMap
 
 
 def brute(seen: np.ndarray) -> int:
@@ -50,3 +52,18 @@ def test_what_the_coarse_cells_leave_is_taken_too() -> None:
 
 def test_nothing_seen_is_nothing() -> None:
     assert largest_rectangle(np.zeros((40, 50), dtype=bool)) == (0, 0, 0, 0)
+
+
+def test_a_cropped_target_shows_the_same_directions() -> None:
+    """One camera sees neither the target's left nor its top, the other not its right and bottom."""
+    target = Pinhole((90, 70), np.array([80.0, 85.0, 44.5, 34.5]))
+    seeing = [Pinhole((90, 70), np.array([80.0, 85.0, 44.5 + u, 34.5 + v])) for u, v in ((-10.0, -5.0), (8.0, 3.0))]
+    maps = [RectifyMap(camera, target, np.eye(3)) for camera in seeing]
+    parts = cropped(maps)
+    for whole, part in zip(maps, parts, strict=True):
+        assert part.target.size_px == (90 - 10 - 8, 70 - 5 - 3)
+        pixels = np.array([[0.0, 0.0], [71.0, 61.0], [20.0, 50.0]])
+        np.testing.assert_allclose(
+            part.source_pixels(pixels)[0], whole.source_pixels(pixels + np.array([10.0, 5.0]))[0]
+        )
+        assert part.coverage().all()
