@@ -7,6 +7,7 @@ import pytest
 from helpers.cameras import sample_cameras
 from helpers.tolerances import ROUND_TRIP_PX
 
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
@@ -88,3 +89,29 @@ def test_pairs_that_cannot_be_rectified_are_refused() -> None:
     looks_away = Rigid3(exp_so3(np.array([2.0, 0.0, 0.0])), np.array([-300.0, 0.0, 0.0]))
     with pytest.raises(DegenerateError, match="stereo rectification"):
         rectify_pair(narrow, narrow, looks_away)
+
+
+@pytest.mark.parametrize("projection", ["perspective", "cylindrical"])
+def test_the_target_has_the_columns_of_either_and_the_rows_of_both_at_their_resolution(projection: str) -> None:
+    one = Pinhole((640, 480), np.array([600.0, 600.0, 300.0, 250.0]))
+    two = Pinhole((640, 480), np.array([600.0, 600.0, 340.0, 260.0]))
+    # Squinting inwards, and the second camera a little up.
+    pose = Rigid3(exp_so3(np.array([-0.05, 0.2, 0.02])), [-120.0, 4.0, 15.0])
+    pair = rectify_pair(one, two, pose, projection=projection)
+    steps = np.linspace(0.0, 1.0, 301)
+    edge = np.concatenate(
+        [np.stack([steps, np.full(301, k)], axis=1) for k in (0.0, 1.0)]
+        + [np.stack([np.full(301, k), steps], axis=1) for k in (0.0, 1.0)]
+    )
+    ends = []
+    for remap in (pair.map1, pair.map2):
+        there, valid = remap.pixels(edge * [639.0, 479.0])
+        assert valid.all()
+        ends.append((there.min(axis=0), there.max(axis=0)))
+        assert np.median(remap.scale(edge * [639.0, 479.0])) == pytest.approx(1.0, abs=0.1)
+    low, high = np.array(ends).swapaxes(0, 1)
+    size = np.array(pair.map1.target.size_px) - 1.0
+    # The extent is that of samples of the images; the size is rounded up.
+    np.testing.assert_allclose([low[:, 0].min(), low[:, 1].max()], 0.0, atol=1.0)
+    np.testing.assert_allclose([high[:, 0].max(), high[:, 1].min()], size, atol=2.0)
+    assert np.ptp(low, axis=0).min() > 5.0 and np.ptp(high, axis=0).min() > 5.0
