@@ -15,7 +15,7 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.relative_pose.refinement.local import SampsonRows, marginal_quality, marginal_weights
 from rigkit.relative_pose.refinement.refine import refine_pose
-from rigkit.relative_pose.robust import robust_pose
+from rigkit.relative_pose.robust import BATCH, _draw, robust_pose
 from rigkit.relative_pose.solvers.planar_ambiguity import other_ambiguous_poses
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 
@@ -44,6 +44,22 @@ def test_outliers_do_not_matter(rng, kind, sample):
     assert found.inliers[~bad].mean() > 0.97
     # A wrong partner lies near its epipolar line by chance: 15 px of 1240.
     assert found.inliers[bad].mean() < 0.15
+
+
+def test_samples_are_drawn_until_one_without_outliers_is_likely(rng):
+    """Of five points each, one sample in a thousand has none: one batch finds such a pose in half of the scenes."""
+    for _ in range(6):
+        wild, pose, _ = contaminated(rng, "general", count=150, outliers=0.75)
+        assert max(pose_errors_deg(robust_pose(wild, rng).refined.cam2_from_cam1, pose)) < 2.0
+
+
+def test_samples_have_no_match_twice_and_all_alike(rng):
+    among = np.array([3, 5, 8, 9, 14])
+    drawn = np.concatenate([_draw(rng, among, 3) for _ in range(50)])
+    assert all(len(set(sample)) == 3 for sample in drawn.tolist())
+    counts = (drawn[..., None] == among).sum(axis=0)
+    # Five standard deviations of a share of a fifth.
+    assert np.abs(counts - len(drawn) / 5.0).max() < 5.0 * np.sqrt(50 * BATCH * 0.2 * 0.8)
 
 
 def test_the_same_seed_gives_the_same_answer(rng):
