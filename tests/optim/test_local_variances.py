@@ -59,3 +59,7 @@ def test_what_a_redescending_loss_leaves_is_made_whole(rng: np.random.Generator)
         assert left < variance
         # 200 000 draws tell a variance to 0.3 %, and less where weights are small.
         assert abs(float(of_redescending(np.array(left), TURN)) / variance - 1.0) < 0.03
+
+
+def test_samples_of_equal_variances_stay() -> None:
+    np.testing.assert_allclose(shrunk_variances(np.full(5, 4.0), np.full(5, 1e6)), 4.0, rtol=1e-5)

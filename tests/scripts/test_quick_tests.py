@@ -38,6 +38,8 @@ def test_expensive_tests_are_left_out_where_others_reach_their_lines(chooser: Mo
         ("tests/e.py::then", 1.5, 0.0, None, ".....1.1."),
         ("tests/e.py::at_last", 1.5, 0.0, None, "......1.1"),
         ("tests/contracts/test_round_trips.py::drawn", 0.1, 0.0, None, ".1......."),
+        ("tests/a.py::of_a_function[long]", 0.02, 0.0, 0, "1........"),
+        ("tests/a.py::of_a_function[short]", 0.01, 0.0, None, "1........"),
     )
     reach = chooser.Reach(
         tests=tuple(row[0] for row in table),
@@ -58,7 +60,12 @@ def test_expensive_tests_are_left_out_where_others_reach_their_lines(chooser: Mo
         "dear_and_alone_in_its_file",
         "chosen_early",
         "drawn",
+        "of_a_function[long]",
     }
-    assert reach.total_s(~out) == pytest.approx(0.1 + 2.0 + 3.0 + 4.0 + 1.0 + 9.0 + 0.1 + 1.5 + 1.5)
+    assert reach.total_s(~out) == pytest.approx(0.1 + 2.0 + 3.0 + 4.0 + 1.0 + 9.0 + 0.1 + 1.5 + 1.5 + 0.01)
     assert reach.parts[~out].any(axis=0).all()
     assert reach.left_out(20.0).sum() == 1
+    # The short test of a function stays, whatever the limit.
+    below = reach.left_out(0.005)
+    assert not below[reach.tests.index("tests/a.py::of_a_function[short]")]
+    assert below[reach.tests.index("tests/a.py::of_a_function[long]")]
