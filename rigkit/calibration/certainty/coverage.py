@@ -37,9 +37,6 @@ def corner_ranges(calibration: Calibration) -> FloatArray:
     found = []
     for board in calibration.boards:
         views = np.flatnonzero(shown == board.board_id)
-        rotation, shift = corners.rotation[views], corners.translation_mm[views]
-        # |R X + t|^2 = |X|^2 + 2 X . R^T t + |t|^2.
-        squared = board.points_mm @ (2.0 * (shift[:, None] @ rotation)[:, 0]).T
-        squared += (board.points_mm**2).sum(axis=1)[:, None] + (shift**2).sum(axis=1)
-        found.append(np.sqrt(np.maximum(squared, 0.0)).ravel())
+        places = board.points_mm @ np.swapaxes(corners.rotation[views], 1, 2) + corners.translation_mm[views, None]
+        found.append(np.linalg.norm(places, axis=-1).ravel())
     return np.concatenate(found)

@@ -15,7 +15,14 @@ from rigkit.calibration.assemble import assemble
 from rigkit.calibration.compare import CameraVerdict, compare_calibrations
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving import clustered
-from rigkit.calibration.solving.clustered import clustered_covariance, widening, with_block
+from rigkit.calibration.solving.clustered import (
+    SERIAL_LAGS,
+    SERIAL_POWER,
+    _serial_moments,
+    clustered_covariance,
+    widening,
+    with_block,
+)
 from rigkit.calibration.solving.fit import fit_kept
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
@@ -163,3 +170,19 @@ def test_widened_sigmas_contain_as_much_as_of_a_normal_distribution(sigmas: floa
     reach = sigmas * widening(8.0, sigmas)
     assert stdtr(8.0, -reach) == pytest.approx(ndtr(-sigmas))
     assert widening(1e9, sigmas) == 1.0
+
+
+def test_the_moments_of_a_sum_include_what_successive_scores_share(rng: np.random.Generator) -> None:
+    """Of an autoregression of factor r the covariances decrease as r^k; weights of Newey and West, 1 - k / (m + 1)."""
+    count, factor = 4000, 0.7
+    noise, scores = rng.normal(size=(count, 2)), np.zeros((count, 2))
+    for k in range(1, count):
+        scores[k] = factor * scores[k - 1] + noise[k]
+    moments, alike = _serial_moments(scores)
+    lags = np.arange(1, int(SERIAL_LAGS * (count / 100.0) ** SERIAL_POWER) + 1)
+    expected = 1.0 + 2.0 * np.sum((1.0 - lags / (len(lags) + 1.0)) * factor**lags)
+    assert alike == pytest.approx(expected, rel=0.05)
+    np.testing.assert_allclose(np.diag(moments) / (scores**2).sum(axis=0), expected, rtol=0.1)
+    # In a random order there is nothing alike, beyond SERIAL_SIGMAS by chance.
+    found = [_serial_moments(rng.permutation(scores)[:200])[1] for _ in range(100)]
+    assert np.mean(np.array(found) != 1.0) < 0.05
