@@ -19,7 +19,7 @@ DRAWN_EVERY_PX = 2.0
 """Largest distance of sample positions, px of the image, before averaging: blurred images have no finer detail."""
 
 MAX_RESAMPLED = 1.6e7
-"""Largest number of samples."""
+"""Largest number of samples; of boards that need more (blurred, over 30 megapixels) they are further apart."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -58,10 +58,11 @@ def resampled(image: GreyImage, lattice: Lattice, matrix: FloatArray, radius_px:
     side = float(np.median(np.linalg.norm(fit_cells(lattice.pixels, lattice.known).sides @ matrix.T, axis=2)))
     low = np.floor(corners.min(axis=0) - MARGIN_CELLS * side)
     size = np.ceil(corners.max(axis=0) + MARGIN_CELLS * side - low).astype(int) + 1
-    # Supersampling, then means.
-    fine = int(np.ceil(1.0 / (DRAWN_EVERY_PX * np.linalg.svd(matrix)[1].min())))
-    if not 0 < float(np.prod(size, dtype=np.float64)) * fine**2 < MAX_RESAMPLED:
+    count = float(np.prod(size, dtype=np.float64))
+    if not 0.0 < count < MAX_RESAMPLED:
         return None
+    # Supersampling, then means.
+    fine = int(min(np.ceil(1.0 / (DRAWN_EVERY_PX * np.linalg.svd(matrix)[1].min())), np.sqrt(MAX_RESAMPLED / count)))
     # Only the part that is sampled is converted.
     reached = (np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) * size + low) @ np.linalg.inv(matrix).T
     first = np.floor(reached.min(axis=0)).clip(0, np.array(image.shape[::-1]) - 2).astype(int)
