@@ -29,6 +29,7 @@ from rigkit.detection.checks.validate import (
 from rigkit.detection.lattice.grow import MAX_FAILED_GROWTHS, grow_all
 from rigkit.detection.lattice.lattice import MIN_ROWS, Lattice, build_lattices
 from rigkit.detection.lattice.links import find_links
+from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image
 from rigkit.detection.searched_image import SearchedImage
@@ -52,8 +53,9 @@ MarkerTest = Callable[[GreyImage, Lattice], bool]
 SMEARED_CORNERS = 12
 """Smallest number of corners with motion blur for which an image without a board is searched again with them."""
 
-SAME_PX = 4.0
-"""Largest distance between the same corners fitted in the image and in a resampled part: the effect of strong blur."""
+SAME_PX, SAME_CELLS = 4.0, 0.1
+"""Largest distance between the same corners fitted in the image and in a resampled part, px or (the larger) cells: the
+effect of strong blur."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,6 +242,11 @@ def _score(item: RefinedLattice) -> float:
     return Evidence.of(item).score
 
 
+def same_corner_px(item: RefinedLattice) -> float:
+    """Return the largest distance, px, between the corners of `item` and the same ones fitted otherwise."""
+    return max(SAME_PX, SAME_CELLS * known_median(fit_cells(item.lattice.pixels, item.lattice.known).cell_px()))
+
+
 def _with_better(found: list[RefinedLattice], others: Sequence[RefinedLattice]) -> list[RefinedLattice]:
     """Return `found` with `others` in place of lattices with mostly the same corners, and no more in total."""
     for item in others:
@@ -247,7 +254,7 @@ def _with_better(found: list[RefinedLattice], others: Sequence[RefinedLattice]) 
         same = [
             one
             for one in found
-            if 2 * int(np.count_nonzero(near_any(one.lattice.pixels[one.lattice.known], mine, SAME_PX)))
+            if 2 * int(np.count_nonzero(near_any(one.lattice.pixels[one.lattice.known], mine, same_corner_px(item))))
             > one.lattice.count
         ]
         if sum(one.lattice.count for one in same) <= item.lattice.count:

@@ -16,10 +16,12 @@ from rigkit.detection.guided.guided import completed
 from rigkit.detection.guided.rejoin import rejoined
 from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.origin import quarter_turns
+from rigkit.detection.lattices import same_corner_px
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.resampled import Resampled
 from rigkit.detection.targets.base import Finder, Search
+from rigkit.kernels.front import near_any
 
 SEEN_OF_LINE = 0.5
 """Smallest difference in the share of a missed row's corners found on one side of a lattice and on the other. On the
@@ -30,18 +32,33 @@ class ChessboardFinder(Finder):
     """Returns all lattices that no other finder has used, of any size."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
-        if search.camera is not None:
-            # The camera predicts corners in the image itself, not in resampled parts.
-            return _in_image(search.grey, search.lattices, boards, search.camera, quick=search.quick)
-        out = _in_image(
-            search.grey, [item for item in search.lattices if item.picture is None], boards, quick=search.quick
-        )
+        # The camera predicts corners in the image itself, not in resampled parts.
+        plain = [item for item in search.lattices if item.picture is None or search.camera is not None]
+        out = _in_image(search.grey, plain, boards, search.camera, quick=search.quick)
         for item in search.lattices:
             if (picture := item.picture) is not None:
                 there = _in_image(search.grey, [item], boards, picture=picture, quick=search.quick)
                 # Corners that are too oblique in the resampled part may be found in the image itself.
-                out += [completed(search.grey, _out_of(picture, found), boards, None) for found in there]
+                mine = [completed(search.grey, _out_of(picture, found), boards, None) for found in there]
+                out = out + mine if search.camera is None else _with_more_certain(out, mine, same_corner_px(item))
         return out
+
+
+def _with_more_certain(
+    found: Sequence[BoardDetection], others: Sequence[BoardDetection], same_px: float
+) -> list[BoardDetection]:
+    """Return `found` with `others` in place of those of mostly the same corners that know less of where they are."""
+    out = list(found)
+    for other in others:
+        same = [one for one in out if 2 * int(near_any(one.pixels, other.pixels, same_px).sum()) > len(one.grid)]
+        if sum(_information(one) for one in same) < _information(other):
+            out = [one for one in out if not any(one is less for less in same)] + [other]
+    return out
+
+
+def _information(found: BoardDetection) -> float:
+    # Of typical corners: a few that look far more certain than the others would outweigh these.
+    return len(found.grid) / float(np.median(found.sigma_px)) ** 2
 
 
 def _in_image(
