@@ -53,7 +53,7 @@ MarkerTest = Callable[[GreyImage, Lattice], bool]
 SMEARED_CORNERS = 12
 """Smallest number of corners with motion blur for which an image without a board is searched again with them."""
 
-SAME_PX, SAME_CELLS = 4.0, 0.1
+SAME_PX, SAME_OF_CELL = 4.0, 0.1
 """Largest distance between the same corners fitted in the image and in a resampled part, px or (the larger) cells: the
 effect of strong blur."""
 
@@ -244,7 +244,7 @@ def _score(item: RefinedLattice) -> float:
 
 def same_corner_px(item: RefinedLattice) -> float:
     """Return the largest distance, px, between the corners of `item` and the same ones fitted otherwise."""
-    return max(SAME_PX, SAME_CELLS * known_median(fit_cells(item.lattice.pixels, item.lattice.known).cell_px()))
+    return max(SAME_PX, SAME_OF_CELL * known_median(fit_cells(item.lattice.pixels, item.lattice.known).cell_px()))
 
 
 def _with_better(found: list[RefinedLattice], others: Sequence[RefinedLattice]) -> list[RefinedLattice]:
