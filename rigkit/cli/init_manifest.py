@@ -39,7 +39,7 @@ def run_manifest(args: argparse.Namespace) -> int:
     if args.square_mm is not None:
         parse_length("--square-mm", args.square_mm)
     given_poses, given_angles = _parse_pose_types(args.pose_type), _parse_angles(args.angle_deg)
-    root = usable_path(args.folder).resolve()
+    root = usable_path(args.folder)
     target = args.output or root / "dataset.toml"
     images = find_images(root)
     calibrations = _parse_calibrations(args.calibration, target.parent)
@@ -51,13 +51,17 @@ def run_manifest(args: argparse.Namespace) -> int:
     names = [pair.name for pair in found.pairs]
     for pair in found.pairs:
         note(f"pair '{pair.name}': {pair.first.image.name}, {pair.second.image.name}")
+    for again, pair in found.repeated:
+        note(
+            f"left out: '{again.first.image}' and '{again.second.image}' show the boards where pair '{pair.name}' does"
+        )
     squares_mm = 0.0 if declared else args.square_mm or parse_length("--square-mm", _ask("side of a square, mm"))
     if not calibrations:
         calibrations = _parse_calibrations([_ask("path of calibration.json")], target.parent)
     cameras = _cameras_of(names, calibrations, args.cameras)
     poses = {name: _value_of(given_poses, name) or _ask(f"pose type of '{name}'", POSE_TYPES) for name in names}
     new = NewManifest(
-        name=args.name or name_of_folder(root),
+        name=args.name or name_of_folder(root.resolve()),
         pairs=found.pairs,
         declared=declared or squares_mm,
         calibrations=calibrations,

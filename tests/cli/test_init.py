@@ -21,6 +21,7 @@ from rigkit.io.manifests.manifest_writer import ImageBoards, group_pairs
 from rigkit.io.manifests.rig_session import load_rig_session
 from rigkit.io.manifests.session import load_session
 from rigkit.io.media.images import read_image
+from rigkit.workflows.reconstruction.datasets import load_cameras
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "images"
 CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
@@ -300,3 +301,32 @@ def test_impossible_angles_are_refused(declared: str, tmp_path: Path, capsys: py
     shutil.copy(IMAGES / "fisheye-general" / "view1.jpg", tmp_path / "first")
     assert main(["init", str(tmp_path), "--square-mm", "50", "--angle-deg", declared]) == 2
     assert f"--angle-deg '{declared}': write" in capsys.readouterr().err
+
+
+def test_pictures_of_results_are_no_pairs_and_paths_stay_as_typed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "seen").mkdir()
+    for side, number in (("left", 1), ("right", 2)):
+        shutil.copy(IMAGES / "fisheye-general" / f"view{number}.jpg", f"{side}.jpg")
+        drawn = cv2.imread(f"{side}.jpg")
+        assert drawn is not None
+        cv2.imwrite(f"seen/{side}.png", cv2.circle(drawn, (40, 40), 20, (0, 0, 255), 2))
+    options = ["--square-mm", "50", "--pose-type", "general", "--calibration", str(CALIBRATION)]
+    assert main(["init", ".", *options]) == 0
+    printed = capsys.readouterr()
+    assert printed.out == "dataset.toml\n"
+    assert "left out: 'seen/left.png' and 'seen/right.png' show the boards where pair 'pair' does" in printed.err
+    assert [pair.pair_id for pair in load_dataset(tmp_path).pairs] == ["pair"]
+
+
+def test_calibrations_of_other_programs_are_taken(tmp_path: Path) -> None:
+    shutil.copytree(IMAGES / "regular-general", tmp_path / "first")
+    camera = "camera_model: pinhole, distortion_model: none, intrinsics: [1355, 1355, 811.5, 619.5]"
+    text = f"cam0: {{{camera}, distortion_coeffs: [], resolution: [1624, 1240]}}\n"
+    (tmp_path / "kalibr.yaml").write_text(text)
+    options = ["--square-mm", "50", "--pose-type", "general", "--calibration", str(tmp_path / "kalibr.yaml")]
+    assert main(["init", str(tmp_path), *options]) == 0
+    cameras = load_cameras(load_dataset(tmp_path))
+    assert [camera.calibration for camera in cameras.known.values()] == [None] and not cameras.failed

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
+import numpy as np
+
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
@@ -41,13 +43,19 @@ NUMBERED = re.compile(r"(.*\D)0*(\d+)")
 """A name that ends in a number."""
 
 
+SAME_PLACE_PX = 2.0
+"""Largest distance between the ends of the boards in an image and in a picture of its results: what is drawn over the
+corners moves them. Boards of two captures are never all so near, in both images of a pair."""
+
+
 @dataclass(frozen=True, slots=True)
 class ImageBoards:
-    """The size of an image and of the complete boards found in it."""
+    """The size of an image and of the complete boards found in it, and the (left, top, right, bottom) ends of all."""
 
     image: Path
     size_px: tuple[int, int]
     boards: tuple[tuple[int, int], ...]
+    ends_px: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -74,6 +82,16 @@ class FoundPair:
     first: ImageBoards
     second: ImageBoards
 
+    def repeats(self, other: FoundPair) -> bool:
+        """Return whether both images are in deeper folders than those of `other`, and show the boards where these do:
+        pictures of results, or copies."""
+        return len(self.first.image.parts) > len(other.first.image.parts) and all(
+            mine.size_px == its.size_px
+            and len(mine.ends_px) == len(its.ends_px) > 0
+            and np.abs(np.subtract(mine.ends_px, its.ends_px)).max() < SAME_PLACE_PX
+            for mine, its in ((self.first, other.first), (self.second, other.second))
+        )
+
 
 def find_images(folder: Path) -> list[Path]:
     """Return all images below `folder`, sorted; raises InputError if there are none, or a name is not UTF-8."""
@@ -90,11 +108,13 @@ def find_images(folder: Path) -> list[Path]:
     return images
 
 
-def board_sizes(detections: Sequence[BoardDetection]) -> tuple[tuple[int, int], ...]:
-    """Return the sizes (larger, smaller) of boards that are complete or identified, the largest first."""
+def image_boards(image: Path, size_px: tuple[int, int], detections: Sequence[BoardDetection]) -> ImageBoards:
+    """Return what `detections` show: sizes (larger, smaller), the largest first, of boards that are complete or
+    identified, and where they end."""
     whole = [d for d in detections if d.complete or d.board_id is not None]
     sizes = [(max(d.columns, d.rows), min(d.columns, d.rows)) for d in whole]
-    return tuple(sorted(sizes, reverse=True))
+    ends = [tuple(np.concatenate([d.pixels.min(axis=0), d.pixels.max(axis=0)]).tolist()) for d in whole]
+    return ImageBoards(image, size_px, tuple(sorted(sizes, reverse=True)), tuple(sorted(ends)))
 
 
 def group_pairs(shown: Sequence[ImageBoards], root: Path) -> list[FoundPair]:

@@ -13,27 +13,29 @@ from rigkit.core.identifiers import MAX_IDENTIFIER
 from rigkit.core.printing import counted
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
-from rigkit.io.calibrations.calibration_file import load_camera
 from rigkit.io.disk.writing import write_atomic
 from rigkit.io.manifests.manifest import load_dataset
 from rigkit.io.manifests.manifest_writer import (
     FoundPair,
     ImageBoards,
     NewManifest,
-    board_sizes,
     group_pairs,
+    image_boards,
     manifest_text,
 )
 from rigkit.io.media.images import read_image, require_size, to_grey
+from rigkit.workflows.inputs.camera_files import load_camera_or_calibration
 from rigkit.workflows.inputs.identify_board import suggestion
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FoundPairs:
-    """The pairs of a folder, and the errors of images that cannot be read."""
+    """The pairs of a folder, the errors of images that cannot be read, and the pairs that show again what another one
+    does, with that."""
 
     pairs: tuple[FoundPair, ...]
     unreadable: tuple[InputError, ...]
+    repeated: tuple[tuple[FoundPair, FoundPair], ...] = ()
 
 
 def find_pairs(
@@ -48,8 +50,8 @@ def find_pairs(
     for done, path in enumerate(images, start=1):
         try:
             image = read_image(path)
-            sizes = board_sizes(detect_boards(to_grey(image), boards or None))
-            shown.append(ImageBoards(path, (image.shape[1], image.shape[0]), sizes))
+            found = detect_boards(to_grey(image), boards or None)
+            shown.append(image_boards(path, (image.shape[1], image.shape[0]), found))
         except InputError as error:
             unreadable.append(error)
         progress("looking for boards", done, len(images))
@@ -60,7 +62,16 @@ def find_pairs(
         seen = suggestion(images).words
         such = f"they show --board {seen}, with MM measured" if seen else "give other boards with --board"
         raise InputError(f"init: {what} is found in {counted(len(shown), 'image')}; {such}")
-    return FoundPairs(tuple(group_pairs(shown, root)), tuple(unreadable))
+    pairs: list[FoundPair] = []
+    repeated: list[tuple[FoundPair, FoundPair]] = []
+    # Captures are above the folders of their results.
+    for pair in sorted(group_pairs(shown, root), key=lambda one: len(one.first.image.parts)):
+        before = next((one for one in pairs if pair.repeats(one)), None)
+        if before is None:
+            pairs.append(pair)
+        else:
+            repeated.append((pair, before))
+    return FoundPairs(tuple(sorted(pairs, key=lambda one: one.name)), tuple(unreadable), tuple(repeated))
 
 
 def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> InputError | None:
@@ -73,7 +84,12 @@ def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> Inpu
         for image, name in zip((pair.first, pair.second), new.cameras[pair.name], strict=True):
             calibration = path.parent / new.calibrations[name]
             if calibration.is_file():
-                require_size(image.size_px, f"image '{image.image}'", load_camera(calibration).size_px, calibration)
+                require_size(
+                    image.size_px,
+                    f"image '{image.image}'",
+                    load_camera_or_calibration(calibration)[0].size_px,
+                    calibration,
+                )
     write_atomic(path, manifest_text(new, path.parent.resolve()), force=force)
     try:
         load_dataset(path)

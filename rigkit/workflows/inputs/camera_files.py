@@ -91,6 +91,13 @@ def camera_format(text: str) -> str | None:
     return "rigkit" if OURS.search(text) and found not in JSON_TOO else found
 
 
+def load_camera_or_calibration(path: str | Path) -> tuple[Camera, Calibration | None]:
+    """Return the camera of a file of rigkit or another tool, and the calibration if it is one; raises as
+    `import_camera`."""
+    calibration = calibration_of_file(path)
+    return (import_camera(path), None) if calibration is None else (calibration.camera, calibration)
+
+
 def calibration_of_file(path: str | Path) -> Calibration | None:
     """Return the calibration in a file of rigkit's, None for any other; raises InputError if it cannot be read."""
     if camera_format(camera_text(path)) != "rigkit":

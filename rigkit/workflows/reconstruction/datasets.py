@@ -23,11 +23,11 @@ from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.errors import InputError, InternalError, RigkitError, interruption
 from rigkit.core.processes import over_items, process_count
 from rigkit.core.progress import Progress, silent
-from rigkit.io.calibrations.calibration_file import calibration_text, load_calibration_or_camera
+from rigkit.io.calibrations.calibration_file import calibration_text
 from rigkit.io.disk.reading import about
 from rigkit.io.manifests.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.workflows.calibration.calibrate import calibrate_camera
-from rigkit.workflows.inputs.camera_files import warn_if_bad, warn_if_exact
+from rigkit.workflows.inputs.camera_files import load_camera_or_calibration, warn_if_bad, warn_if_exact
 from rigkit.workflows.options.clouds import DatasetOptions
 from rigkit.workflows.outputs.results import CALIBRATIONS, require_folder, write_results
 
@@ -142,7 +142,8 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool = False, progress: Progr
         name = entry.camera_id
         try:
             if entry.calibration.is_file() and (name not in used or not recalibrate):
-                known[name], sources[name] = _load(entry.calibration), entry.calibration
+                sources[name] = entry.calibration
+                known[name] = LoadedCamera(*load_camera_or_calibration(entry.calibration))
                 whole = known[name].calibration
                 if name in used:
                     warn_if_bad(entry.calibration, () if whole is None else whole.verdicts)
@@ -182,11 +183,6 @@ def _file_of(camera_id: str, index: int) -> str:
     """Return the path of a new calibration in the results; characters that file names cannot have are replaced."""
     safe = re.sub(r"[^\w-]", "_", camera_id)[:40]
     return f"{CALIBRATIONS}/{safe if safe == camera_id else f'{safe}-{index + 1}'}.json"
-
-
-def _load(path: Path) -> LoadedCamera:
-    known = load_calibration_or_camera(path)
-    return LoadedCamera(known.camera, known) if isinstance(known, Calibration) else LoadedCamera(known, None)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
