@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--length", type=float, metavar="MM", help="also state the error of a length of MM")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance (with --length)")
     add_options(parser, CheckOptions, fix="FILE.json", report="-r [check.html]", history="--register FILE.jsonl")
-    add_options(parser, CheckOptions, temperature_c="--temperature C", force="")
+    add_options(parser, CheckOptions, temperature_c="--temperature C", frames="", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="images as captured, folders or videos; with --rig of two cameras, taken at the same time",
     )
     parser.add_argument("--camera", metavar="CALIB", help="the camera's calibration.json")
-    add_options(parser, RectifyOptions, output="-o OUT", maps="FILE.npz", force="")
+    add_options(parser, RectifyOptions, output="-o OUT", maps="FILE.npz", frames="", force="")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     stereo = parser.add_argument_group(
         "stereo",

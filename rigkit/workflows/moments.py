@@ -13,6 +13,7 @@ from rigkit.core.printing import counted
 from rigkit.io.manifests.rig_session import frames_of_images
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.folder_session import cameras_in, images_of_camera
+from rigkit.workflows.options.base import FrameRule
 
 _log = logging.getLogger(__name__)
 
@@ -31,12 +32,15 @@ def warn_of_several_cameras(sources: Sequence[Path]) -> None:
                 )
 
 
-def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[ImagesByMoment, list[Path]]:
+def moments_of(
+    names: Sequence[str], sources: Sequence[Path], how: FrameRule | None = None
+) -> tuple[ImagesByMoment, list[Path]]:
     """Return the moments of the cameras `names`, and the images without a partner.
 
     Sources are one folder per camera, named like the cameras or in their order; one folder, as for `cameras_in`; or the
     images themselves. These are grouped by the names of files or folders if these are equal but for the camera's name,
-    else moment by moment, in the order of the cameras. Raises InputError for unequal numbers of images.
+    else moment by moment, in the order of the cameras. `how` pairs the images of folders (`frames_of_images`). Raises
+    InputError for unequal numbers of images.
     """
     if len(names) == 1:
         moments = [[image] for image in images_in(sources)]
@@ -55,21 +59,26 @@ def moments_of(names: Sequence[str], sources: Sequence[Path]) -> tuple[ImagesByM
         raise InputError(
             f"a rig of {len(names)} cameras ({', '.join(names)}) needs a folder of images for each, got {len(found)}"
         )
-    return grouped_by_moment([found[name] for name in names] if set(found) == set(names) else list(found.values()))
+    columns = [found[name] for name in names] if set(found) == set(names) else list(found.values())
+    return grouped_by_moment(columns, how)
 
 
-def grouped_by_moment(columns: Sequence[Sequence[Path]]) -> tuple[ImagesByMoment, list[Path]]:
+def grouped_by_moment(
+    columns: Sequence[Sequence[Path]], how: FrameRule | None = None
+) -> tuple[ImagesByMoment, list[Path]]:
     """Return the moments of which every camera has an image of the same name or number, and the images without a
-    partner; images are paired in order where names give no pairs.
+    partner; images are paired in order where names give no pairs. `how` as for `frames_of_images`.
 
     Raises InputError where they give none, and the cameras have unequal numbers of images.
     """
     places = [f"{own[0].parent}" for own in columns]
     keys = places if len(set(places)) == len(places) else [f"{k}" for k in range(len(places))]
     try:
-        known = frames_of_images({key: [path.name for path in own] for key, own in zip(keys, columns, strict=True)})
+        known = frames_of_images(
+            {key: [path.name for path in own] for key, own in zip(keys, columns, strict=True)}, how
+        )
     except InputError:
-        if len({len(own) for own in columns}) > 1:
+        if how is not None or len({len(own) for own in columns}) > 1:
             raise
         return [list(moment) for moment in zip(*columns, strict=True)], []
     frames = [{known[key][path.name]: path for path in own} for key, own in zip(keys, columns, strict=True)]
@@ -79,6 +88,11 @@ def grouped_by_moment(columns: Sequence[Sequence[Path]]) -> tuple[ImagesByMoment
             "no frame has an image of every camera (same name or number); give images that were taken together"
         )
     single = [path for own in frames for frame, path in own.items() if frame not in shared]
+    if single and how is None and len({len(own) for own in columns}) == 1:
+        _log.warning(
+            f"{counted(len(shared), 'moment')} by names or numbers, of {counted(len(columns[0]), 'image')} of every "
+            "camera; if the sorted lists correspond one by one: --frames order"
+        )
     return [[own[frame] for own in frames] for frame in shared], single
 
 

@@ -31,6 +31,7 @@ from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_camera, import_pair, rig_of_file
 from rigkit.workflows.inputs.folder_session import cameras_in, images_of_camera
 from rigkit.workflows.moments import grouped_by_moment, warn_of_several_cameras
+from rigkit.workflows.options.base import FrameRule
 from rigkit.workflows.options.cameras import RectifyOptions
 
 
@@ -160,7 +161,7 @@ def rectify_stereo_images(
         images, names = _assigned(images, tuple(rig_of_file(rig).cameras))
     both, (camera1, camera2), cam2_from_cam1 = import_pair(rig, names)
     with ExitStack() as stack:
-        sources, single = _pairs(images, both, stack)
+        sources, single = _pairs(images, both, stack, options.frames)
         out = options.output
         if _is_folder(out):
             jobs = [_outputs(own, out / name) for own, name in zip(sources, both, strict=True)]
@@ -200,7 +201,7 @@ def _assigned(
 
 
 def _pairs(
-    images: tuple[str | Path, str | Path] | str | Path, names: tuple[str, str], stack: ExitStack
+    images: tuple[str | Path, str | Path] | str | Path, names: tuple[str, str], stack: ExitStack, how: FrameRule | None
 ) -> tuple[Sequence[Sequence[Path | _VideoFrame]], dict[str, InputError]]:
     """Return the paired images of each camera, and the errors of images without a partner."""
     if isinstance(images, (str, Path)):
@@ -227,7 +228,7 @@ def _pairs(
         return [sources[:count] for sources in own], {}
     else:
         found = [list(images_in([Path(image)])) for image in images]
-    moments, single = grouped_by_moment(found)
+    moments, single = grouped_by_moment(found, how)
     alone = {str(path): InputError(f"'{path}': the other camera has no image of its name or number") for path in single}
     return list(zip(*moments, strict=True)), alone
 

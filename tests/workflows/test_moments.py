@@ -51,6 +51,21 @@ def test_images_without_a_partner_are_named(tmp_path: Path) -> None:
     assert moments == [[left[0], right[0]], [left[2], right[2]]] and single == [left[1], right[1]]
 
 
+def test_counters_that_overlap_are_paired_in_order_if_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    # Two cameras count their own pictures: DSC_3 and IMG_3 are not of one moment.
+    left, right = (
+        _images(tmp_path / "left", "DSC_1", "DSC_2", "DSC_3"),
+        _images(tmp_path / "right", "IMG_3", "IMG_4", "IMG_5"),
+    )
+    folders = [tmp_path / "left", tmp_path / "right"]
+    assert moments_of(NAMES, folders, "order") == ([list(pair) for pair in zip(left, right, strict=True)], [])
+    assert not caplog.text
+    assert moments_of(NAMES, folders)[0] == [[left[2], right[0]]]
+    assert (
+        "1 moment by names or numbers, of 3 images of every camera" in caplog.text and "--frames order" in caplog.text
+    )
+
+
 def test_names_that_tell_nothing_leave_the_order(tmp_path: Path) -> None:
     left, right = _images(tmp_path / "left", "a", "b"), _images(tmp_path / "right", "c", "d")
     folders = [tmp_path / "left", tmp_path / "right"]

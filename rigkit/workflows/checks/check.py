@@ -100,8 +100,8 @@ def check_pictures(
     warn_if_bad(source)
     if not images:
         raise InputError("check: give new images, or a folder of them")
-    now, single = moments_of(monitored.names, paths_of(images))
-    before, alone = moments_of(monitored.names, options.before) if options.before else ([], [])
+    now, single = moments_of(monitored.names, paths_of(images), options.frames)
+    before, alone = moments_of(monitored.names, options.before, options.frames) if options.before else ([], [])
     inputs = [source, *(image for frame in (*now, *before) for image in frame)]
     ensure_writable((options.fix, options.report), force=options.force, inputs=inputs)
     if options.history is not None:

@@ -2,6 +2,10 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Literal
+
+FrameRule = Literal["name", "number", "time", "order"]
+"""What tells which images of several cameras are of one moment (`rig_session.frames_of_images`)."""
 
 
 class NamesFiles:

@@ -6,7 +6,7 @@ from pathlib import Path
 from rigkit.core.boards import Board
 from rigkit.core.measurement_task import Task
 from rigkit.core.reach import Reach
-from rigkit.workflows.options.base import WrittenFiles
+from rigkit.workflows.options.base import FrameRule, WrittenFiles
 
 TYPICAL_SIGMA_PX = 0.15
 
@@ -25,6 +25,7 @@ class CheckOptions(WrittenFiles):
     report : write an HTML report.
     history : append the check to this register (see rigkit history).
     temperature_c : temperature during the capture, for the register.
+    frames : which images of a rig are of one moment (default: by their names; "order": by the sorted lists).
     """
 
     boards: tuple[Board, ...] = ()
@@ -35,6 +36,7 @@ class CheckOptions(WrittenFiles):
     report: Path | None = None
     history: Path | None = None
     temperature_c: float | None = None
+    frames: FrameRule | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

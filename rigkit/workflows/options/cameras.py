@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from rigkit.core.errors import InputError
-from rigkit.workflows.options.base import NamesFiles, WrittenFiles
+from rigkit.workflows.options.base import FrameRule, NamesFiles, WrittenFiles
 
 
 class Cache(StrEnum):
@@ -142,6 +142,7 @@ class RectifyOptions(WrittenFiles):
     interpolation : spline (default) shifts points by less than 0.001 px; linear is fast.
     crop : crop to the largest rectangle without empty pixels (in both images of a pair).
     maps : also write K, P, Q (mm) and maps for cv2.remap.
+    frames : which images of a rig are of one moment (default: by their names; "order": by the sorted lists).
     """
 
     output: Path
@@ -152,6 +153,7 @@ class RectifyOptions(WrittenFiles):
     interpolation: Literal["spline", "lanczos", "linear", "nearest"] = "spline"
     crop: bool = False
     maps: Path | None = None
+    frames: FrameRule | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
