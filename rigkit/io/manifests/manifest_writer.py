@@ -83,14 +83,16 @@ class FoundPair:
     second: ImageBoards
 
     def repeats(self, other: FoundPair) -> bool:
-        """Return whether both images are in deeper folders than those of `other`, and show the boards where these do:
+        """Return whether both images are in deeper folders than those of `other`, and show boards only where these do:
         pictures of results, or copies."""
         return len(self.first.image.parts) > len(other.first.image.parts) and all(
-            mine.size_px == its.size_px
-            and len(mine.ends_px) == len(its.ends_px) > 0
-            and np.abs(np.subtract(mine.ends_px, its.ends_px)).max() < SAME_PLACE_PX
+            mine.size_px == its.size_px and all(_is_among(ends, its.ends_px) for ends in mine.ends_px)
             for mine, its in ((self.first, other.first), (self.second, other.second))
         )
+
+
+def _is_among(ends: Sequence[float], others: Sequence[Sequence[float]]) -> bool:
+    return any(max(abs(a - b) for a, b in zip(ends, one, strict=True)) < SAME_PLACE_PX for one in others)
 
 
 def find_images(folder: Path) -> list[Path]:
