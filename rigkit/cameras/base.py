@@ -279,10 +279,11 @@ class Camera(ABC):
         y: FloatArray,
         z: FloatArray,
         d_pixels_d_point: FloatArray,
-        d_pixels_d_parameters: FloatArray,
+        d_pixels_d_parameters: FloatArray | None,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return u, v and valid, each (N,), of N points given by flat coordinates, and write the Jacobians into
-        `d_pixels_d_point` (2, 3, N) and `d_pixels_d_parameters` (2, P, N): `project_with_jacobians` without allocation.
+        `d_pixels_d_point` (2, 3, N) and, unless None, `d_pixels_d_parameters` (2, P, N): `project_with_jacobians`
+        without allocation.
 
         Invalid entries are arbitrary, also NaN. The caller has to fill `d_pixels_d_parameters` with zeros: entries that
         are zero for every camera of the model are not written.

@@ -19,11 +19,11 @@ import numpy as np
 
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.shape import in_enough_views, released_sigma
-from rigkit.calibration.solving.state import State, with_views_changed
+from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardView, grid_turned
+from rigkit.core.detections import grid_turned
 from rigkit.geometry.rigid3 import Rigid3
 
 SURE = 10.0
@@ -52,12 +52,17 @@ def with_boards_renumbered(
 ) -> tuple[Observations, State]:
     """Return observations and state with the boards of the chosen `views` (V,) numbered from another corner. Residuals
     of flat boards do not change."""
-
-    def renumbered(view: BoardView, pose: Rigid3) -> tuple[BoardView, Rigid3]:
-        grid = grid_turned(view.grid, view.board.size, quarter_turns)
-        return replace(view, grid=grid), pose @ board_turn(view.board, quarter_turns).inverse()
-
-    return with_views_changed(observations, state, views, renumbered)
+    rotation, translation = state.rotation.copy(), state.translation_mm.copy()
+    corner, changed = observations.corner.copy(), list(observations.views)
+    for k in np.flatnonzero(views).tolist():
+        board = changed[k].board
+        changed[k] = replace(changed[k], grid=grid_turned(changed[k].grid, board.size, quarter_turns))
+        pose = Rigid3(rotation[k], translation[k]) @ board_turn(board, quarter_turns).inverse()
+        rotation[k], translation[k] = pose.rotation, pose.translation_mm
+        index = observations.first_row[observations.board[k]] + board.index(changed[k].grid)
+        corner[k, : len(index)] = index
+    observations = replace(observations, views=tuple(changed), corner=corner)
+    return observations, replace(state, rotation=rotation, translation_mm=translation)
 
 
 def misnumbered_views(observations: Observations, fit: Fit, quarter_turns: int) -> BoolArray:

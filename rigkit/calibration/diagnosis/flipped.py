@@ -12,26 +12,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rigkit.calibration.assemble import with_solution
-from rigkit.calibration.choosing.board_orientation import with_boards_renumbered
 from rigkit.calibration.diagnosis.two_kinds import ImageScores
 from rigkit.calibration.diagnosis.view_evidence import ViewEvidence, columns_of
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.poses import START_TOLERANCE, refine_poses
 from rigkit.calibration.solving.solver import solve
-from rigkit.calibration.solving.state import State, evaluate, weighted_squares, with_views_changed
-from rigkit.calibration.views.flips import FLIP_SIGNS, Flip
+from rigkit.calibration.solving.state import State, evaluate, weighted_squares
+from rigkit.calibration.views.flips import FLIP_SIGNS
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import image_center
 from rigkit.core.arrays import BoolArray, IntArray
-from rigkit.core.detections import BoardView
 from rigkit.core.findings import Finding
-from rigkit.geometry.rigid3 import Rigid3
 
 TOLERANCE = 1e-4
 """Relative cost at which the solver stops: if flipping is the cause, the cost falls by a factor."""
@@ -88,6 +85,7 @@ def flipped_images(
     if not tried or not before > 0.0:
         return None
     back = min(tried, key=lambda one: one.squares)
+    back = replace(back, observations=_with_views(back.observations))
     residuals = evaluate(back.state, back.observations)
     solved = with_solution(calibration, back.observations, back.state, residuals, fit.kept)
     now = evidence.again(solved)
@@ -159,7 +157,8 @@ def _fitting_better_flipped(
     numbered from either end, as is one with rotational symmetry."""
     every, weight = np.ones(len(observations.views), dtype=bool), fit.weight(observations)
     now, costs = weighted_squares(state, observations, weight), []
-    for turns in (0, 2):
+    # Flat boards look the same from either end.
+    for turns in (0,) if state.shape.kind == "flat" else (0, 2):
         numbered = turns == 2 and math.prod(FLIP_SIGNS[way]) > 0.0
         possible = np.array([not numbered or view.board.looks_same_turned for view in observations.views])
         if not possible.any():
@@ -177,15 +176,46 @@ def _flipped(
     way: str, at: BoolArray, turns: IntArray, observations: Observations, state: State
 ) -> tuple[Observations, State]:
     """Return observations and poses with the images of the views `at` (V,) flipped in one `way`, and their boards
-    renumbered by so many quarter `turns` (V,)."""
-    signs, middle = FLIP_SIGNS[way], image_center(state.camera.size_px)
-    flip = Flip(signs, 0 if math.prod(signs) < 0.0 else None)
+    renumbered by so many quarter `turns` (V,): a mirrored board along its columns, or else along its rows. Only
+    `_with_views` has the views themselves flipped."""
+    signs = np.append(FLIP_SIGNS[way], 1.0)
+    half, which = turns == 2, observations.board
+    backwards = at[:, None] & np.stack([half ^ bool(signs.prod() < 0.0), half], axis=-1)
+    size = np.array([board.size for board in observations.boards])[which][:, None]
+    first = observations.first_row[which][:, None]
+    grid = _grid(observations)
+    grid = np.where(backwards[:, None], size - 1 - grid, grid)
+    corner = np.where(observations.present, first + grid[..., 1] * size[..., 0] + grid[..., 0], observations.corner)
+    middle, off_axis = image_center(state.camera.size_px), np.where(at[:, None], signs, 1.0)
+    pixels = np.where(
+        (at[:, None] & observations.present)[..., None],
+        middle + signs[:2] * (observations.pixels - middle),
+        observations.pixels,
+    )
+    # The frame of a board begins at zero again.
+    far = np.where(backwards, np.array([board.points()[-1, :2] for board in observations.boards])[which], 0.0)
+    on_board = np.append(np.where(backwards, -1.0, 1.0), np.ones((len(at), 1)), axis=1)
+    place = (state.rotation[..., :2] @ far[..., None])[..., 0] + state.translation_mm
+    moved = replace(
+        state,
+        rotation=off_axis[:, :, None] * state.rotation * on_board[:, None],
+        translation_mm=off_axis * place,
+    )
+    return replace(observations, pixels=pixels, corner=corner), moved
 
-    def flipped(view: BoardView, pose: Rigid3) -> tuple[BoardView, Rigid3]:
-        return flip.view(view, middle), flip.pose(pose, view.board)
 
-    out, state = with_views_changed(observations, state, at, flipped)
-    return with_boards_renumbered(out, state, at & (turns == 2), 2)
+def _grid(observations: Observations) -> IntArray:
+    """Return column and row (V, C, 2) of every corner on its board."""
+    columns = np.array([board.columns for board in observations.boards])[observations.board]
+    row, column = np.divmod(observations.corner - observations.first_row[observations.board][:, None], columns[:, None])
+    return np.stack([column, row], axis=-1)
+
+
+def _with_views(observations: Observations) -> Observations:
+    """Return the observations with views of their pixels and corners."""
+    each = zip(observations.views, _grid(observations), observations.pixels, strict=True)
+    views = [replace(view, grid=grid[: len(view.grid)], pixels=pixels[: len(view.grid)]) for view, grid, pixels in each]
+    return replace(observations, views=tuple(views))
 
 
 def _finding_of(back: _FlippedBack, before: float, evidence: ViewEvidence) -> Finding | None:

@@ -22,17 +22,22 @@ CORNERS_AT_A_TIME = 8192
 
 
 def normal_equations(
-    observations: Observations, state: State, weight: FloatArray | None = None, loss_px: float | None = None
+    observations: Observations,
+    state: State,
+    weight: FloatArray | None = None,
+    loss_px: float | None = None,
+    *,
+    lens_held: bool = False,
 ) -> NormalEquations:
     """Return the normal equations and the cost at `state`, without priors.
 
     `weight` (V, C) multiplies the residuals, by default the observations' own; `loss_px` is the scale of the Cauchy
-    loss, None for least squares.
+    loss, None for least squares. With `lens_held` the camera's parameters are no unknowns.
     """
     weight = observations.weight if weight is None else weight
     views, corners = weight.shape
     camera, shape = state.camera, state.shape
-    parameters = camera.parameters.size
+    parameters = 0 if lens_held else camera.parameters.size
     count = parameters + shape.basis.shape[-1]
     sums = ViewSums.of(_board_views(observations, state, weight, loss_px), count + 7)
     step = max(1, CORNERS_AT_A_TIME // max(corners, 1))
@@ -46,7 +51,7 @@ def normal_equations(
             first,
             d_pixels_d_point,
             d_pixels_d_parameters,
-            camera.derivatives(x, y, z, d_pixels_d_point, d_pixels_d_parameters),
+            camera.derivatives(x, y, z, d_pixels_d_point, None if lens_held else d_pixels_d_parameters),
             lever,
         )
     products, shared = sums.products, sums.products[:, :count].sum(axis=0)

@@ -41,7 +41,7 @@ def refine_poses(
 
     def linearise(rotation: Mat3, translation_mm: Points) -> NormalEquations:
         moved = replace(held, rotation=rotation, translation_mm=translation_mm)
-        return normal_equations(observations, moved, weight, loss_px)
+        return normal_equations(observations, moved, weight, loss_px, lens_held=True)
 
     rotation, translation_mm, cost = refine_each(state.rotation, state.translation_mm, linearise, tolerance)
     return replace(state, rotation=rotation, translation_mm=translation_mm), cost

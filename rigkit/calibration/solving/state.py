@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,9 +11,7 @@ from rigkit.calibration.solving.normal_equations import Residuals, SchurStep
 from rigkit.calibration.solving.shape import ShapeModel, shape_model
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
-from rigkit.core.detections import BoardView
-from rigkit.geometry.rigid3 import Rigid3
+from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.geometry.rotation import exp_so3
 
 
@@ -67,26 +64,6 @@ class State:
         np.matmul(self.rotation, np.swapaxes(board, 0, 1), out=np.swapaxes(lever, 0, 1))
         points = lever + self.translation_mm.T[:, :, None]
         return np.moveaxis(points, 0, -1), np.moveaxis(lever, 0, -1)
-
-
-def with_views_changed(
-    observations: Observations,
-    state: State,
-    chosen: BoolArray,
-    change: Callable[[BoardView, Rigid3], tuple[BoardView, Rigid3]],
-) -> tuple[Observations, State]:
-    """Return observations and state with the views `chosen` (V,) and their poses as `change` returns them; a view keeps
-    its board and its corners, but these may have other pixels and another numbering."""
-    rotation, translation = state.rotation.copy(), state.translation_mm.copy()
-    pixels, corner, views = observations.pixels.copy(), observations.corner.copy(), list(observations.views)
-    for k in np.flatnonzero(chosen).tolist():
-        views[k], pose = change(views[k], Rigid3(rotation[k], translation[k]))
-        rotation[k], translation[k] = pose.rotation, pose.translation_mm
-        pixels[k, : len(views[k].grid)] = views[k].pixels
-        index = observations.first_row[observations.board[k]] + views[k].board.index(views[k].grid)
-        corner[k, : len(index)] = index
-    observations = replace(observations, views=tuple(views), pixels=pixels, corner=corner)
-    return observations, replace(state, rotation=rotation, translation_mm=translation)
 
 
 def evaluate(state: State, observations: Observations) -> Residuals:

@@ -233,3 +233,12 @@ def test_a_best_fit_at_the_end_of_a_range_is_found(start: float, rng: np.random.
     assert step is not None
     assert step.globals[4] == 0.0
     assert step.predicted < COST_REL * found.normal.cost
+
+
+@pytest.mark.parametrize("name", ["reg", "fish"])
+def test_pose_blocks_with_the_lens_held_are_the_same(name: str, rng: np.random.Generator) -> None:
+    observations, state = scene(name, rng)
+    whole, held = normal_equations(observations, state), normal_equations(observations, state, lens_held=True)
+    assert held.gg.shape == (0, 0)
+    for own, alone in ((whole.pp, held.pp), (whole.p, held.p), (whole.costs, held.costs)):
+        assert np.allclose(own, alone, rtol=1e-12)
