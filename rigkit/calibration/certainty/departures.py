@@ -38,6 +38,7 @@ from rigkit.calibration.solving.clustered import (
     products_between,
     root_of_inverse,
     square_of_rest,
+    summed_by,
     widening,
     with_block,
 )
@@ -179,11 +180,7 @@ def _by_image(calibration: Calibration, products: FloatArray) -> FloatArray:
     number: dict[str, int] = {}
     shown = np.unique(corners.view[corners.kept]).tolist()
     image = [number.setdefault(calibration.views[k].image, len(number)) for k in shown]
-    if len(number) == len(image):
-        return products
-    out = np.zeros((len(number), *products.shape[1:]))
-    np.add.at(out, image, products)
-    return out
+    return summed_by(np.array(image), products)
 
 
 def _less_noise(calibration: Calibration, root: FloatArray, variance: float, share: float) -> FloatArray:

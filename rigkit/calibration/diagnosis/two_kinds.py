@@ -89,8 +89,7 @@ class ImageScores:
     def of(cls, fit: Fit, number: IntArray, min_images: int | None = None) -> ImageScores:
         """Return those of the images `number` (V,) of the views, with all other unknowns held; by default a part has at
         least `min_of_a_kind` images."""
-        information, score = _of_images(fit, fit.data.products[0], number)
-        return cls.scaled(information, score, _prior(fit), min_images)
+        return cls.scaled(*_of_images(fit, number), _prior(fit), min_images)
 
     @classmethod
     def of_halves(cls, observations: Observations, fit: Fit, number: IntArray) -> ImageScores:
@@ -98,8 +97,9 @@ class ImageScores:
         every board is cut across its longer direction in the image, and both parts may have poses of their own."""
         first, weight, count = _first_halves(observations, fit.kept), fit.weight(observations), number.max() + 1
         parts = [view_products(observations, fit.state, np.where(half, weight, 0.0)) for half in (first, ~first)]
-        information, score = _of_images(fit, np.concatenate(parts), np.r_[number, count + number])
-        return cls.scaled(information, score, _prior(fit), 1)
+        p = fit.state.camera.parameters.size
+        of_halves = reduced_by_cluster(np.concatenate(parts), p, np.r_[number, count + number])
+        return cls.scaled(*of_halves, _prior(fit), 1)
 
     @classmethod
     def scaled(
@@ -278,16 +278,15 @@ class ImageScores:
         return reached / (DRAWS + 1)
 
 
-def _of_images(fit: Fit, products: FloatArray, number: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return information (N, P, P) and score (N, P) of the images `number` (V,) from J^T J of the views (V, K, K)."""
+def _of_images(fit: Fit, number: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return information (N, P, P) and score (N, P) of the images `number` (V,) of the views."""
     p = fit.state.camera.parameters.size
-    rows = np.r_[:p, -7:0] % products.shape[-1]
-    return reduced_by_cluster(products[:, rows[:, None], rows], p, number)
+    return reduced_by_cluster(fit.data.products[0], p, number, fit.normal.covariance[2])
 
 
 def explained_by_focus(fit: Fit, number: IntArray) -> float:
     """Return what another focal length for every image explains, of the images `number` (V,) of the views."""
-    information, score = _of_images(fit, fit.data.products[0], number)
+    information, score = _of_images(fit, number)
     step = _longer_focus(fit.state.camera)
     return _amounts(information @ step, step, score)[1]
 

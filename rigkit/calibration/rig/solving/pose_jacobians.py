@@ -18,6 +18,7 @@ import numpy as np
 
 from rigkit.calibration.certainty.covariance import PoseJacobians
 from rigkit.calibration.rig.solving.state import RigObservations, RigState
+from rigkit.calibration.solving.clustered import summed_by
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.geometry.rotation import skew
 
@@ -99,16 +100,15 @@ def summed_products(
     for own, direct, parts in each:
         p = len(direct)
         for part in parts:
-            follow = np.zeros((len(part.views), p + 7, count + 7))
-            follow[:, np.arange(p), direct] = 1.0
-            follow[:, p : p + 6, part.index] = part.globals
-            follow[:, p : p + 6, count : count + 6] = part.target
+            # Derivatives by the camera's own unknowns, by those that move its views, and by the pose; the residual.
+            columns = np.concatenate([direct, part.index, np.arange(count, count + 7)])
+            follow = np.zeros((len(part.views), p + 7, len(columns)))
+            follow[:, np.arange(p), np.arange(p)] = 1.0
+            follow[:, p : p + 6, p:-7] = part.globals
+            follow[:, p : p + 6, -7:-1] = part.target
             follow[:, -1, -1] = 1.0
-            more = np.swapaxes(follow, -1, -2) @ own[part.views] @ follow
-            if len(np.unique(part.poses)) == len(part.poses):
-                out[part.poses] += more
-            else:  # Slow, but adds all views of one pose.
-                np.add.at(out, part.poses, more)
+            more = summed_by(part.poses, np.swapaxes(follow, -1, -2) @ own[part.views] @ follow)
+            out[: len(more), columns[:, None], columns] += more
     return out
 
 
