@@ -119,14 +119,20 @@ def reduced_by_cluster(
 
 
 def summed_by(group: IntArray, values: FloatArray) -> FloatArray:
-    """Return the sums (N, ...) of the values (V, ...) of each `group` (V,). np.add.at takes ten times as long."""
+    """Return the sums (N, ...) of the values (V, ...) of each `group` (V,). np.add.at takes several times as long."""
     count = int(group.max(initial=-1)) + 1
     if count == len(group) and (group[1:] > group[:-1]).all():
         return values
     order = np.argsort(group, kind="stable")
-    shown, first = np.unique(group[order], return_index=True)
-    out = np.zeros((count, *values.shape[1:]))
-    out[shown] = np.add.reduceat(values[order], first, axis=0)
+    shown, first, size = np.unique(group[order], return_index=True, return_counts=True)
+    out = values[order[first]]
+    if len(shown) < count:
+        out, some = np.zeros((count, *values.shape[1:])), out
+        out[shown] = some
+    # The second value of every group, the third one ...: none of these sets has a group twice.
+    for k in range(1, int(size.max(initial=0))):
+        one = order[first[size > k] + k]
+        out[group[one]] += values[one]
     return out
 
 
