@@ -236,7 +236,7 @@ def _result(solution: _Solution) -> Calibration:
     """Return the result of a camera with its verdicts, with a moving pupil if requested or confirmed."""
     central, far = solution.assembled()
     request = solution.fits.request
-    if request.pupil == "central" or (request.pupil == "auto" and not may_move(central)):
+    if request.pupil == "central" or (request.pupil == "auto" and not may_move(central, far)):
         return solution.with_verdicts(central, far)
     moving = solved_with_pupil(solution.outcome, solution.fits.observations, request)
     compared: Sequence[Candidate] = ()

@@ -122,7 +122,7 @@ def changing(
     at first order."""
     smooth = calibration.corners.neighbour_correlation > MIN_NEIGHBOUR_CORRELATION
     evidence = view_evidence(calibration) if smooth else None
-    changes = evidence.changes() if evidence is not None else {}
+    changes = dict(evidence.changes) if evidence is not None else {}
     if evidence is None or not changes:
         return []
     if solved is not None:
@@ -228,7 +228,7 @@ def drifting(calibration: Calibration, evidence: ViewEvidence) -> Finding | None
     from scipy.special import stdtr
 
     columns = columns_of(evidence.own.shape[1])["focus"]
-    if evidence.changes()["focus"].ratio < MIN_FOCUS_RATIO:
+    if evidence.changes["focus"].ratio < MIN_FOCUS_RATIO:
         return None
     views = [calibration.views[k] for k in evidence.views]
     amounts = evidence.explained(columns)[2][:, 0]

@@ -77,10 +77,11 @@ def flipped_images(
     principal points are possible.
     """
     before = float(weighted_squares(fit.state, observations, fit.weight(observations)).sum())
+    split = _split_of_shifts(evidence, len(observations.views)) if shifted else None
     tried = [
         _alternated(way, at, turns, observations, fit, before)
         for way in _possible_ways(observations)
-        for at, turns in _initial_flips(way, evidence if shifted else None, observations, fit)
+        for at, turns in _initial_flips(way, split, observations, fit)
     ]
     if not tried or not before > 0.0:
         return None
@@ -105,23 +106,25 @@ def _possible_ways(observations: Observations) -> list[str]:
     return [way for way, signs in FLIP_SIGNS.items() if readable or math.prod(signs) > 0.0]
 
 
+def _split_of_shifts(evidence: ViewEvidence, count: int) -> BoolArray | None:
+    """Return which of `count` views are of one of two clusters of principal points; None without any."""
+    rows = columns_of(evidence.own.shape[1])["shift"]
+    scores = ImageScores.scaled(evidence.own[:, rows, rows], evidence.along[:, rows], np.zeros((2, 2)))
+    split = scores.best_split()
+    return None if split is None else np.isin(np.arange(count), np.array(evidence.views)[split[0]])
+
+
 def _initial_flips(
-    way: str, evidence: ViewEvidence | None, observations: Observations, fit: Fit
+    way: str, split: BoolArray | None, observations: Observations, fit: Fit
 ) -> Iterator[tuple[BoolArray, IntArray]]:
     """Yield which views (V,) may be flipped, and the quarter turns by which their boards are then numbered differently:
-    the views that fit better flipped with lens and boards held, and those of one of two clusters of principal points.
+    the views that fit better flipped with lens and boards held, and those of the `split` by principal points.
     """
     better, gain, turns = _fitting_better_flipped(way, observations, fit.state, fit)
     if gain > MIN_FIRST_GAIN and not better.all():
         yield better, turns
-    if evidence is None:
-        return
-    rows = columns_of(evidence.own.shape[1])["shift"]
-    scores = ImageScores.scaled(evidence.own[:, rows, rows], evidence.along[:, rows], np.zeros((2, 2)))
-    if split := scores.best_split():
-        at = np.zeros(len(turns), dtype=bool)
-        at[np.array(evidence.views)[split[0]]] = True
-        yield at, turns
+    if split is not None:
+        yield split, turns
 
 
 def _alternated(
@@ -220,7 +223,7 @@ def _with_views(observations: Observations) -> Observations:
 
 def _finding_of(back: _FlippedBack, before: float, evidence: ViewEvidence) -> Finding | None:
     """Return the finding, if flipping images back explains the residuals and no shift between images is left."""
-    at, changes = back.at, evidence.changes()
+    at, changes = back.at, evidence.changes
     left, part = max(back.squares / before, np.finfo(float).eps), float(at.mean())
     if not 0.0 < part < 1.0 or not changes:
         return None

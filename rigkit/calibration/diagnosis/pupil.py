@@ -249,9 +249,10 @@ def modelled_pupil(calibration: Calibration) -> Iterator[Finding]:
     )
 
 
-def may_move(calibration: Calibration) -> bool:
+def may_move(calibration: Calibration, far: FarProjection) -> bool:
     """Return whether a moving pupil should be solved for: its first-order estimate is significant at ASKED_AT, or the
-    lens is wide, and far points may be displaced by a relevant amount. The fit decides then."""
+    lens is wide, and far points may be displaced by a relevant amount, against `far` of the calibration. The fit
+    decides then."""
     if calibration.corners.neighbour_correlation <= MIN_NEIGHBOUR_CORRELATION:
         return False
     pupil = MovingPupil.of(calibration)
@@ -262,7 +263,7 @@ def may_move(calibration: Calibration) -> bool:
         return False
     uncertain = EXCLUDED_SIGMAS * pupil.sigma_mm_per_rad2 / max(abs(pupil.mm_per_rad2), np.finfo(float).tiny)
     more = 1.0 + uncertain if rim > WIDE_FROM_RAD else 1.0
-    return more * pupil.far_px(FarProjection.of(calibration)) > MIN_FOUND * SMALL_PX
+    return more * pupil.far_px(far) > MIN_FOUND * SMALL_PX
 
 
 def _distances_and_rim(calibration: Calibration) -> tuple[float, float, float]:

@@ -6,8 +6,9 @@ an image's residuals (`predicted_by_others`) is no change.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -64,7 +65,7 @@ class ViewChange:
         return cls(squares / directions / rest, squares - directions * rest, left, float(criterion))
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ViewEvidence:
     """Products of the rows of `rows_of` for V views, with poses eliminated.
 
@@ -112,9 +113,10 @@ class ViewEvidence:
         """Return the evidence of another solution for the same images."""
         return _evidence(calibration, self.clusters)
 
-    def changes(self) -> dict[str, ViewChange]:
-        """Return what each kind of change explains; empty with too few degrees of freedom."""
-        out = {}
+    @cached_property
+    def changes(self) -> Mapping[str, ViewChange]:
+        """What each kind of change explains; empty with too few degrees of freedom."""
+        out: dict[str, ViewChange] = {}
         for kind, rows in columns_of(self.own.shape[1]).items():
             squares, directions, _ = self.explained(rows)
             if self.freedom <= 2 * directions or not self.total > squares:

@@ -160,7 +160,7 @@ def test_what_changes_is_far_above_the_correlation_that_is_looked_at(way: str, r
     assert noise.corners.neighbour_correlation < MIN_NEIGHBOUR_CORRELATION
     evidence = view_evidence(noise)
     assert evidence is not None
-    assert max(change.share for change in evidence.changes().values()) < 0.1
+    assert max(change.share for change in evidence.changes.values()) < 0.1
 
 
 def test_what_is_wrong_in_all_images_alike_changes_in_none(rng: np.random.Generator) -> None:
