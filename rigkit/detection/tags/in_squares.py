@@ -12,7 +12,6 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, known_median
 from rigkit.core.boards import Board
-from rigkit.core.detections import grid_turned
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.lattice.lattice import Lattice
@@ -26,10 +25,6 @@ from rigkit.kernels.surface import maps_of_quads
 MIN_MARKERS, AGREEING_MARKERS = 3, 0.7
 """Smallest number of markers, and smallest share of those read, that agree on the place of a lattice: on a board of the
 other pattern, or with other columns, only the markers of every second row agree."""
-
-LIKE_BETTER_ROWS = 0.5
-"""Smallest mean likeness of a row of markers that agrees with a place, relative to the better half of the rows: on a
-board of the other pattern, every second row has 0."""
 
 MAX_PREDICTION_GAIN = 8.0
 """Largest standard deviation of predicted corners beyond the known ones of standard deviation 1."""
@@ -98,17 +93,8 @@ def _place_together(
     place = place_together(excess, cells, size, codes_at)
     if place is None:
         return None
-    _, turns, shift = place
-    columns, rows = size
-    column, row = (grid_turned(cells, (columns - 1, rows - 1), turns) + shift).T
-    inside = (column >= 0) & (row >= 0) & (column <= board.columns) & (row <= board.rows)
-    codes = codes_at[row[inside], column[inside]]
-    own = codes >= 0
-    of_row = np.bincount(row[inside][own]), np.bincount(row[inside][own], excess[inside][own, codes[own] + -turns % 4])
-    means = np.sort(of_row[1][of_row[0] > 0] / of_row[0][of_row[0] > 0])
-    agreeing = means > LIKE_BETTER_ROWS * means[len(means) // 2 :].mean()
     # The first square is the one before the first corner.
-    return (turns, shift - 1) if agreeing.mean() >= AGREEING_MARKERS else None
+    return place[1], place[2] - 1
 
 
 def between_markers(image: GreyImage, pixels: FloatArray, board: Board) -> FloatArray:
@@ -144,6 +130,18 @@ def between_markers(image: GreyImage, pixels: FloatArray, board: Board) -> Float
     np.add.at(markers, (rows[read], columns[read]), 1)
     grown[(markers < ADJACENT_MARKERS) & np.isnan(np.pad(pixels[..., 0], 1, constant_values=np.nan))] = np.nan
     return grown[1:-1, 1:-1]
+
+
+def confirmed(image: GreyImage, pixels: FloatArray, board: Board) -> bool:
+    """Return whether most markers that are read between the corners (R, C, 2) of a board, NaN where unknown, are the
+    board's own in their places."""
+    quads = _square_corners(pixels, _places(board))
+    inside = np.flatnonzero(_in_image(image, quads).all(axis=1))
+    if not len(inside):
+        return False
+    tags = _read(image, quads[inside], board)
+    own = tags.read & (tags.number == _pattern(board).first_marker + inside) & (tags.turns == 0)
+    return bool(np.count_nonzero(own) >= max(1.0, AGREEING_MARKERS * np.count_nonzero(tags.read)))
 
 
 def likeness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, numbers: IntArray, board: Board) -> FloatArray:

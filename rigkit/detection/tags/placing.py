@@ -36,6 +36,10 @@ ones; the sum of many is normal: one in a billion, with hundreds of places to tr
 AHEAD = 2.0
 """Smallest difference of the excess to that of any other place."""
 
+LIKE_BETTER_ROWS = 0.5
+"""Smallest mean excess of a row of tags that agrees with a place, relative to the better half of the rows: on a ChArUco
+board of the other pattern every second row has 0, on a board with other columns than declared all rows but one."""
+
 MIN_TAGS_OF_PLACE = 4
 """Smallest number of tags that are evaluated together; fewer are read one by one."""
 
@@ -177,7 +181,7 @@ def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> Place | None:
 
 def place_together(excess: FloatArray, cells: IntArray, size: tuple[int, int], codes_at: IntArray) -> Place | None:
     """Return the place of a lattice whose codes may be too blurred to be read one by one: the one with the largest
-    correlation of all of them with the board's codes. None if it may be random.
+    correlation of all of them with the board's codes. None if it may be random, or if it is that of some rows only.
 
     Parameters
     ----------
@@ -216,7 +220,15 @@ def place_together(excess: FloatArray, cells: IntArray, size: tuple[int, int], c
     best = int(score.argmax())
     if score[best] < max(SURE_EXCESS, AHEAD + float(np.delete(score, best).max(initial=0.0))):
         return None
-    return int(count[best]), int(move[best, 0]), move[best, 1:]
+    turn, shift = int(move[best, 0]), move[best, 1:]
+    column, row = (grid_turned(cells, (columns - 1, rows - 1), turn) + shift).T
+    own = (column >= 0) & (row >= 0) & (column < wide) & (row < tall)
+    own[own] = codes_at[row[own], column[own]] >= 0
+    row, agreement = row[own], excess[own, codes_at[row[own], column[own]] + -turn % 4]
+    there = np.bincount(row)
+    means = np.sort((np.bincount(row, agreement) / np.maximum(there, 1))[there > 0])
+    agreeing = means > LIKE_BETTER_ROWS * means[len(means) // 2 :].mean()
+    return (int(count[best]), turn, shift) if agreeing.mean() >= AGREEING_READ else None
 
 
 def squares_of(lattice: Lattice, *, dark: bool) -> tuple[FloatArray, IntArray]:

@@ -17,7 +17,7 @@ from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
 from rigkit.detection.saddles.local_contrast import equalised, stretched
 from rigkit.detection.saddles.response import BASE_PIXELS, GreyImage, Level, each_level, enlarged_level
 from rigkit.detection.saddles.saddle import Corners, each_once, find_corners
-from rigkit.detection.tags.codes import read_tags
+from rigkit.detection.tags.codes import excess_likeness
 from rigkit.detection.tags.corners import tag_corners
 from rigkit.detection.tags.placing import TagBoard, placed_lattices
 from rigkit.detection.tags.quads import placed_tags
@@ -27,6 +27,10 @@ from rigkit.detection.targets.base import Finder, Search
 FIRST_SEEN, MIN_SEEN_AT_FIRST = 0.9, 16
 """Smallest share of the visible corners, and smallest number, that must be found on the finest level for the coarser
 ones to be skipped; the few missed ones are then searched for one by one."""
+
+LIKE_BEST_CODE = 0.5
+"""Smallest excess of a code in its place, relative to that of the code most like it: that one is itself unless blurred;
+another code reaches half of the largest of a hundred random ones once in ten times."""
 
 
 class AprilGridFinder(Finder):
@@ -52,9 +56,8 @@ class AprilGridFinder(Finder):
                 seen = tag_corners(grey, item, pixels, search.camera) if np.isfinite(pixels).any() else None
                 if seen is None or len(seen.grid) < search.min_corners_of(item.board):
                     continue
-                # Tags that place less than half of the corners may be of another board, whose corners fit as well.
-                few = 2 * np.count_nonzero(np.isfinite(pixels[..., 0])) < len(seen.grid)
-                if not few or _confirmed(grey, item, seen):
+                # Corners of another board fit as well.
+                if _confirmed(grey, item, seen):
                     found.append(seen)
         return found
 
@@ -120,13 +123,15 @@ def _or_lone_tags(image: GreyImage, tags: TagBoard, pixels: FloatArray) -> Float
 
 
 def _confirmed(image: GreyImage, tags: TagBoard, seen: BoardDetection) -> bool:
-    """Return whether most of the tags that are read in a detection are the board's tags at these places."""
+    """Return whether most codes in a detection are like those of the board's tags at these places, which may be too
+    blurred to be read one by one."""
     pixels = seen.lattice()
     quads = np.stack([pixels[::2, ::2], pixels[::2, 1::2], pixels[1::2, 1::2], pixels[1::2, ::2]], axis=2)
     whole = np.isfinite(quads).all(axis=(2, 3))
-    codes = read_tags(image, quads[whole], tags.codes)
-    own = (codes.number == tags.numbers[whole]) & (codes.turns == 0)
-    return bool(2 * np.count_nonzero(codes.read & own) > np.count_nonzero(codes.read))
+    excess = excess_likeness(image, quads[whole], tags.codes)
+    own = excess[np.arange(len(excess)), 4 * np.flatnonzero(whole)]
+    alike = own > LIKE_BEST_CODE * excess.max(axis=1, initial=0.0)
+    return bool(2 * np.count_nonzero(alike) > np.count_nonzero(excess.any(axis=1)))
 
 
 def _nearly_whole(tags: TagBoard, pixels: FloatArray, shape: tuple[int, ...]) -> bool:

@@ -35,7 +35,7 @@ from rigkit.detection.subpixel.subpixel import refine
 from rigkit.detection.subpixel.uncertain_corners import sigmas_beside_edges
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.detection.tags.codes import transferred
-from rigkit.detection.tags.in_squares import AGREEING_MARKERS, MIN_MARKERS, between_markers, place_by_markers
+from rigkit.detection.tags.in_squares import AGREEING_MARKERS, MIN_MARKERS, between_markers, confirmed, place_by_markers
 from rigkit.detection.tags.without_markers import without_markers
 from rigkit.detection.targets.base import Finder, Search
 from rigkit.kernels.boards import Picture
@@ -153,7 +153,7 @@ def _by_outlines(
     pictures: Sequence[GreyImage], lattices: Sequence[RefinedLattice], board: Board
 ) -> tuple[Lattice, list[RefinedLattice]]:
     """Return the corners of a board beside markers detected by their outlines, from lattices where these have them, and
-    the lattices that have none."""
+    the lattices that have none; no corners where other markers are read between them (of a board of other columns)."""
     whole, left = _empty(board), []
     seen = (_marked_corners(as_bytes(picture), board) for picture in pictures)
     grid, pixels = max(seen, key=lambda corners: len(corners[0]))
@@ -163,7 +163,9 @@ def _by_outlines(
             left.append(item)
         else:
             whole = whole.filled(placed)
-    return whole.filled(_of(board, grid, pixels)), left
+    whole = whole.filled(_of(board, grid, pixels))
+    sure = any(confirmed(picture, whole.pixels, board) for picture in pictures)
+    return (whole, left) if sure else (_empty(board), list(lattices))
 
 
 def _marked_corners(image: np.ndarray, board: Board) -> tuple[IntArray, FloatArray]:

@@ -203,6 +203,16 @@ def test_blurred_tags_of_another_board_are_none(rng: np.random.Generator) -> Non
     assert not any(found.board_id for found in detect_boards(image, [others]))
 
 
+@pytest.mark.parametrize(("shown", "declared"), [(1.0, 4), (0.5, 4), (0.5, 6), (0.5, 10), (0.5, 12)])
+def test_tags_of_a_board_with_other_columns_are_none(shown: float, declared: int) -> None:
+    """Of the whole board one row agrees with the declared board's; of its half one tag is read, by chance."""
+    board = Board("b", 12, 12, 60.0, 60.0, pattern=AprilGrid(0.3))
+    image = facing(board, 30.0).render(optics=Optics(2.5), noise_levels=2.0, rng=np.random.default_rng(0))
+    part = np.ascontiguousarray(image[:, : round(shown * image.shape[1])])
+    found = detect_boards(part, [replace(board, columns=declared)])
+    assert [item.board_id for item in found] == (["b"] if declared == board.columns else [])
+
+
 def test_tags_of_few_bits_name_no_mirror_image() -> None:
     """Of the nine in the lattice eight are read as some tag of the board, four of them as those of one place."""
     tags = AprilGrid(0.3, "DICT_APRILTAG_16h5", numbering="opencv")
