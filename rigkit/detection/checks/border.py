@@ -9,13 +9,14 @@ remains a part.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, known_median
+from rigkit.core.arrays import BoolArray, FloatArray, known_median, median_of
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import FLEXIBLE, MIN_PREDICTORS, LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, sample
@@ -124,14 +125,23 @@ def place_part(image: GreyImage, refined: RefinedLattice, sizes: Sequence[tuple[
     refined : a part of a board; lattices of a known size are returned unchanged.
     sizes : (columns, rows) of the possible boards, which may be swapped.
     """
-    columns, rows = refined.lattice.size
-    known = {size for c, r in sizes for size in ((c, r), (r, c))}
-    if (columns, rows) in known:
+    larger = further_lines(refined.lattice, sizes)
+    if (0, 0) in larger:
         return refined
-    larger = [(c - columns, r - rows) for c, r in known if c >= columns and r >= rows]
-    if not larger:
-        return None
-    every = board_sides(image, refined.lattice)
+    return part_between(image, refined, larger, board_sides(image, refined.lattice)) if larger else None
+
+
+def further_lines(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return how many more columns and rows the boards of the `sizes`, which may be swapped, have than `lattice`."""
+    columns, rows = lattice.size
+    known = {size for c, r in sizes for size in ((c, r), (r, c))}
+    return [(c - columns, r - rows) for c, r in known if c >= columns and r >= rows]
+
+
+def part_between(
+    image: GreyImage, refined: RefinedLattice, larger: Sequence[tuple[int, int]], every: Sequence[BoardSide]
+) -> RefinedLattice | None:
+    """Return `refined` as by `place_part`, from the `further_lines` of boards and its `board_sides`."""
     cell_px = fit_cells(refined.lattice.pixels, refined.lattice.known).cell_px()
     if known_median(refined.blur_px) > EDGE_WIDTH * float(np.median(cell_px)):
         every = _with_blurred_borders(image, refined.lattice, every)
@@ -179,14 +189,13 @@ def _alternations_beyond(image: GreyImage, lattice: Lattice) -> FloatArray:
 
 def _alternation_above_first_row(image: GreyImage, lattice: Lattice) -> float:
     squares = _Squares.above(lattice)
-    seen = squares.inside(image, float(NEXT_SQUARE[1]), float(WITHIN[-1])) & squares.near
-    seen &= squares.supported(MIN_NEXT_SUPPORT)
+    seen = squares.inside(image, _corners_of_next_square()) & squares.near & squares.supported(MIN_NEXT_SUPPORT)
     bright, dark = seen & squares.bright, seen & ~squares.bright
     if min(bright.sum(), dark.sum()) < MIN_OF_KIND:
         return np.nan
-    inner, outer, beyond = (squares.brightness(image, places) for places in (-SQUARE, SQUARE, NEXT_SQUARE))
-    contrast = float(np.median(np.where(squares.bright, outer - inner, inner - outer)[seen]))
-    return float(np.median(beyond[dark]) - np.median(beyond[bright])) / max(contrast, 1e-3)
+    inner, outer, beyond = _medians(squares.brightness(image, _places_in_next_square()))
+    contrast = median_of(np.where(squares.bright, outer - inner, inner - outer)[seen])
+    return (median_of(beyond[dark]) - median_of(beyond[bright])) / max(contrast, 1e-3)
 
 
 def _side_above_first_row(image: GreyImage, lattice: Lattice) -> BoardSide:
@@ -195,21 +204,69 @@ def _side_above_first_row(image: GreyImage, lattice: Lattice) -> BoardSide:
     usable = squares.usable(image)
     if usable.sum() < 2 * MIN_OF_KIND:
         return BoardSide(Side.UNKNOWN)
-    inner, outer, beyond = (squares.brightness(image, places) for places in (-SQUARE, SQUARE, BEYOND))
+    brightness = squares.brightness(image, _places_to_border())
+    inner, outer, beyond = _medians(brightness[:, : 3 * len(SQUARE)])
     contrast = np.where(squares.bright, outer - inner, inner - outer)
-    usable &= contrast > MIN_OUTER_CONTRAST * float(np.nanmedian(lattice.contrast))
+    usable &= contrast > MIN_OUTER_CONTRAST * known_median(lattice.contrast)
     if any((usable & kind).sum() < MIN_OF_KIND for kind in (squares.bright, ~squares.bright)):
         return BoardSide(Side.UNKNOWN)
     dark = np.minimum(inner, outer)
     relative = (beyond - dark) / np.maximum(contrast, 1e-3)
-    level = float(np.median(relative[usable]))
+    level = median_of(relative[usable])
     steps = np.abs(beyond - outer) > MIN_STEP * contrast
-    border = squares.end_on_one_line(image, outer, beyond, usable & steps) | ~steps
+    profiles = brightness[:, 3 * len(SQUARE) :].mean(axis=2)
+    border = squares.end_on_one_line(profiles, outer, beyond, usable & steps) | ~steps
     border &= np.abs(relative - level) < EVEN
     if (usable & steps).sum() >= MIN_OF_KIND and border[usable].mean() >= AGREEING_SQUARES:
         return BoardSide(Side.BORDER, level)
     continues = np.where(squares.bright, relative < MAX_NEXT_DARK, relative > 1.0 - MAX_NEXT_DARK)
     return BoardSide(Side.CONTINUES if continues[usable].mean() >= AGREEING_SQUARES else Side.UNKNOWN)
+
+
+def _medians(brightness: FloatArray) -> FloatArray:
+    """Return the medians (3, M) over three parts of `brightness` (M, 3 K, 3), K odd."""
+    parts = brightness.reshape(len(brightness), 3, -1)
+    middle = parts.shape[2] // 2
+    # np.median takes five times as long.
+    return np.partition(parts, middle, axis=2)[..., middle].T
+
+
+def _weights(up: FloatArray, lateral: FloatArray) -> FloatArray:
+    """Return the weights (K, 20) of `_Squares.corners` for the pixels at `up` (K,) squares beyond the row and `lateral`
+    (K,) from the squares' middles: interpolated between the polynomials of the two corners of the nearer row."""
+    weights = np.zeros((len(up), 2, 2, 5))
+    for k, (down, near) in enumerate(((1.0 - up, up >= 0.5), (-up, up < 0.5))):
+        for shift, share in ((0, 0.5 - lateral), (1, 0.5 + lateral)):
+            along = 0.5 + lateral - shift
+            terms = [np.ones(len(up)), along, down, 0.5 * along**2, 0.5 * down**2]
+            weights[:, k, shift] = np.where(near, share, 0.0)[:, None] * np.stack(terms, axis=1)
+    return weights.reshape(len(up), -1)
+
+
+def _across(*up: FloatArray) -> FloatArray:
+    """Return the `_weights` WITHIN the squares at each of the distances `up`."""
+    every = np.concatenate(up)
+    return _weights(np.repeat(every, len(WITHIN)), np.tile(WITHIN, len(every)))
+
+
+@functools.cache
+def _places_to_border() -> FloatArray:
+    return _across(-SQUARE, SQUARE, BEYOND, PROFILE)
+
+
+@functools.cache
+def _places_in_next_square() -> FloatArray:
+    return _across(-SQUARE, SQUARE, NEXT_SQUARE)
+
+
+@functools.cache
+def _corners_to_border() -> FloatArray:
+    return _weights(np.array([1.0, 1.0, BEYOND[-1], BEYOND[-1]]), np.array([-0.5, 0.5, -0.5, 0.5]))
+
+
+@functools.cache
+def _corners_of_next_square() -> FloatArray:
+    return _weights(np.repeat(NEXT_SQUARE[1], 2), WITHIN[[0, -1]])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -221,11 +278,13 @@ class _Squares:
     bright : (M,) whether they are white.
     near : (M,) whether one of the two corners of row 0 is known.
     shape : of the cells (row -1, columns -1 .. C), then of (row 0, columns -1 .. C); 2 (M + 1) in all.
+    corners : (M, 20, 2) pixels and derivatives of `shape` at the left and the right corner in row -1, then in row 0.
     """
 
     bright: BoolArray
     near: BoolArray
     shape: LocalFit
+    corners: FloatArray
 
     @classmethod
     def above(cls, lattice: Lattice) -> _Squares:
@@ -236,35 +295,21 @@ class _Squares:
         bright = wide.signs()[2, 1:-2] < 0.0
         known = wide.known[2, 1:-1]
         shape = fit_cells(wide.pixels, cells, **FLEXIBLE._asdict())
-        return cls(bright, known[:-1] | known[1:], shape)
-
-    def at(self, up: FloatArray, lateral: FloatArray) -> FloatArray:
-        """Return pixels (M, K, 2) at `up` (K,) squares beyond the row and `lateral` (K,) from the squares' middles."""
-        count = len(self.bright)
-        far = up >= 0.5
-        out = np.zeros((count, len(up), 2))
-        for first, rows, which in ((0, 1.0 - up, far), (count + 1, -up, ~far)):
-            for shift, share in ((0, 0.5 - lateral), (1, 0.5 + lateral)):
-                part = slice(first + shift, first + shift + count)
-                along = (0.5 + lateral - shift)[:, None]
-                down = rows[:, None]
-                place = self.shape.pixels[part, None] + along * self.shape.along_column[part, None]
-                place = place + down * self.shape.along_row[part, None]
-                place = place + 0.5 * along**2 * self.shape.curvature_column[part, None]
-                place = place + 0.5 * down**2 * self.shape.curvature_row[part, None]
-                out += np.where(which, share, 0.0)[:, None] * place
-        return out
+        terms = np.concatenate([shape.pixels[:, None], shape.sides, shape.curvatures], axis=1)
+        first, second = terms.reshape(2, -1, *terms.shape[1:])
+        corners = np.concatenate([first[:-1], first[1:], second[:-1], second[1:]], axis=1)
+        return cls(bright, known[:-1] | known[1:], shape, corners)
 
     def usable(self, image: GreyImage) -> BoolArray:
         """Return which squares (M,) are large enough and well predicted, and in the image with the paper beyond."""
         sound = (self.shape.gain < MAX_BORDER_GAIN) & (self.shape.shorter_px() > MIN_CELL_PX)
-        inside = self.inside(image, 1.0, 0.5) & self.inside(image, float(BEYOND[-1]), 0.5)
+        inside = self.inside(image, _corners_to_border())
         return np.asarray(inside & self.near & self.supported(MIN_PREDICTORS) & self._of_squares(sound))
 
-    def inside(self, image: GreyImage, up: float, lateral: float) -> BoolArray:
-        """Return which squares (M,) are in the image at `up` squares beyond the row, to `lateral` on both sides."""
+    def inside(self, image: GreyImage, weights: FloatArray) -> BoolArray:
+        """Return which squares (M,) are in the image at all places of the `_weights`."""
         height, width = image.shape
-        places = self.at(np.array([up, up]), np.array([-lateral, lateral]))
+        places = weights @ self.corners
         return np.asarray(((places >= 0.0) & (places <= np.array([width, height]) - 1.0)).all(axis=(1, 2)))
 
     def supported(self, min_support: int) -> BoolArray:
@@ -277,23 +322,26 @@ class _Squares:
         both = first & second
         return np.asarray(both[:-1] & both[1:])
 
-    def brightness(self, image: GreyImage, up: FloatArray) -> FloatArray:
-        """Return the median brightness (M,) over `up` (K,) squares beyond the row and WITHIN the squares."""
-        places = self.at(np.repeat(up, len(WITHIN)), np.tile(WITHIN, len(up)))
-        return np.asarray(np.median(sample(image, places), axis=1), dtype=np.float64)
+    def brightness(self, image: GreyImage, weights: FloatArray) -> FloatArray:
+        """Return the brightness (M, K, 3) WITHIN the squares at the K distances of the `_weights` (`_across`)."""
+        values = sample(image, weights @ self.corners)
+        return values.astype(np.float64).reshape(len(values), -1, len(WITHIN))
 
-    def end_on_one_line(self, image: GreyImage, outer: FloatArray, beyond: FloatArray, tested: BoolArray) -> BoolArray:
-        """Return which squares (M,) change from brightness `outer` to `beyond` once, on the line of those `tested`."""
-        places = self.at(np.repeat(PROFILE, len(WITHIN)), np.tile(WITHIN, len(PROFILE)))
-        values = sample(image, places).reshape(len(outer), len(PROFILE), len(WITHIN)).mean(axis=2)
+    def end_on_one_line(
+        self, profiles: FloatArray, outer: FloatArray, beyond: FloatArray, tested: BoolArray
+    ) -> BoolArray:
+        """Return which squares (M,) change from brightness `outer` to `beyond` once, on the line of those `tested`.
+
+        `profiles` (M, K) : their brightness along PROFILE.
+        """
         step = beyond - outer
         step = np.where(np.abs(step) < 1e-3, 1e-3, step)
-        past = (values - outer[:, None]) / step[:, None] > 0.5
+        past = (profiles - outer[:, None]) / step[:, None] > 0.5
         end = PROFILE[0] + (PROFILE[1] - PROFILE[0]) * ((~past).sum(axis=1) - 0.5)
         from_end = PROFILE - end[:, None]
         clean = ~((from_end < -EDGE_WIDTH) & past).any(axis=1) & ~((from_end > EDGE_WIDTH) & ~past).any(axis=1)
         count = len(self.bright) + 1
         height = np.linalg.norm(self.shape.along_row[:count], axis=1)
         within = np.maximum(STRAIGHT, STRAIGHT_PX / np.maximum(np.minimum(height[:-1], height[1:]), 1.0))
-        line = float(np.median(end[tested])) if tested.any() else 1.0
+        line = median_of(end[tested]) if tested.any() else 1.0
         return np.asarray(clean & (np.abs(end - line) < within) & (abs(line - 1.0) < ENDS_WITHIN))
