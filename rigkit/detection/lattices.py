@@ -29,16 +29,16 @@ from rigkit.detection.checks.validate import (
 from rigkit.detection.lattice.grow import MAX_FAILED_GROWTHS, grow_all
 from rigkit.detection.lattice.lattice import MIN_ROWS, Lattice, build_lattices
 from rigkit.detection.lattice.links import find_links
-from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
+from rigkit.detection.new_corners import is_mostly, new_corners, with_better
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image
+from rigkit.detection.saddles.saddle import Corners
 from rigkit.detection.searched_image import SearchedImage
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
 from rigkit.detection.subpixel.subpixel import refine
 from rigkit.detection.subpixel.uniform_blur import LOOKED_AT_PX, with_uniform_blur
 from rigkit.detection.subpixel.whole_board import placed_together
-from rigkit.kernels.front import near_any
 
 IsPlausible = Callable[[GreyImage, Level, Lattice], bool]
 
@@ -52,10 +52,6 @@ MarkerTest = Callable[[GreyImage, Lattice], bool]
 
 SMEARED_CORNERS = 12
 """Smallest number of corners with motion blur for which an image without a board is searched again with them."""
-
-SAME_PX, SAME_OF_CELL = 4.0, 0.1
-"""Largest distance between the same corners fitted in the image and in a resampled part, px or (the larger) cells: the
-effect of strong blur."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,36 +88,19 @@ def find_lattices(
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
-    criteria = BoardCriteria(min_corners, sizes, has_markers)
     searched = searched or SearchedImage.of(grey)
-    plausible = _RejectionCounter(_is_plausible if has_markers is None else _plausible_or_marked(has_markers))
-    fitted = _Fitted()
-
-    def search(at: SearchedImage, before: Sequence[RefinedLattice] = (), more_than: int = 0) -> list[RefinedLattice]:
-        boards = candidate_lattices(at, min_corners, _again_or(plausible, before) if before else plausible)
-        if sum(item.count for item in boards) <= more_than:
-            return []
-        out = fitted.confirmed(grey, boards, criteria)
-        if has_markers is None:
-            # Large lattices were tested before they were fully grown. Of discs that nearly touch, coarser levels show
-            # corners that hide how far the edges bow between them. Markers in the squares bow edges, too, but the
-            # finest level shows their corners.
-            off = has_edge_offset if at is searched else has_bowed_edges
-            out = [item for item in out if not (item.lattice.solid and off(item.lattice, searched.finest))]
-        plausible.rejected += 0 if out else len(boards)
-        return out
-
-    found = search(searched)
+    search = _Search.of(searched, grey, BoardCriteria(min_corners, sizes, has_markers))
+    found = search.at(searched)
     if _needs_second_search(searched, found, sizes):
-        found = max(search(searched.with_smeared(), found), found, key=corner_count)
+        found = search.more(found, searched.with_smeared(), searched.saddles.smeared, SMEARED_CORNERS, ties=True)
     for k in range(1, 1 if searched.enlarged else len(searched.levels)):
         # Coarser levels help only where squares do not meet at their corners; those of clutter do.
-        if _has_whole_board(found, sizes) or plausible.rejected >= MAX_FAILED_GROWTHS:
+        if _has_whole_board(found, sizes) or search.plausible.rejected >= MAX_FAILED_GROWTHS:
             break
         coarser = searched.coarser(k)
         if coarser is None:
             break
-        found = max(found, search(coarser, found, corner_count(found)), key=corner_count)
+        found = search.more(found, coarser, coarser.corners, MIN_BOARD_CORNERS, ties=False)
     if min_corners < MIN_BOARD_CORNERS and has_markers is None:
         return found
     return [
@@ -147,17 +126,72 @@ class _RejectionCounter:
 
 
 @dataclass(slots=True)
-class _Fitted:
-    """What `fit_and_confirm` gave for the lattices of earlier searches: the same often grow from several levels."""
+class _Search:
+    """Searches of one image with different corners.
 
-    every: list[tuple[list[Lattice], list[RefinedLattice]]] = field(default_factory=list)
+    Attributes
+    ----------
+    first : the corners of the first search.
+    grey, criteria : where boards are fitted, and what they must fulfil.
+    plausible : the test of lattices before they are fully grown.
+    fitted : what `fit_and_confirm` gave for the lattices of each search: the same often grow from several levels.
+    """
 
-    def confirmed(self, grey: GreyImage, boards: list[Lattice], criteria: BoardCriteria) -> list[RefinedLattice]:
-        for same, out in self.every:
+    first: SearchedImage
+    grey: GreyImage
+    criteria: BoardCriteria
+    plausible: _RejectionCounter
+    fitted: list[tuple[list[Lattice], list[RefinedLattice]]] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, first: SearchedImage, grey: GreyImage, criteria: BoardCriteria) -> _Search:
+        has_markers = criteria.has_markers
+        test = _is_plausible if has_markers is None else _plausible_or_marked(has_markers)
+        return cls(first, grey, criteria, _RejectionCounter(test))
+
+    def at(
+        self, searched: SearchedImage, before: Sequence[RefinedLattice] = (), more_than: int = 0
+    ) -> list[RefinedLattice]:
+        """Return the boards from the corners `searched`, none unless their lattices have `more_than` corners; those
+        found `before` are plausible."""
+        plausible = _again_or(self.plausible, before) if before else self.plausible
+        boards = candidate_lattices(searched, self.criteria.min_corners, plausible)
+        if sum(item.count for item in boards) <= more_than:
+            return []
+        out = self._confirmed(boards)
+        if self.criteria.has_markers is None:
+            # Large lattices were tested before they were fully grown. Of discs that nearly touch, coarser levels show
+            # corners that hide how far the edges bow between them. Markers in the squares bow edges, too, but the
+            # finest level shows their corners.
+            off = has_edge_offset if searched is self.first else has_bowed_edges
+            out = [item for item in out if not (item.lattice.solid and off(item.lattice, self.first.finest))]
+        self.plausible.rejected += 0 if out else len(boards)
+        return out
+
+    def _confirmed(self, boards: list[Lattice]) -> list[RefinedLattice]:
+        for same, out in self.fitted:
             if _have_same_corners(same, boards):
                 return out
-        self.every.append((boards, fit_and_confirm(grey, boards, criteria)))
-        return self.every[-1][1]
+        self.fitted.append((boards, fit_and_confirm(self.grey, boards, self.criteria)))
+        return self.fitted[-1][1]
+
+    def more(
+        self, found: list[RefinedLattice], at: SearchedImage, seen: Corners, least: int, *, ties: bool
+    ) -> list[RefinedLattice]:
+        """Return what was `found`, or what the corners `at` show if those `seen` may add to it: to its lattices, or
+        with `least` corners elsewhere. With `ties` the same number of corners is enough."""
+        if not found:
+            return self.at(at)
+        new, may_belong = new_corners(found, seen.pixels)
+        # With uneven blur the corners of the board itself are smeared.
+        if may_belong or (ties and any(item.picture is not None for item in found)):
+            before = corner_count(found)
+            again = self.at(at, found, 0 if ties else before)
+            return again if corner_count(again) >= before + (not ties) else found
+        if np.count_nonzero(new) < least:
+            return found
+        elsewhere = at.corners.of(new_corners(found, at.corners.pixels)[0])
+        return with_better(found, self.at(replace(at, corners=elsewhere), found))
 
 
 def _again_or(plausible: IsPlausible, before: Sequence[RefinedLattice]) -> IsPlausible:
@@ -166,8 +200,7 @@ def _again_or(plausible: IsPlausible, before: Sequence[RefinedLattice]) -> IsPla
     known = np.concatenate([item.lattice.pixels[item.lattice.known] for item in before])
 
     def test(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
-        same = near_any(lattice.pixels[lattice.known], known, SAME_PX)
-        return 2 * int(np.count_nonzero(same)) > len(same) or plausible(grey, finest, lattice)
+        return is_mostly(lattice, known) or plausible(grey, finest, lattice)
 
     return test
 
@@ -234,32 +267,12 @@ def fit_and_confirm(grey: GreyImage, boards: Sequence[Lattice], criteria: BoardC
         there = [replace(board, pixels=picture.of(board.pixels))]
         room = replace(criteria, sizes=criteria.sizes if len(found) < len(criteria.sizes) else ())
         again = refine(picture.grey, there, _score, radius_px=picture.radius_px)
-        found = _with_better(found, [one.out_of(picture) for one in _confirmed_parts(picture.grey, there, again, room)])
+        found = with_better(found, [one.out_of(picture) for one in _confirmed_parts(picture.grey, there, again, room)])
     return found
 
 
 def _score(item: RefinedLattice) -> float:
     return Evidence.of(item).score
-
-
-def same_corner_px(item: RefinedLattice) -> float:
-    """Return the largest distance, px, between the corners of `item` and the same ones fitted otherwise."""
-    return max(SAME_PX, SAME_OF_CELL * known_median(fit_cells(item.lattice.pixels, item.lattice.known).cell_px()))
-
-
-def _with_better(found: list[RefinedLattice], others: Sequence[RefinedLattice]) -> list[RefinedLattice]:
-    """Return `found` with `others` in place of lattices with mostly the same corners, and no more in total."""
-    for item in others:
-        mine = item.lattice.pixels[item.lattice.known]
-        same = [
-            one
-            for one in found
-            if 2 * int(np.count_nonzero(near_any(one.lattice.pixels[one.lattice.known], mine, same_corner_px(item))))
-            > one.lattice.count
-        ]
-        if sum(one.lattice.count for one in same) <= item.lattice.count:
-            found = [one for one in found if not any(one is other for other in same)] + [item]
-    return found
 
 
 def _confirmed_parts(

@@ -93,8 +93,10 @@ def _kept_rows(image: NDArray[np.generic]) -> _Lines | None:
     if height < 2 * MIN_LINES or width < SAMPLED:
         return None
     sampled = image[:, width // (2 * SAMPLED) :: max(1, width // SAMPLED)]
-    if not _as_before(sampled[max(0, (height - STRETCH) // 2) :][:STRETCH]).any():
-        return None
+    middle = slice(max(0, (height - STRETCH) // 2), max(0, (height - STRETCH) // 2) + STRETCH)
+    for few in (sampled, image[:, :: max(1, width // MORE_SAMPLED)]):
+        if not _as_before(few[middle]).any():
+            return None
     same = _as_before(sampled)
     for places in (MORE_SAMPLED, width):
         near, step = np.flatnonzero(same), max(1, width // places)

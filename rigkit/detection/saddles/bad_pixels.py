@@ -61,14 +61,16 @@ def _without_bad_rows(grey: GreyImage) -> GreyImage:
     """Return `grey` with its bad rows replaced by the mean of both neighbours; unchanged without any."""
     if min(grey.shape) < 3:
         return grey
-    rows = np.arange(1, len(grey) - 1)
+    rows: IntArray | None = None
     for across in SAMPLED_ACROSS:
         places = grey[:, grey.shape[1] // (2 * across) :: max(1, grey.shape[1] // across)].T.copy()
-        above, here, below = places[:, rows - 1], places[:, rows], places[:, rows + 1]
+        # At first all rows: slices take a tenth of the time of indices.
+        lines = [slice(k, len(grey) - 2 + k) if rows is None else rows - 1 + k for k in range(3)]
+        above, here, below = (places[:, of] for of in lines)
         least, most, step = cv2.min(above, below), cv2.max(above, below), SPAN_SHARE * float(np.ptp(places))
         bad = _hold(here >= most, EXTREME_SHARE) & _hold(cv2.subtract(here, most) > step, EVIDENT_SHARE)
         bad |= _hold(here <= least, EXTREME_SHARE) & _hold(cv2.subtract(least, here) > step, EVIDENT_SHARE)
-        rows = rows[bad]
+        rows = bad.nonzero()[0] + 1 if rows is None else rows[bad]
         if not 0 < len(rows) <= MAX_BAD_LINES * len(grey):
             return grey
     out = grey.copy()
@@ -79,7 +81,8 @@ def _without_bad_rows(grey: GreyImage) -> GreyImage:
 
 def _hold(true: BoolArray, share: float) -> BoolArray:
     """Return which columns (N,) of `true` (M, N) are true in at least this share of the rows."""
-    return np.asarray(np.count_nonzero(true, axis=0) >= share * len(true))
+    # np.count_nonzero takes three times as long; there are fewer than 2 SAMPLED_ACROSS places.
+    return np.asarray(np.add.reduce(true, axis=0, dtype=np.uint8) >= share * len(true))
 
 
 def _evident(grey: GreyImage) -> float | None:

@@ -16,7 +16,7 @@ from rigkit.detection.guided.guided import completed
 from rigkit.detection.guided.rejoin import rejoined
 from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.origin import quarter_turns
-from rigkit.detection.lattices import same_corner_px
+from rigkit.detection.new_corners import same_corner_px
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.resampled import Resampled
@@ -40,7 +40,8 @@ class ChessboardFinder(Finder):
                 there = _in_image(search.grey, [item], boards, picture=picture, quick=search.quick)
                 # Corners that are too oblique in the resampled part may be found in the image itself.
                 mine = [completed(search.grey, _out_of(picture, found), boards, None) for found in there]
-                out = out + mine if search.camera is None else _with_more_certain(out, mine, same_corner_px(item))
+                same_px = same_corner_px(item.lattice)
+                out = out + mine if search.camera is None else _with_more_certain(out, mine, same_px)
         return out
 
 

@@ -1,0 +1,54 @@
+"""Later searches of an image: only corners that the boards found before do not explain lead to one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from detection_bench.scenes import one_board
+
+from rigkit.core.boards import Board
+from rigkit.detection import lattices
+from rigkit.detection.detect import detect_boards
+from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.new_corners import new_corners
+from rigkit.detection.subpixel.refined import RefinedLattice
+
+STEP_PX = 20.0
+
+
+def board_with_a_hole() -> RefinedLattice:
+    """Return a lattice of 6 x 5 corners from pixel (200, 100) on, STEP_PX apart, without that of column 2 and row 3."""
+    pixels = np.stack(np.meshgrid(np.arange(6.0), np.arange(5.0)), axis=-1) * STEP_PX + (200.0, 100.0)
+    pixels[3, 2] = np.nan
+    one = np.where(np.isnan(pixels[..., 0]), np.nan, 1.0)
+    return RefinedLattice(Lattice(pixels, one, True), 0.1 * one, one, one, one)
+
+
+def test_corners_of_a_board_found_before_are_not_new() -> None:
+    found = board_with_a_hole()
+    new, may_belong = new_corners([found], found.lattice.pixels[found.lattice.known] + 1.0)
+    assert not new.any()
+    assert not may_belong
+
+
+@pytest.mark.parametrize(
+    ("cell", "belongs"), [((2.0, 3.0), True), ((6.1, 2.0), True), ((-1.0, -1.0), True), ((9.0, 2.0), False)]
+)
+def test_a_corner_in_a_hole_or_next_to_a_board_may_belong_to_it(cell: tuple[float, float], belongs: bool) -> None:
+    pixel = np.array([cell]) * STEP_PX + (200.0, 100.0)
+    new, may_belong = new_corners([board_with_a_hole()], pixel)
+    assert new.all()
+    assert may_belong is belongs
+
+
+def test_a_whole_board_of_another_size_is_searched_for_once(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searches = []
+    search = lattices.candidate_lattices
+    monkeypatch.setattr(lattices, "candidate_lattices", lambda *args: searches.append(args) or search(*args))
+    scene = one_board(rng, board=Board("b", 8, 6, 30.0, 30.0))
+    image = scene.render(noise_levels=2.0, rng=rng)
+    (found,) = detect_boards(image, [Board("larger", 9, 7, 30.0, 30.0)])
+    assert (found.columns, found.rows) == (8, 6)
+    assert len(searches) == 1
