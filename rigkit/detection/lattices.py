@@ -27,7 +27,7 @@ from rigkit.detection.checks.validate import (
     without_stray_rows,
 )
 from rigkit.detection.lattice.grow import MAX_FAILED_GROWTHS, grow_all
-from rigkit.detection.lattice.lattice import MIN_ROWS, Lattice, build_lattices
+from rigkit.detection.lattice.lattice import MANY_CORNERS, MIN_ROWS, Lattice, build_lattices
 from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
 from rigkit.detection.new_corners import is_mostly, new_corners, with_better
@@ -160,13 +160,21 @@ class _Search:
             return []
         out = self._confirmed(boards)
         if self.criteria.has_markers is None:
-            # Large lattices were tested before they were fully grown. Of discs that nearly touch, coarser levels show
-            # corners that hide how far the edges bow between them. Markers in the squares bow edges, too, but the
-            # finest level shows their corners.
-            off = has_edge_offset if searched is self.first else has_bowed_edges
-            out = [item for item in out if not (item.lattice.solid and off(item.lattice, self.first.finest))]
+            out = [item for item in out if not self._has_odd_edges(item.lattice, searched)]
         self.plausible.rejected += 0 if out else len(boards)
         return out
+
+    def _has_odd_edges(self, lattice: Lattice, searched: SearchedImage) -> bool:
+        """Return whether the edges of a board show that it is none, unless that was tested before the fit.
+
+        Large lattices were tested before they were fully grown. Of discs that nearly touch, coarser levels show corners
+        that hide how far the edges bow between them. Markers in the squares bow edges, too, but the finest level shows
+        their corners.
+        """
+        if searched is self.first and lattice.count < MANY_CORNERS:
+            return False
+        test = has_edge_offset if searched is self.first else has_bowed_edges
+        return lattice.solid and test(lattice, self.first.finest)
 
     def _confirmed(self, boards: list[Lattice]) -> list[RefinedLattice]:
         for same, out in self.fitted:
