@@ -153,14 +153,9 @@ def _scaramuzza(camera: Camera, outline: Pixels | None) -> Written:
 
 def _inverse_polynomial(ss: FloatArray, camera: Camera, stretch: float) -> tuple[FloatArray, float]:
     """Return rho as a polynomial of atan(z / r), with z backwards, over the image, and its largest error, px."""
-    width, height = camera.size_px
-    edge = np.linspace(0.0, 1.0, 50)
-    border = np.concatenate(
-        [np.stack([edge * (width - 1.0), np.full(50, y)], axis=-1) for y in (0.0, height - 1.0)]
-        + [np.stack([np.full(50, x), edge * (height - 1.0)], axis=-1) for x in (0.0, width - 1.0)]
-    )
     centre = camera.parameters[-4:-2]
-    farthest = float(np.linalg.norm(border - centre, axis=-1).max()) * max(abs(stretch), 1.0)
+    farther = np.maximum(np.abs(centre), np.abs(np.array(camera.size_px) - 1.0 - centre))
+    farthest = float(np.linalg.norm(farther)) * max(abs(stretch), 1.0)
     rho = np.linspace(0.0, farthest, 300)
     z = np.polynomial.polynomial.polyval(rho, ss)
     angle = np.arctan2(z, rho)

@@ -293,6 +293,9 @@ cam1:
 """
     cameras, poses = read_kalibr(text)
     assert cameras[0].parameters.tolist() == [458.6, 457.2, 367.2, 248.3, -0.28, 0.07, 0.0002, 1.7e-05]
+    # A term of zero is a term.
+    (fewer,), _ = read_kalibr(text.split("cam1:")[0].replace("-0.28, 0.07", "-0.28, 0.0"))
+    assert fewer.parameters.tolist() == [458.6, 457.2, 367.2, 248.3, -0.28, 0.0, 0.0002, 1.7e-05]
     assert cameras[1].model == "ucm"
     assert cameras[1].focal_px == pytest.approx(np.sqrt(700.0 * 701.0) / 1.9)
     assert poses[1].translation_mm.tolist() == pytest.approx([-110.0, 0.0, 0.0])

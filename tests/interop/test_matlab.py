@@ -68,6 +68,12 @@ def test_structures_of_the_toolbox(content: dict[str, Any], tmp_path: Path) -> N
     assert not is_rig(path)
 
 
+def test_what_a_structure_leaves_out_is_zero(tmp_path: Path) -> None:
+    fewer = {key: value for key, value in INTRINSICS.items() if not key.endswith(("Distortion", "Skew"))}
+    camera = import_camera(_saved(tmp_path / "camera.mat", fewer))
+    assert camera.model == "pinhole" and camera.parameters == pytest.approx(OURS[:4], abs=1e-12)
+
+
 def test_matrices_for_row_vectors(tmp_path: Path) -> None:
     camera = import_camera(_saved(tmp_path / "camera.mat", OLD))
     assert camera.parameters[:6] == pytest.approx([*OURS[:6]], abs=1e-12)
