@@ -154,8 +154,8 @@ def test_lenses_of_colmap_and_opencv_are_theirs(rng: np.random.Generator) -> Non
         assert seen.all()
     prism, place, still = foreign_lenses.brown_prism_lens(core, np.array(PRISM)), rays / rays[:, 2:], np.zeros(3)
     near = (rays[:, 2] > 0.7)[:, None]
-    theirs = cv2.projectPoints(place, still, still, K, np.array(PRISM))[0][:, 0]
-    np.testing.assert_allclose(np.where(near, prism(rays)[0], 0.0), np.where(near, theirs, 0.0), atol=SAME_PX)
+    of_opencv = cv2.projectPoints(place, still, still, K, np.array(PRISM))[0][:, 0]
+    np.testing.assert_allclose(np.where(near, prism(rays)[0], 0.0), np.where(near, of_opencv, 0.0), atol=SAME_PX)
     # The tangent from the eye at xi touches the unit sphere where z = -1 / xi.
     edge = np.arccos(-1.0 / 1.2) + np.array([-0.01, 0.01])
     _, seen = foreign_lenses.unified_brown_lens(core, 1.2, d)(np.stack([np.sin(edge), 0.0 * edge, np.cos(edge)], 1))

@@ -97,7 +97,7 @@ def test_the_target_has_the_columns_of_either_and_the_rows_of_both_at_their_reso
     two = Pinhole((640, 480), np.array([600.0, 600.0, 340.0, 260.0]))
     # Squinting inwards, and the second camera a little up.
     pose = Rigid3(exp_so3(np.array([-0.05, 0.2, 0.02])), [-120.0, 4.0, 15.0])
-    pair = rectify_pair(one, two, pose, projection=projection)
+    pair = rectify_pair(one, two, pose, projection=projection)  # type: ignore[arg-type]
     steps = np.linspace(0.0, 1.0, 301)
     edge = np.concatenate(
         [np.stack([steps, np.full(301, k)], axis=1) for k in (0.0, 1.0)]
