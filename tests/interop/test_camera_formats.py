@@ -237,22 +237,30 @@ def test_colmap_reads_what_we_write(label: str, tmp_path: Path, rng: np.random.G
 
 
 @pytest.mark.parametrize(
-    ("line", "parameters"),
+    "line",
     [
-        ("SIMPLE_PINHOLE 640 480 500 320.5 240.5", [500.0, 320.5, 240.5]),
-        ("SIMPLE_RADIAL 640 480 500 320.5 240.5 -0.1", [500.0, 320.5, 240.5, -0.1]),
-        ("RADIAL 640 480 500 320.5 240.5 -0.1 0.02", [500.0, 320.5, 240.5, -0.1, 0.02]),
-        ("SIMPLE_FISHEYE 640 480 300 320.5 240.5", [300.0, 320.5, 240.5]),
-        ("FISHEYE 640 480 300 301 320.5 240.5", [300.0, 301.0, 320.5, 240.5]),
-        ("SIMPLE_RADIAL_FISHEYE 640 480 300 320.5 240.5 -0.02", [300.0, 320.5, 240.5, -0.02]),
-        ("RADIAL_FISHEYE 640 480 300 320.5 240.5 -0.02 0.003", [300.0, 320.5, 240.5, -0.02, 0.003]),
-        ("OPENCV 640 480 500 501 320.5 240.5 -0.1 0.02 1e-3 -2e-3",
-         [500.0, 501.0, 320.5, 240.5, -0.1, 0.02, 1e-3, -2e-3]),
+        "SIMPLE_PINHOLE 640 480 500 320.5 240.5",
+        "PINHOLE 640 480 500 501 320.5 240.5",
+        "SIMPLE_RADIAL 640 480 500 320.5 240.5 -0.1",
+        "RADIAL 640 480 500 320.5 240.5 -0.1 0.02",
+        "SIMPLE_FISHEYE 640 480 300 320.5 240.5",
+        "FISHEYE 640 480 300 301 320.5 240.5",
+        "SIMPLE_RADIAL_FISHEYE 640 480 300 320.5 240.5 -0.02",
+        "RADIAL_FISHEYE 640 480 300 320.5 240.5 -0.02 0.003",
+        "OPENCV 640 480 500 501 320.5 240.5 -0.1 0.02 1e-3 -2e-3",
+        "OPENCV_FISHEYE 640 480 300 301 320.5 240.5 -0.02 0.003 1e-3 -2e-4",
+        # Each term of the rest alone, and all.
+        "FULL_OPENCV 640 480 500 501 320.5 240.5 -0.1 0.02 1e-3 -2e-3 0.03 0 0 0",
+        "FULL_OPENCV 640 480 500 501 320.5 240.5 -0.1 0.02 1e-3 -2e-3 0 0.05 0 0",
+        "FULL_OPENCV 640 480 500 501 320.5 240.5 -0.1 0.02 1e-3 -2e-3 0 0 0 0.05",
+        "FULL_OPENCV 640 480 500 501 320.5 240.5 -0.1 0.02 1e-3 -2e-3 0.03 0.05 0.02 0.01",
+        "EUCM 640 480 300 301 320.5 240.5 0.6 1.1",
     ],
-)  # fmt: skip
-def test_we_read_colmap_models(line: str, parameters: list[float], rng: np.random.Generator) -> None:
+)
+def test_we_read_colmap_models(line: str, rng: np.random.Generator) -> None:
     camera = read_colmap_cameras(f"# comment\n7 {line}\n")[7]
-    theirs = pycolmap.Camera(model=line.split()[0], width=640, height=480, params=np.array(parameters))
+    kind, _, _, *parameters = line.split()
+    theirs = pycolmap.Camera(model=kind, width=640, height=480, params=np.array(parameters, dtype=np.float64))
     points = rays_within(np.radians(40.0), 200, rng)
     ours, valid = camera.project(points)
     assert valid.all()
@@ -268,6 +276,8 @@ def test_kalibr_rig_poses_in_metres() -> None:
     cameras = [CAMERAS[k] for k in ("pinhole", "double_sphere", "eucm")]
     text = write_kalibr(cameras, poses).text
     assert re.search(r"cam1:\n  T_cn_cnm1:", text)
+    # Kalibr asks for four of radtan.
+    assert re.search(r"distortion_coeffs: \[(0\.0, ){3}0\.0\]\n  distortion_model: radtan", text)
     again, cam_from_rig = read_kalibr(text)
     assert [c.model for c in again] == ["pinhole", "double_sphere", "eucm"]
     for a, b in zip(poses, cam_from_rig, strict=True):
