@@ -14,7 +14,6 @@ from helpers.schemas import faults
 from helpers.stereo_pictures import CAMERA, FRAMES, RIGHT_FROM_LEFT, of_one_camera
 
 from rigkit.calibration.certainty.displaced import covariance_of_modes
-from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
@@ -22,7 +21,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation
 from rigkit.interop.opencv import read_opencv, write_opencv
 from rigkit.interop.ros import read_camera_info
-from rigkit.io.calibrations.calibration_file import camera_to_json, load_calibration, save_calibration
+from rigkit.io.calibrations.calibration_file import camera_to_json, load_calibration
 from rigkit.io.calibrations.rig_file import load_rig, load_saved_rig
 from rigkit.io.corners.corner_cache import FoundCorners
 from rigkit.io.corners.corners_file import read_corners
@@ -327,11 +326,7 @@ def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(pictures: Pat
 
 
 def test_known_cameras_are_written_to_the_session(
-    pictures: Path,
-    calibration: Calibration,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     lens, known = tmp_path / "lens.yaml", tmp_path / "known.json"
     lens.write_text(write_opencv(CAMERA).text)
@@ -350,18 +345,6 @@ def test_known_cameras_are_written_to_the_session(
     reported = known_cameras(replace(session, lenses={"right": lens}))
     assert reported is not None and list(reported.cameras) == ["left", "right"] and reported.covariance is None
     assert all(f"'{path}' states no uncertainty" in caplog.text for path in (known, lens))
-    # A lens that was calibrated alone has the covariance of its file.
-    alone = tmp_path / "alone.json"
-    save_calibration(alone, calibration)
-    reported = known_cameras(replace(session, known_rig=None, lenses={"right": alone}))
-    assert reported is not None and reported.cameras["right"][1] is None
-    np.testing.assert_array_equal(reported.cameras["right"][0].parameters, calibration.camera.parameters)
-    covariance, ours = reported.of_lens("right"), calibration.covariance[:9, :9]
-    assert covariance is not None
-    sigma = np.sqrt(np.diag(covariance) / np.diag(ours))
-    # Departures, which are stated apart, are not in it; the noise is of the same size.
-    assert sigma.min() > 0.8 and sigma.max() < 1.5, sigma
-    assert reported.departures["right"].moves.shape[0] == 9
     # A camera of the rig that has no images is not lost without a word.
     known_cameras_first(session)
     assert "without images here, top will not be in the new rig" in caplog.text
