@@ -22,7 +22,7 @@ from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.check import compare
 from rigkit.validation.checks import validate, validate_each
 from rigkit.validation.fitted_planes import FittedPlanes
-from rigkit.validation.measure import Measured, measure
+from rigkit.validation.measure import Measured, _distance_scatter, measure
 
 BASELINE_MM = float(np.linalg.norm(CAM2_FROM_CAM1.translation_mm))
 EXACT = 1e-9
@@ -207,6 +207,20 @@ def test_scatter_of_the_corners_is_carried_into_angles_and_distances(rng: np.ran
     ratio = np.std(found[..., 0], axis=0) / np.sqrt(np.mean(found[..., 1] ** 2, axis=0))
     assert (ratio > SIGMA_RATIO[0]).all(), ratio
     assert (ratio < SIGMA_RATIO[1]).all(), ratio
+
+
+def test_scatter_of_a_distance_is_that_along_it(rng: np.random.Generator) -> None:
+    """By differences of the distance between two points, whose covariances are far from round."""
+    noise = 0.1 * rng.normal(size=(2, 144, 2))
+    exact = make_reconstruction()
+    boards = measure(triangulated(exact, exact.cam2_from_cam1, noise)).boards
+    a, b = Feature.parse("plane1[7,0]"), Feature.parse("plane2[0,5]")
+    (point, own), (other, others) = (boards[f.board_id].feature(f) for f in (a, b))
+    slope = [
+        (np.linalg.norm(point + step - other) - np.linalg.norm(point - step - other)) / 2e-3
+        for step in 1e-3 * np.eye(3)
+    ]
+    assert _distance_scatter(boards, a, b) == pytest.approx(slope @ (own + others) @ slope, rel=1e-6)
 
 
 def test_a_pair_of_which_nothing_was_measured_is_not_checked() -> None:
