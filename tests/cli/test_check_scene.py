@@ -16,10 +16,10 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibrations.calibration_file import camera_to_json
 
-CAMERA = Pinhole((320, 240), np.array([280.0, 280.0, 160.3, 119.1]))
+CAMERA = Pinhole((240, 180), np.array([210.0, 210.0, 120.3, 89.1]))
 MOUNT = Rigid3(exp_so3(np.array([0.0, 0.06, 0.01])), [-150.0, 2.0, 1.0])
 TURN_RAD = 0.01
-"""2 px at the border of the image; the corrected rig is told from it by a tenth."""
+"""1.5 px at the border of the image; the corrected rig is told from it by a tenth."""
 
 
 def test_a_turned_camera_is_found_and_corrected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -49,6 +49,6 @@ def test_a_turned_camera_is_found_and_corrected(tmp_path: Path, capsys: pytest.C
     # Walls without texture are no evidence.
     blank = [tmp_path / "a.png", tmp_path / "b.png"]
     for path in blank:
-        cv2.imwrite(str(path), np.full((240, 320), ord(path.stem), np.uint8))
+        cv2.imwrite(str(path), np.full((180, 240), ord(path.stem), np.uint8))
     assert main([*words[:2], *map(str, blank), "--scene"]) == 3
     assert "less than" in capsys.readouterr().err
