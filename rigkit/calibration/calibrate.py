@@ -157,6 +157,8 @@ class _Solution:
             close,
         )
         result = replace(result, disagreeing=tuple(image for image, _ in outcome.reasons))
+        # Its views are those observed.
+        vars(result)["clusters"] = outcome.observations.clusters()
         far = FarProjection.of(result, from_boards=True)
         require_determined(result, far.of_parameters_px)
         return result, far

@@ -12,6 +12,7 @@ from helpers.calibration_scenes import SIZE, lens
 from helpers.schemas import faults
 
 from rigkit.calibration.board_shape import BoardShape
+from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
@@ -98,7 +99,7 @@ def test_central_cameras_have_a_wrong_baseline() -> None:
 def test_a_camera_whose_images_tell_less_has_one_where_another_does(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Calibration] = []
 
-    def of_the_first(calibration: Calibration) -> bool:
+    def of_the_first(calibration: Calibration, far: FarProjection) -> bool:
         asked.append(calibration)
         return len(asked) == 1
 
