@@ -20,8 +20,12 @@ from rigkit.calibration.solving.clustered import (
     SERIAL_POWER,
     _serial_moments,
     clustered_covariance,
+    products_between,
+    root_of_inverse,
+    summed_by,
     widening,
     with_block,
+    without_leverage,
 )
 from rigkit.calibration.solving.fit import fit_kept
 from rigkit.calibration.solving.state import State
@@ -186,3 +190,21 @@ def test_the_moments_of_a_sum_include_what_successive_scores_share(rng: np.rando
     # In a random order there is nothing alike, beyond SERIAL_SIGMAS by chance.
     found = [_serial_moments(rng.permutation(scores)[:200])[1] for _ in range(100)]
     assert np.mean(np.array(found) != 1.0) < 0.05
+
+
+def test_products_of_scores_are_those_of_scores_without_leverage(rng: np.random.Generator) -> None:
+    rows = rng.normal(size=(9, 12, 3)) * np.r_[3.0, np.ones(8)][:, None, None]
+    information, score = np.swapaxes(rows, 1, 2) @ rows, rng.normal(size=(9, 3, 2))
+    root = root_of_inverse(information.sum(axis=0))
+    leverage = root.T @ information @ root
+    assert 0.05 < np.linalg.norm(leverage[1]) < 0.8 < np.linalg.norm(leverage[0])  # Both ways are taken.
+    each = np.stack([without_leverage(leverage, own @ root) for own in np.moveaxis(score, 2, 0)])
+    assert np.allclose(products_between(root, information, score), np.einsum("avi,bvi->ab", each, each))
+
+
+@pytest.mark.parametrize("group", [[0, 1, 2, 3], [2, 0, 3, 1], [1, 0, 1, 1], [3, 3, 0, 3]])
+def test_sums_by_group(group: list[int], rng: np.random.Generator) -> None:
+    values = rng.normal(size=(4, 2, 3))
+    expected = np.zeros((max(group) + 1, 2, 3))
+    np.add.at(expected, group, values)
+    assert np.allclose(summed_by(np.array(group), values), expected)
