@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from rigkit.core.findings import Severity, most_severe_first
+from rigkit.core.findings import Finding, Severity, most_severe_first
 from rigkit.core.printing import counted, length_words
 
 if TYPE_CHECKING:
@@ -174,12 +174,10 @@ def describe_rig(rig: RigCalibration, checks: Sequence[Check]) -> str:
             f"{alone.rms_px:.4f}; in the rig {camera.rms_px:.4f} px; centre "
             f"({length_words(*centre, decimals=2)}) mm, rotation {rotation_deg:.3f} deg"
         )
-    lines += [f"baseline {b.a} to {b.b}: {measured_words(b.value, b.sigma, 3)} mm" for b in baselines(rig)]
-    lines += [
-        f"points transferred from {t.a} to {t.b}: ±{t.median_px:.3f} px (at worst ±{t.worst_px:.3f} px; one standard "
-        "deviation)"
-        for t in filter(None, transfers(rig))
-    ]
+    for b, t in zip(baselines(rig), transfers(rig), strict=True):
+        line = f"baseline {b.a} to {b.b}: {measured_words(b.value, b.sigma, 3)} mm"
+        moved = "" if t is None else f"; transferred points ±{t.median_px:.3f} px (at worst ±{t.worst_px:.3f} px)"
+        lines.append(line + moved)
     for target in rig.board_rigs:
         lines += [f"angle {a.a} to {a.b}: {measured_words(a.value, a.sigma, 3)} deg" for a in angles(target)]
     for c in checks:
@@ -193,10 +191,13 @@ def describe_rig(rig: RigCalibration, checks: Sequence[Check]) -> str:
     lines += frames_left_out(rig.left_out)
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         lines += [f"{camera.name}: {line}" for line in left_out(alone)]
-        found = most_severe_first(alone.verdicts)
-        # The rig is what counts: of each camera the headline, and what must not be trusted.
-        said = [finding for k, finding in enumerate(found) if k == 0 or finding.severity is Severity.BAD]
-        lines += [f"'{camera.name}' by itself: {finding}" for finding in said]
-        if more := len(found) - len(said):
-            lines.append(f"'{camera.name}' by itself: {counted(more, 'more finding')} on the page (-r) and in --json")
+        lines += first_finding(camera.name, most_severe_first(alone.verdicts))
     return "\n".join(lines)
+
+
+def first_finding(camera: str, found: Sequence[Finding]) -> list[str]:
+    """Return the line of one camera of a rig: the rig is what counts, so its first finding, and how many more there
+    are."""
+    bad = sum(finding.severity is Severity.BAD for finding in found[1:])
+    more = f"; {counted(len(found) - 1, 'more finding')}{f' ({bad} bad)' if bad else ''} on the page (-r)"
+    return [f"'{camera}' by itself: {finding}{more if len(found) > 1 else ''}" for finding in found[:1]]

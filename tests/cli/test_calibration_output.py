@@ -8,7 +8,7 @@ import numpy as np
 from helpers.calibration_scenes import SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.cli.calibration_output import frames_left_out, left_out
+from rigkit.cli.calibration_output import first_finding, frames_left_out, left_out
 from rigkit.core.findings import Finding
 
 
@@ -42,3 +42,10 @@ def test_reasons_that_verdicts_state_are_not_said_again() -> None:
     stated = (no_board, Finding.look("the lens: is damaged"))
     dropped = (("a.png", "no board found"), ("b.png", "is damaged"))
     assert left_out(replace(calibration, dropped=dropped, verdicts=stated)) == ["dropped b.png: is damaged"]
+
+
+def test_a_camera_of_a_rig_is_one_line() -> None:
+    found = [Finding.bad("one"), Finding.bad("two"), Finding.look("three")]
+    assert first_finding("left", found) == ["'left' by itself: bad: one; 2 more findings (1 bad) on the page (-r)"]
+    assert first_finding("left", found[:1]) == ["'left' by itself: bad: one"]
+    assert first_finding("left", []) == []
