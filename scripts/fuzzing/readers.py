@@ -93,7 +93,7 @@ def read_database(path: Path) -> None:
 
 def read_times(path: Path) -> None:
     """Read which frames of two videos are of one moment."""
-    read_timestamps(path, ["cam1", "cam2"])
+    read_timestamps(path, {"cam1": 0, "cam2": 0})
 
 
 def coach_video(path: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
 
@@ -140,18 +140,19 @@ class Video:
             self.count = 0
 
 
-def read_timestamps(path: Path, cameras: Sequence[str]) -> dict[int, Mapping[str, int]]:
+def read_timestamps(path: Path, cameras: Mapping[str, int]) -> dict[int, Mapping[str, int]]:
     """Return moment -> camera -> frame number in the camera's video, from a CSV file with the columns TIMESTAMPS.
 
-    `cam_id` is a name of `cameras`, or the number at its end. Frame numbers start at the first one that a camera has in
-    the file, because recorders also count frames before the recording.
+    `cameras` : number of frames of each camera's video, 0 if unknown. `cam_id` is one of these cameras, or the number
+    at its end. Frame numbers that exceed a video start at the first one that the camera has in the file, because
+    recorders also count frames before the recording.
 
     Raises InputError: a column is missing, a field is no integer, or a camera has no rows.
     """
     head, lines = csv_table(path, "timestamps")
     if not set(TIMESTAMPS) <= set(head):
         raise InputError(f"'{path}': the first line must name the columns {', '.join(TIMESTAMPS)}, a row a frame")
-    named = {last_number(name): name for name in reversed(cameras)} | {name: name for name in cameras}
+    named = {last_number(name): name for name in reversed(list(cameras))} | {name: name for name in cameras}
     moments: dict[int, dict[str, int]] = {}
     for line, row in lines:
         try:
@@ -163,13 +164,13 @@ def read_timestamps(path: Path, cameras: Sequence[str]) -> dict[int, Mapping[str
             ) from error
         if camera is not None:
             moments.setdefault(moment, {})[camera] = frame
-    for camera in cameras:
+    for camera, count in cameras.items():
         own = [frames[camera] for frames in moments.values() if camera in frames]
         if not own:
             raise InputError(
                 f"'{path}' has no rows of camera '{camera}'; its cam_id must be the number at the end of its name"
             )
         for frames in moments.values():
-            if camera in frames:
+            if camera in frames and max(own) >= count:
                 frames[camera] -= min(own)
     return {moment: moments[moment] for moment in sorted(moments)}

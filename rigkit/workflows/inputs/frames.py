@@ -186,7 +186,8 @@ def _opened(
     """Open videos, by camera, and yield them with the moments of `timestamps`, as `_moments` takes them."""
     with ExitStack() as stack:
         videos = {name: stack.enter_context(Video(path)) for name, path in sources.items()}
-        yield videos, None if timestamps is None else read_timestamps(timestamps, list(sources))
+        counts = {name: video.count for name, video in videos.items()}
+        yield videos, None if timestamps is None else read_timestamps(timestamps, counts)
 
 
 def moments_of_videos(

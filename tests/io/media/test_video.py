@@ -80,12 +80,16 @@ def test_hidden_files_of_a_folder_are_no_videos_and_no_images(tmp_path: Path) ->
 def test_timestamps_count_from_the_first_frame_of_each_camera(tmp_path: Path) -> None:
     path = tmp_path / "timestamps.csv"
     path.write_text("sync_index,cam_id,frame_index,frame_time\n7,0,26,1.0\n7,1,30,1.0\n8,1,31,1.1\n9,0,28,1.2\n")
-    assert read_timestamps(path, ["cam_0", "cam_1"]) == {7: {"cam_0": 0, "cam_1": 0}, 8: {"cam_1": 1}, 9: {"cam_0": 2}}
+    moments = {7: {"cam_0": 0, "cam_1": 0}, 8: {"cam_1": 1}, 9: {"cam_0": 2}}
+    assert read_timestamps(path, {"cam_0": 0, "cam_1": 2}) == moments
+    # Those written by hand are the numbers in the video, which has more frames.
+    given = {7: {"cam_0": 26, "cam_1": 0}, 8: {"cam_1": 1}, 9: {"cam_0": 28}}
+    assert read_timestamps(path, {"cam_0": 29, "cam_1": 31}) == given
     with pytest.raises(InputError, match="no rows of camera 'cam_4'"):
-        read_timestamps(path, ["cam_0", "cam_4"])
+        read_timestamps(path, {"cam_0": 0, "cam_4": 0})
     path.write_text("time\n1\n")
     with pytest.raises(InputError, match="must name the columns"):
-        read_timestamps(path, ["cam_0"])
+        read_timestamps(path, {"cam_0": 0})
 
 
 @pytest.mark.parametrize(
