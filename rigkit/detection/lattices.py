@@ -89,18 +89,23 @@ def find_lattices(
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
     searched = searched or SearchedImage.of(grey)
-    search = _Search.of(searched, grey, BoardCriteria(min_corners, sizes, has_markers))
+    plausible = _RejectionCounter(_is_plausible if has_markers is None else _plausible_or_marked(has_markers))
+    search = _Search(searched, grey, BoardCriteria(min_corners, sizes, has_markers), plausible)
     found = search.at(searched)
     if _needs_second_search(searched, found, sizes):
-        found = search.more(found, searched.with_smeared(), searched.saddles.smeared, SMEARED_CORNERS, ties=True)
+        smeared = searched.saddles.smeared
+        found = search.more(found, searched.with_smeared(), smeared, SMEARED_CORNERS, ties=True) or found
     for k in range(1, 1 if searched.enlarged else len(searched.levels)):
         # Coarser levels help only where squares do not meet at their corners; those of clutter do.
-        if _has_whole_board(found, sizes) or search.plausible.rejected >= MAX_FAILED_GROWTHS:
+        if _has_whole_board(found, sizes) or plausible.rejected >= MAX_FAILED_GROWTHS:
             break
         coarser = searched.coarser(k)
         if coarser is None:
             break
-        found = search.more(found, coarser, coarser.corners, MIN_BOARD_CORNERS, ties=False)
+        again = search.more(found, coarser, coarser.corners, MIN_BOARD_CORNERS, ties=False)
+        if again is None:  # Still coarser levels show fewer corners.
+            break
+        found = again
     if min_corners < MIN_BOARD_CORNERS and has_markers is None:
         return found
     return [
@@ -143,12 +148,6 @@ class _Search:
     plausible: _RejectionCounter
     fitted: list[tuple[list[Lattice], list[RefinedLattice]]] = field(default_factory=list)
 
-    @classmethod
-    def of(cls, first: SearchedImage, grey: GreyImage, criteria: BoardCriteria) -> _Search:
-        has_markers = criteria.has_markers
-        test = _is_plausible if has_markers is None else _plausible_or_marked(has_markers)
-        return cls(first, grey, criteria, _RejectionCounter(test))
-
     def at(
         self, searched: SearchedImage, before: Sequence[RefinedLattice] = (), more_than: int = 0
     ) -> list[RefinedLattice]:
@@ -185,9 +184,11 @@ class _Search:
 
     def more(
         self, found: list[RefinedLattice], at: SearchedImage, seen: Corners, least: int, *, ties: bool
-    ) -> list[RefinedLattice]:
-        """Return what was `found`, or what the corners `at` show if those `seen` may add to it: to its lattices, or
-        with `least` corners elsewhere. With `ties` the same number of corners is enough."""
+    ) -> list[RefinedLattice] | None:
+        """Return what was `found`, or what the corners `at` show if that is more, with `ties` if it is as much.
+
+        None if those `seen` cannot add to it: none may belong to its lattices, and fewer than `least` are elsewhere.
+        """
         if not found:
             return self.at(at)
         new, may_belong = new_corners(found, seen.pixels)
@@ -197,7 +198,7 @@ class _Search:
             again = self.at(at, found, 0 if ties else before)
             return again if corner_count(again) >= before + (not ties) else found
         if np.count_nonzero(new) < least:
-            return found
+            return None
         elsewhere = at.corners.of(new_corners(found, at.corners.pixels)[0])
         return with_better(found, self.at(replace(at, corners=elsewhere), found))
 

@@ -11,6 +11,7 @@ from rigkit.detection import lattices
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.new_corners import new_corners
+from rigkit.detection.searched_image import SearchedImage
 from rigkit.detection.subpixel.refined import RefinedLattice
 
 STEP_PX = 20.0
@@ -44,9 +45,14 @@ def test_a_corner_in_a_hole_or_next_to_a_board_may_belong_to_it(cell: tuple[floa
 def test_a_whole_board_of_another_size_is_searched_for_once(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    searches = []
+    searches: list[SearchedImage] = []
     search = lattices.candidate_lattices
-    monkeypatch.setattr(lattices, "candidate_lattices", lambda *args: searches.append(args) or search(*args))
+
+    def counted(at: SearchedImage, min_corners: int, plausible: lattices.IsPlausible) -> list[Lattice]:
+        searches.append(at)
+        return search(at, min_corners, plausible)
+
+    monkeypatch.setattr(lattices, "candidate_lattices", counted)
     scene = one_board(rng, board=Board("b", 8, 6, 30.0, 30.0))
     image = scene.render(noise_levels=2.0, rng=rng)
     (found,) = detect_boards(image, [Board("larger", 9, 7, 30.0, 30.0)])

@@ -14,7 +14,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, median_of
 from rigkit.core.detections import grid_turned
 from rigkit.detection.lattice.lattice import Lattice, margins
 from rigkit.detection.lattice.local_fit import FLEXIBLE, MIN_PREDICTING, PREDICTION_WIDTH, STIFF, fit_cells
@@ -285,7 +285,7 @@ def _agree(pixels: FloatArray, one: BoolArray, two: BoolArray) -> bool:
         best = np.argsort(gain)[: min(BETWEEN, int(np.isfinite(gain).sum()))]
         side = np.minimum(np.hypot(*mine.along_column[best].T), np.hypot(*mine.along_row[best].T))
         separation = np.hypot(*(mine.pixels - theirs.pixels)[best].T) / np.maximum(side, 1e-9)
-        if len(best) and np.median(separation) < AGREES_CELLS:
+        if len(best) and median_of(separation) < AGREES_CELLS:
             return True
     return False
 
