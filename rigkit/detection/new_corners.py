@@ -19,9 +19,9 @@ effect of strong blur."""
 
 NEXT_CELLS = 1.0
 """Largest distance of a corner from an empty place of a lattice, or from one next to it, in typical sides of its cells,
-for the lattice to be searched again: the corner, or one that grows from it, may belong there. In 247 REAL images whose
-boards were found at once, searches without such a corner found one corner more of one board; with 0.5 they found 12 of
-four more (images blurred, halved and cropped too)."""
+for the lattice to be searched again: the corner, or one that grows from it, may belong there. Compared with searching
+always no corner of a REAL image is lost, and of 220 that were blurred, moved, halved, cropped or brightened one corner
+of one board and a grid of uncertain ones (0.5 px); with 0.5 seven corners of four more boards."""
 
 
 def new_corners(found: Sequence[RefinedLattice], pixels: FloatArray) -> tuple[BoolArray, bool]:
