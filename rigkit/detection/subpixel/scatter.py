@@ -10,6 +10,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.lattice.spacing import spacing_changes
+from rigkit.detection.subpixel.lens_scatter import lens_scatter
 from rigkit.kernels import lattice as native
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
 
@@ -34,11 +35,15 @@ LOWER_ORDER = 4
 a lens and not scatter: of REAL boards with irregular prints 0.7 to 1.3 times, of fisheyes (REAL and RENDERED) 2.1 to 7
 times."""
 
-THIRD, BEND_DIFFERENCES, BEND_SURFACES = 3, 3.0, 12.0
+LARGE_SCATTER = 4.0
+"""Factor of small boards beyond which `lens_scatter`, which takes 6 ms, decides: most REAL boards of 24
+corners scatter by less, and the bend of a fisheye nearby looks like up to 70 sigmas (SIMULATED)."""
+
+THIRD, BEND_DIFFERENCES = 3, 3.0
 """Order of the differences that show the bend of a lens, and largest factors of small boards, over these differences
-times the change of successive steps, that the bend may explain; the MIXED differences then decide. Of SIMULATED boards
-of 7 x 5 that face an equidistant, equisolid or stereographic fisheye they are 0.9 to 2.0 for differences of order 5 and
-5.2 to 8.3 for surfaces; of scatter alone, whose differences of all orders are alike, mostly 15 to 30."""
+times the change of successive steps, that the bend may explain; `lens_scatter` then decides. Of SIMULATED boards of
+7 x 5 that face an equidistant, equisolid or stereographic fisheye they are 0.9 to 2.0; of scatter alone, whose
+differences of all orders are alike, mostly 15 to 30."""
 
 SURFACES, AS_ROUGH, MIN_TERM = (3, 4), 1.5, 1e-6
 EVEN_STEPS = 0.12
@@ -64,18 +69,22 @@ def excess_scatter(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tup
 
 
 def scatter_factors(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tuple[slice, slice]]) -> FloatArray:
-    """Return the factors (P,) of the sigmas of each part: `excess_scatter`, for strong lenses also mixed differences.
+    """Return the factors (P,) of the sigmas of each part: `excess_scatter`, for strong lenses also mixed differences,
+    of small boards `lens_scatter`.
 
-    Differences along rows do not remove the curvature of strong lenses, nor those of order 5 that of a fisheye that a
-    small board faces; the smallest of all ratios is returned.
+    Differences along rows do not remove the curvature of strong lenses, nor those of order 5 that of a fisheye near a
+    small board; the smallest of all ratios is returned.
     """
     factors = excess_scatter(pixels, sigma_px, parts)
     for k in np.flatnonzero(factors > UNEXPLAINED_SCATTER).tolist():
         part = parts[k]
         strong = any(change.every > STRONG_CURVATURE for change in spacing_changes(pixels[part]))
         small = np.isfinite(native.surface_scatter(pixels[part], sigma_px[part], _rules())[1])
-        if strong or (small and factors[k] < BEND_DIFFERENCES * _bend(pixels[part], sigma_px[part])):
-            factors[k] = _calmest(factors[k], pixels[part], sigma_px[part])
+        if small and (strong or factors[k] < BEND_DIFFERENCES * _bend(pixels[part], sigma_px[part])):
+            factors[k] = _through_lens(factors[k], pixels[part], sigma_px[part])
+        elif strong:
+            mixed = (_mixed_roughness(pixels[part], sigma_px[part], *orders) for orders in MIXED)
+            factors[k] = max(np.fmin.reduce([factors[k], *mixed]), 1.0)
     return factors
 
 
@@ -96,21 +105,23 @@ def small_scatter(pixels: FloatArray, sigma_px: FloatArray) -> float:
     Where columns, or rows, are too short for any, twice MIN_DIFFERENCES are asked of the others: a board of 7 x 5 has
     20 along its rows, where the surfaces leave 40.
     The factor follows from the residuals of cubic and quartic surfaces, which are similar if they are scatter. If the
-    quartic ones are much smaller, due to a strong lens, the factor is 1.
+    quartic ones are much smaller, due to a strong lens, the factor is 1. Where both may be the bend of a board that
+    faces the lens, which is odd while the quartic terms are even, `lens_scatter` tells.
     """
     cubic, quartic = native.surface_scatter(pixels, sigma_px, _rules())
     if not (cubic < AS_ROUGH * quartic and quartic > UNEXPLAINED_SCATTER):
         return 1.0
     if any(change.every > EVEN_STEPS for change in spacing_changes(pixels)):
         return 1.0
-    # The bend of a board that faces the lens is odd, and the quartic terms are even.
-    explained = quartic < BEND_SURFACES * _bend(pixels, sigma_px)
-    return _calmest(quartic, pixels, sigma_px) if explained else quartic
+    return _through_lens(quartic, pixels, sigma_px) if quartic > LARGE_SCATTER else quartic
 
 
-def _calmest(factor: float, pixels: FloatArray, sigma_px: FloatArray) -> float:
-    """Return the smallest of `factor` and the MIXED differences of a board (R, C, 2), at least 1."""
-    return float(max(np.fmin.reduce([factor, *(_mixed_roughness(pixels, sigma_px, *o) for o in MIXED)]), 1.0))
+def _through_lens(factor: float, pixels: FloatArray, sigma_px: FloatArray) -> float:
+    """Return the smallest of `factor` and the `lens_scatter` of a small board (R, C, 2), at least 1.
+
+    It does not replace a smaller factor: a bent board (REAL, fisheye-chess) is no scatter, but no flat board either.
+    """
+    return max(min(factor, lens_scatter(pixels, sigma_px)), 1.0)
 
 
 def _bend(pixels: FloatArray, sigma_px: FloatArray) -> float:

@@ -59,6 +59,23 @@ def test_a_small_board_that_faces_a_fisheye(times: float, low: float, high: floa
     assert low <= np.median(factors) <= high
 
 
+@pytest.mark.parametrize(("times", "low", "high"), [(1.0, 1.0, 2.0), (8.0, 4.0, 9.0)])
+def test_a_small_board_near_a_fisheye(times: float, low: float, high: float) -> None:
+    """Tilted, and 3 squares away: its bend seemed to be scatter, many times the sigmas."""
+    rng = np.random.default_rng(7)
+    sigma_px, whole = np.full((5, 7), 0.006), [(slice(0, 5), slice(0, 7))]
+    factors = []
+    for _ in range(10):
+        u, v = (part + rng.uniform(-0.5, 0.5) for part in np.meshgrid(np.arange(7) - 3.0, np.arange(5) - 2.0))
+        depth = 3.0 + 0.07 * u * rng.uniform(-1.0, 1.0) + 0.3 * v
+        beside = np.hypot(u, v)
+        pixels = 240.0 * np.stack([u, v], axis=-1) * (np.arctan2(beside, depth) / beside)[..., None]
+        pixels += times * 0.006 * rng.standard_normal((5, 7, 2))
+        factor = float(scatter_factors(pixels, sigma_px, whole)[0])
+        factors.append(factor * small_scatter(pixels, factor * sigma_px))
+    assert low <= np.median(factors) <= high
+
+
 def test_boards_of_many_or_hardly_any_corners_are_left_to_others() -> None:
     rng = np.random.default_rng(2)
     for columns, rows in ((9, 6), (3, 3)):
