@@ -100,19 +100,23 @@ EXPORT int64_t grow_patches(
 /* planes.c */
 
 /* Measurements of a surface at the nodes of a grid (reconstruction.growing.surface): values, NaN where missing, their information
- * matrices (inverse covariances), and the matrices that map a plane to the predicted values. */
+ * matrices (inverse covariances), and the matrices that map a plane to the predicted values; offsets of the measured points from
+ * their nodes, which are `step` px apart, and the variances of the windows that measured them, px^2. */
 typedef struct {
     ARRAY(const double, values, rows, columns, 3);
     ARRAY(const double, information, rows, columns, 3, 3);
     ARRAY(const double, frames, rows, columns, 3, 3);
+    ARRAY(const double, offsets, rows, columns, 2);
+    ARRAY(const double, windows, rows, columns);
     int64_t rows, columns, reach, rounds;
-    double turn;
+    double turn, step;
 } plane_grid_t;
 
 EXPORT int64_t fit_planes(
     const plane_grid_t *grid, RESULT(double, planes, grid.rows, grid.columns, 3),
     RESULT(double, normals, grid.rows, grid.columns, 3, 3), RESULT(double, support, grid.rows, grid.columns),
-    RESULT(double, squares, grid.rows, grid.columns));
+    RESULT(double, squares, grid.rows, grid.columns), RESULT(double, mixed, grid.rows, grid.columns, 3, 3),
+    RESULT(double, bends, grid.rows, grid.columns, 3, 3), RESULT(double, pull, grid.rows, grid.columns, 3));
 
 /* sweep.c */
 

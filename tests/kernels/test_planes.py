@@ -7,7 +7,7 @@ import pytest
 from kernels.reference import planes as reference
 
 from rigkit.geometry.rotation import unit
-from rigkit.kernels.planes import fitted_planes
+from rigkit.kernels.planes import PlaneFits, fitted_planes
 
 REACH, ROUNDS, TURN = 3, 5, 2.385
 ROUNDING = 1e-4
@@ -31,10 +31,19 @@ def step_edge(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     return values, np.broadcast_to(np.diag(sigmas**-2.0), (rows, columns, 3, 3)), frames, truth
 
 
+def fitted(values: np.ndarray, information: np.ndarray, frames: np.ndarray, reach: int = REACH) -> PlaneFits:
+    """Return the planes through values at their nodes, 4 px apart, of windows without extent."""
+    shape = values.shape[:2]
+    flat = {"offsets": np.zeros((*shape, 2)), "windows": np.zeros(shape), "step": 4.0}
+    return fitted_planes(values, information, frames, **flat, reach=reach, rounds=ROUNDS, turn=TURN)
+
+
 def test_planes_are_fitted_as_defined(rng: np.random.Generator) -> None:
     values, information, frames, _ = step_edge(rng)
+    offsets, windows = rng.uniform(-2.0, 2.0, (*values.shape[:2], 2)), rng.uniform(10.0, 30.0, values.shape[:2])
+    extent = {"offsets": offsets, "windows": windows, "step": 4.0}
     ours, theirs = (
-        fit(values, information, frames, reach=REACH, rounds=ROUNDS, turn=TURN)
+        fit(values, information, frames, **extent, reach=REACH, rounds=ROUNDS, turn=TURN)
         for fit in (fitted_planes, reference.fitted_planes)
     )
     for one, two in zip(ours, theirs, strict=True):
@@ -45,7 +54,7 @@ def test_planes_are_fitted_as_defined(rng: np.random.Generator) -> None:
 
 def test_an_edge_stays_sharp(rng: np.random.Generator) -> None:
     values, information, frames, truth = step_edge(rng)
-    fits = fitted_planes(values, information, frames, reach=REACH, rounds=ROUNDS, turn=TURN)
+    fits = fitted(values, information, frames)
     good, planes = np.isfinite(fits.support), fits.planes
     assert good.sum() > 450
     off = np.abs(np.sum((planes - truth) * frames[..., 0, :], axis=-1))[good]
@@ -60,4 +69,4 @@ def test_planes_without_memory_are_an_error(rng: np.random.Generator) -> None:
     """A million nodes to each side of the grid are more than an address space holds."""
     values, information, frames, _ = step_edge(rng)
     with pytest.raises(MemoryError):
-        fitted_planes(values, information, frames, reach=1_000_000, rounds=1, turn=TURN)
+        fitted(values, information, frames, reach=1_000_000)

@@ -146,6 +146,11 @@ class GrownPatches:
     def __len__(self) -> int:
         return int(self.valid.sum())
 
+    def offsets(self) -> FloatArray:
+        """Return by how much (R, C, 2) px the pixels in image 1 are from their nodes."""
+        rows, columns = np.indices(self.valid.shape)
+        return np.asarray(self.pixels1 - self.step * np.stack([columns, rows], axis=-1))
+
     def centred(self) -> GrownPatches:
         """Return the pairs, each moved from its node to the point of its patch with the least variance.
 

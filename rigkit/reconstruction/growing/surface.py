@@ -9,8 +9,9 @@ downweights neighbours on another surface.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,12 +19,11 @@ import numpy as np
 from rigkit.affine.normal import linear_gauge
 from rigkit.affine.refine_patches import FLOOR_PX, WINDOW_OF_PATCH, curvature_shift, levels_of_larger, window_variance
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Normals, Points
+from rigkit.core.arrays import TINY, BoolArray, FloatArray, IntArray, Normals, Points
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import angle_between
 from rigkit.geometry.triangulation import triangulate_rays
-from rigkit.kernels.planes import fitted_planes
+from rigkit.kernels.planes import PlaneFits, fitted_planes
 from rigkit.optim.local_variances import of_redescending, shrunk_variances
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrownPatches, only
@@ -35,6 +35,15 @@ TURN_OF_LOSS = 2.385
 """Scale of the robust loss, in standard deviations of a component."""
 MIN_NODE_SUPPORT = 0.1
 """Least sum of weights over the number of nodes around; below, a plane is fitted to little more than its own node."""
+CURVATURE_ROUNDS = 3
+"""Curvature raises the noise that the residuals show, which hides curvature: the noise settles in two or three."""
+Row = tuple[float, ...]
+SLOPES, BENDS = (-1.0, 1.0), (1.0, -2.0, 1.0)
+"""Weights of planes in a row that are compared. Curvature adds to first differences, more edges in between to second
+ones: the noise is what both show at most. A sweep's errors reach further than a plane and look like curvature, so only
+first differences show them."""
+OPEN_CURVATURE = 1e-6
+"""Smallest relative eigenvalue of the information on a curvature: less is rounding of nodes in a line."""
 MIN_COMPARED = 200
 """Least number of pairs of planes whose median ratio is known to a tenth."""
 GROUPS_A_DOUBLING = 2
@@ -54,6 +63,8 @@ class NodeMeasurements:
     frame : (R, C, 3, 3) ray and columns of the ray Jacobian in rows: z = frame m for the plane m . X = 1.
     slope : (R, C) derivative, in px along the epipolar line, by the inverse range.
     swept : (R, C) mask of the nodes whose pair is from a sweep.
+    offset : (R, C, 2) px, of the measured points from their nodes, the middle of the windows that measured them.
+    window : (R, C) variance of these windows along an axis, px^2.
     """
 
     z: FloatArray
@@ -61,6 +72,8 @@ class NodeMeasurements:
     frame: FloatArray
     slope: FloatArray
     swept: BoolArray
+    offset: FloatArray
+    window: FloatArray
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -143,6 +156,8 @@ class PairRays:
             frame=self._on_grid(self._frames(), good),
             slope=self._on_grid(slope, good),
             swept=self.grown.swept,
+            offset=self.grown.offsets(),
+            window=_window_variance(self.grown),
         )
 
     def _model_error(self) -> FloatArray:
@@ -151,8 +166,9 @@ class PairRays:
         Without it patches with strong texture contradict each other, and hardly any plane has support.
         """
         at = self.grown.valid
-        place = np.where(self.grown.swept[at], 0.0, FLOOR_PX * 2.0 ** self.grown.coarser[at])
         affinity = np.where(self.grown.swept[at], 0.0, FLOOR_PX / HALF_WIDTH)
+        # Independent errors of pixels move a patch by what they turn it by times its window's standard deviation.
+        place = WINDOW_OF_PATCH * HALF_WIDTH * 2.0 ** self.grown.coarser[at] * affinity
         sigmas = np.repeat(np.stack([place, affinity], axis=1), [2, 4], axis=1)
         return np.asarray(sigmas[:, :, None] ** 2 * np.eye(6), np.float64)
 
@@ -194,7 +210,8 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
 
     Their covariance is scaled twice. First by the local residuals of the nodes around, as far as these vary by more
     than chance: windows with another surface, a highlight or a bend have larger errors. Then by the disagreement of
-    planes that share no node but have similar residuals: neighbouring patches share pixels, and surfaces are not flat.
+    planes that share no node but have similar residuals, because neighbouring patches share pixels. A curvature of the
+    surface is fitted along with each plane; the share of it that is not noise moves the plane.
     Nodes of a sweep are scaled separately, because its errors are correlated over larger distances. `shared_px` is an
     error along the epipolar lines that is common to all nodes around.
 
@@ -207,33 +224,37 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
     valid = np.isfinite(measured.z[..., 0])
     covariance = np.where(valid[..., None, None], measured.covariance, np.eye(3))
     fits = fitted_planes(
-        measured.z, np.linalg.inv(covariance), measured.frame, reach=reach, rounds=SMOOTHING_ROUNDS, turn=TURN_OF_LOSS
+        measured.z,
+        np.linalg.inv(covariance),
+        measured.frame,
+        offsets=measured.offset,
+        windows=measured.window,
+        step=step,
+        reach=reach,
+        rounds=SMOOTHING_ROUNDS,
+        turn=TURN_OF_LOSS,
     )
-    plane = fits.planes
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ray = measured.frame[..., 0, :]
-        inverse = np.sum(plane * ray, axis=-1)
-        support = fits.support / (2 * reach + 1) ** 2
-        keep = (inverse > 0.0) & (support >= MIN_NODE_SUPPORT)
-        points = ray / inverse[..., None]
-        normals = -plane / np.linalg.norm(plane, axis=-1, keepdims=True)
+    ray = measured.frame[..., 0, :]
+    support = fits.support / (2 * reach + 1) ** 2
+    keep = (np.sum(fits.planes * ray, axis=-1) > 0.0) & (support >= MIN_NODE_SUPPORT)
     spread = np.full(fits.normals.shape, np.nan)
     spread[keep] = _inverse(fits.normals[keep])
-    missed = of_redescending(fits.squares / (3.0 * fits.support), TURN_OF_LOSS)
     # Squares of values with Gaussian correlation have half the correlation area.
     around = cv2.boxFilter(
         valid.astype(np.float64), -1, (2 * reach + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT
     )
     freedom = np.maximum(3.0 * around * step**2 / (0.5 * WINDOW_AREA_PX), 1.0)
-    for alike in (keep & measured.swept, keep & ~measured.swept):
-        local = np.full(valid.shape, np.nan)
-        local[alike] = shrunk_variances(missed[alike], freedom[alike])
-        scale = _disagreement(
-            only(alike, normals), only(alike, plane), local[..., None, None] * spread, local, 2 * reach
-        )
-        # Never below the stated noise of the patches.
-        spread[alike] *= np.maximum(local * np.maximum(scale, 1.0) ** 2, 1.0)[alike][:, None, None]
+    plane, curved = fits.planes.copy(), _curvatures(fits, spread)
+    for alike, stencils in ((keep & measured.swept, [SLOPES]), (keep & ~measured.swept, [SLOPES, BENDS])):
+        noise, share = _noise(fits, only(alike, spread), curved.gain, freedom, stencils, 2 * reach)
+        plane[alike] -= (share[..., None] * curved.shift)[alike]
+        spread[alike] = (noise[..., None, None] * (spread + share[..., None, None] * curved.covariance))[alike]
     spread += ((shared_px / measured.slope) ** 2)[..., None, None] * ray[..., :, None] * ray[..., None, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.sum(plane * ray, axis=-1)
+        keep &= inverse > 0.0
+        points = ray / inverse[..., None]
+        normals = -plane / np.linalg.norm(plane, axis=-1, keepdims=True)
     return GrownSurface(
         points=only(keep, points),
         normals=only(keep, normals),
@@ -243,23 +264,90 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
     )
 
 
-def _disagreement(
-    normals: Normals, plane: FloatArray, covariance: FloatArray, scatter: FloatArray, lag: int
-) -> FloatArray:
-    """Return the ratio (R, C) of observed to predicted differences between normals of nodes `lag` apart; 1 without any.
+class _Curvatures(NamedTuple):
+    """What planes (R, C, 3) are off by, `shift`, as the surface is curved around their nodes, with its covariance
+    (R, C, 3, 3) for values of the stated noise, and the decrease (R, C) `gain` of the squares by these curvatures. Zero
+    where the nodes around do not determine a curvature."""
+
+    shift: FloatArray
+    covariance: FloatArray
+    gain: FloatArray
+
+
+def _curvatures(fits: PlaneFits, spread: FloatArray) -> _Curvatures:
+    """Return the curvatures fitted with the planes of the covariances `spread` (R, C, 3, 3), NaN without one."""
+    out = _Curvatures(np.zeros(fits.planes.shape), np.zeros(spread.shape), np.zeros(spread.shape[:2]))
+    by_bend = spread @ fits.mixed
+    own = fits.bends - np.swapaxes(fits.mixed, -1, -2) @ by_bend
+    size = np.sqrt(np.maximum(np.diagonal(own, axis1=-2, axis2=-1), 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own /= size[..., None] * size[..., None, :]
+    known: BoolArray = np.asarray(np.isfinite(own).all(axis=(-1, -2)))
+    known[known] = np.linalg.eigvalsh(own[known])[:, 0] > OPEN_CURVATURE
+    root = 1.0 / size[known]
+    inverse = np.linalg.inv(own[known]) * root[:, :, None] * root[:, None, :]
+    by_bend, pull = by_bend[known], fits.pull[known]
+    bend = (inverse @ pull[..., None])[..., 0]
+    out.shift[known] = (by_bend @ bend[..., None])[..., 0]
+    out.covariance[known] = by_bend @ inverse @ np.swapaxes(by_bend, 1, 2)
+    out.gain[known] = np.sum(bend * pull, axis=-1)
+    return out
+
+
+def _noise(
+    fits: PlaneFits, spread: FloatArray, gain: FloatArray, freedom: FloatArray, stencils: Sequence[Row], lag: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the variances (R, C) of alike nodes over those stated, never less than these, and the shares (R, C) of the
+    curvatures that are not noise.
+
+    `spread` (R, C, 3, 3) are the stated covariances of their planes, NaN elsewhere, `freedom` (R, C) the degrees of
+    freedom of the residuals; planes that share no node are `lag` nodes apart.
+    """
+    alike = np.isfinite(spread[..., 0, 0])
+    share = np.ones(alike.shape)
+    for _ in range(CURVATURE_ROUNDS):
+        missed = of_redescending((fits.squares - share * (2.0 - share) * gain) / (3.0 * fits.support), TURN_OF_LOSS)
+        local = np.full(alike.shape, np.nan)
+        local[alike] = shrunk_variances(missed[alike], freedom[alike])
+        planes, stated = only(alike, fits.planes), local[..., None, None] * spread
+        scale = np.min([_disagreement(planes, stated, local, lag, row) for row in stencils], axis=0)
+        noise = np.maximum(local * np.maximum(scale, 1.0) ** 2, 1.0)
+        share = _share_of_curvature(gain / (3.0 * noise), alike, lag + 1)
+    return noise, share
+
+
+def _share_of_curvature(ratio: FloatArray, alike: BoolArray, side: int) -> FloatArray:
+    """Return the share (R, C) of the fitted curvatures that is not noise: Wiener's, from the mean around each node of
+    the `ratio` (R, C) of their squares to those of noise."""
+    total, count = (
+        cv2.boxFilter(values, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for values in (np.where(alike, ratio, 0.0), alike.astype(np.float64))
+    )
+    return np.asarray(np.where(alike, 1.0 - np.minimum(count / np.maximum(total, TINY), 1.0), 0.0))
+
+
+def _disagreement(plane: FloatArray, covariance: FloatArray, scatter: FloatArray, lag: int, stencil: Row) -> FloatArray:
+    """Return the ratio (R, C) of observed to predicted differences, by the `stencil`, between normals of nodes `lag`
+    apart; 1 without any.
 
     It is a function of `scatter` (R, C), the local residual variance: errors that neighbours share, as a highlight or
     an edge in all their windows, occur where residuals are large, but do not contribute to these.
     """
+    normals = plane / np.linalg.norm(plane, axis=-1, keepdims=True)
     across = np.eye(3) - normals[..., :, None] * normals[..., None, :]
     variance = np.einsum("...ij,...jk,...ik->...", across, covariance, across) / np.sum(plane**2, axis=-1)
-    ratios, scatters = [], []
-    for one, other in ((np.s_[:, :-lag], np.s_[:, lag:]), (np.s_[:-lag], np.s_[lag:])):
-        angle = angle_between(normals[one], normals[other])
-        both = variance[one] + variance[other]
+    ratios, scatters, span = [], [], lag * (len(stencil) - 1)
+    for turned in (False, True):
+        n, v, s = (np.swapaxes(values, 0, 1) if turned else values for values in (normals, variance, scatter))
+        places = [np.s_[k * lag : max(len(n) - span, 0) + k * lag] for k in range(len(stencil))]
+        off = np.sum([w * n[at] for w, at in zip(stencil, places, strict=True)], axis=0)
+        middle = n[places[len(stencil) // 2]]
+        off -= np.sum(off * middle, axis=-1, keepdims=True) * middle
+        both = np.sum([w * w * v[at] for w, at in zip(stencil, places, strict=True)], axis=0)
+        weighted = np.sum([w * w * (v * s)[at] for w, at in zip(stencil, places, strict=True)], axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratios.append((angle / np.sqrt(both)).ravel())
-            scatters.append(((variance[one] * scatter[one] + variance[other] * scatter[other]) / both).ravel())
+            ratios.append((np.linalg.norm(off, axis=-1) / np.sqrt(both)).ravel())
+            scatters.append((weighted / both).ravel())
     ratio, at = np.concatenate(ratios), np.concatenate(scatters)
     known = np.isfinite(ratio) & (at > 0.0)
     if not known.any():
@@ -285,10 +373,14 @@ def correct_curvature(grown: GrownPatches, camera1: Camera, camera2: Camera, cam
     surface in their alignment windows (`curvature_shift`)."""
     planes = PairRays.of(grown, camera1, camera2).planes(cam2_from_cam1)
     at = grown.valid & np.isfinite(planes[..., 0])
-    place = grown.pixels1[at]
-    rows, columns = np.nonzero(at)
-    off = place - grown.step * np.stack([columns, rows], axis=1)
-    variance = window_variance(HALF_WIDTH) * 4.0 ** (grown.coarser[at] + levels_of_larger(grown.A21[at]))
+    place, off, variance = grown.pixels1[at], grown.offsets()[at], _window_variance(grown)[at]
     pixels2 = grown.pixels2.copy()
     pixels2[at] -= curvature_shift(place, planes[at], variance, (camera1, camera2), cam2_from_cam1, off)
     return replace(grown, pixels2=pixels2)
+
+
+def _window_variance(grown: GrownPatches) -> FloatArray:
+    """Return the variance (R, C) of the alignment windows along an axis, px^2 of image 1; none for pairs of a sweep."""
+    out, at = np.zeros(grown.valid.shape), grown.valid & ~grown.swept
+    out[at] = window_variance(HALF_WIDTH) * 4.0 ** (grown.coarser[at] + levels_of_larger(grown.A21[at]))
+    return out

@@ -17,6 +17,7 @@ HOLE = np.s_[25:45, 30:60]
 CAMERA = Pinhole((STEP * SHAPE[1], STEP * SHAPE[0]), np.array([300.0, 300.0, 134.5, 104.5]))
 WALL = np.array([0.0002, -0.0001, 0.001])
 """m of m . X = 1: a wall a metre away."""
+CENTRE = np.array([134.5, 104.5])
 NOISE_PX, SLOPE_PX = 0.1, 2e4
 
 
@@ -28,13 +29,25 @@ def beside_the_hole() -> BoolArray:
     return np.asarray((far > 0.0) & (far <= HALF_WIDTH + STEP))
 
 
-def fitted(times: FloatArray, rng: np.random.Generator) -> GrownSurface:
-    """Return the planes where nodes err by `times` (R, C) what they state."""
+WINDOW = 15.0
+"""Variance of a patch's window, px^2."""
+BOWL = np.array([-3e-8, 5e-9, -2e-8])
+"""Second derivatives (uu, uv, vv) of the inverse range by the pixel: those of a bowl with radii of 0.4 and 0.6 m."""
+
+
+def fitted(times: FloatArray, rng: np.random.Generator, bend: FloatArray | None = None) -> GrownSurface:
+    """Return the planes where nodes err by `times` (R, C) what they state; with second derivatives `bend` (uu, uv, vv)
+    of a bowl around the middle of the image."""
     pixels = np.stack(np.meshgrid(*(STEP * np.arange(float(n)) for n in SHAPE[::-1])), axis=-1)
     rays, _ = CAMERA.unproject(pixels)
     frame = np.concatenate([rays[..., None, :], np.swapaxes(CAMERA.ray_jacobian(pixels), -1, -2)], axis=-2)
     sigma = NOISE_PX / SLOPE_PX * np.array([1.0, 0.1, 0.1])
     z = frame @ WALL + times[..., None] * sigma * rng.normal(size=(*SHAPE, 3))
+    if bend is not None:
+        second = np.array([[bend[0], bend[1]], [bend[1], bend[2]]])
+        d = pixels - CENTRE
+        z[..., 0] += 0.5 * np.einsum("...i,ij,...j->...", d, second, d) + 0.5 * WINDOW * np.trace(second)
+        z[..., 1:] += d @ second
     z[HOLE] = np.nan
     return fit_surface(
         NodeMeasurements(
@@ -43,6 +56,8 @@ def fitted(times: FloatArray, rng: np.random.Generator) -> GrownSurface:
             frame=frame,
             slope=np.full(SHAPE, SLOPE_PX),
             swept=np.zeros(SHAPE, dtype=bool),
+            offset=np.zeros((*SHAPE, 2)),
+            window=np.full(SHAPE, WINDOW),
         ),
         STEP,
     )
@@ -63,6 +78,30 @@ def test_fewer_of_the_nodes_around_lie_in_a_plane_beside_its_end(rng: np.random.
     assert 0.7 < np.median(surface.support[inner]) < 0.8
     beside = surface.support[beside_the_hole()]
     assert np.nanmedian(beside) < 0.75 * np.median(surface.support[inner])
+
+
+def test_a_curved_surface_is_not_too_far_by_what_bends_within_the_windows() -> None:
+    """As a plane through all nodes around would be."""
+    off, sigmas = [], []
+    pixels = np.stack(np.meshgrid(*(STEP * np.arange(float(n)) for n in SHAPE[::-1])), axis=-1)
+    rays, _ = CAMERA.unproject(pixels)
+    d = pixels - CENTRE
+    true = np.sum(WALL * rays, axis=-1)
+    true += 0.5 * (BOWL[0] * d[..., 0] ** 2 + 2.0 * BOWL[1] * d[..., 0] * d[..., 1] + BOWL[2] * d[..., 1] ** 2)
+    for seed in range(4):
+        surface = fitted(np.ones(SHAPE), np.random.default_rng(seed), BOWL)
+        error = np.sum(surface.plane * rays, axis=-1) - true
+        inner = np.isfinite(error) & ~beside_the_hole()
+        inner[:6] = inner[-6:] = inner[:, :6] = inner[:, -6:] = False
+        off.append(error[inner])
+        sigmas.append(np.sqrt(np.einsum("...i,...ij,...j->...", rays, surface.covariance, rays))[inner])
+    error, sigma = np.concatenate(off), np.concatenate(sigmas)
+    # A plane is off by half the curvature times the variance of all windows: of nodes in a square, and of each.
+    nodes = round(2.0 * HALF_WIDTH / STEP)
+    of_plane = 0.5 * (BOWL[0] + BOWL[2]) * (STEP**2 * nodes * (nodes + 1.0) / 3.0 + WINDOW)
+    assert np.median(sigma) < 0.4 * abs(of_plane) and abs(np.median(error)) < 0.35 * abs(of_plane)
+    assert 0.54 < np.mean(np.abs(error) < sigma) < 0.82
+    assert np.mean(np.abs(error) < 2.0 * sigma) > 0.88
 
 
 DULL = np.broadcast_to(np.arange(SHAPE[1]) >= 66, SHAPE)
