@@ -12,19 +12,19 @@ least squares over all corners.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rigkit.calibration.solving.clustered import Clustered, clustered_covariance, effective_freedom, widening
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
-from rigkit.core.arrays import FloatArray, IntArray, root_diagonal
+from rigkit.core.arrays import FloatArray, root_diagonal, scaled_pinv
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import nearest_rotation, rotation_angle, skew
+from rigkit.geometry.rotation import log_so3, nearest_rotation, rotation_angle, skew
 from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
 
@@ -39,6 +39,13 @@ OPEN_PART = 1e-12
 HAND_EYE_DAMPING = Damping(start=1e-4, ceiling=1e12)
 HAND_EYE_STOP = Stop(steps=60, predicted_gain=1e-14)
 UNKNOWNS = 12
+VARIANCE_ROUNDS = 60
+"""Estimates of the robot's noise, each with the poses at their optimum; variances that are zero only approach it."""
+VARIANCES_SETTLED = 1e-3
+"""Change of the variances, as a part of these or of those of poses as seen, that ends the estimates: a twentieth of
+what a thousand images would leave unknown."""
+LEAST_VARIANCE = 1e-9
+"""Robot noise of this part of the noise of boards' poses, as seen, is none, and stays above zero for rounding."""
 INVERSE_FITS_BETTER = 3.0
 """Robot poses are the wrong way round where their inverses fit so many times better."""
 
@@ -50,8 +57,10 @@ class HandEye:
     Attributes
     ----------
     cam_from_mount, stand_from_board : the two unknown poses, mm.
-    covariance : (12, 12) of (w, v) of the first, then of the second: R' = exp([w]x) R, t' = t + v, rad and mm. It is
-        estimated from the scatter between images and so includes the errors of the robot's poses.
+    covariance : (12, 12) of (w, v) of the first, then of the second: R' = exp([w]x) R, t' = t + v, rad and mm. It
+        includes the errors of the robot's poses.
+    robot_turn_rad, robot_move_mm : standard deviations of the robot's poses, of rotations and translations of the hand
+        about and along each axis, as the scatter shows them.
     freedom : its degrees of freedom; quoted standard deviations account for them (`widening`).
     rms_px : 2-D RMS of all corners.
     image_rms_px : the same of each image.
@@ -63,6 +72,8 @@ class HandEye:
     cam_from_mount: Rigid3
     stand_from_board: Rigid3
     covariance: FloatArray
+    robot_turn_rad: float
+    robot_move_mm: float
     freedom: float
     rms_px: float
     image_rms_px: dict[str, float]
@@ -79,8 +90,12 @@ class HandEye:
         return deviations[:, 0], deviations[:, 1]
 
 
-def hand_eye(camera: Camera, views: Sequence[BoardView], mount_from_stand: Sequence[Rigid3]) -> HandEye:
+def hand_eye(
+    camera: Camera, views: Sequence[BoardView], mount_from_stand: Sequence[Rigid3], *, board_on_hand: bool = False
+) -> HandEye:
     """Return the hand-eye calibration from views of one board and the robot's pose at each.
+
+    With `board_on_hand` the stand is the hand, else the mount: the robot's errors turn and move the hand.
 
     Raises
     ------
@@ -93,7 +108,7 @@ def hand_eye(camera: Camera, views: Sequence[BoardView], mount_from_stand: Seque
         raise InputError(f"hand-eye: {len(views)} views, but {len(mount_from_stand)} poses of the robot")
     if len(views) < MIN_POSES:
         raise DegenerateError(f"hand-eye: {len(views)} images with the board; at least {MIN_POSES} are needed")
-    seen = [_pose(camera, view) for view in views]
+    names, seen = [view.image for view in views], [_pose(camera, view) for view in views]
     mismatch = _mismatch(seen, mount_from_stand)
     use = np.flatnonzero(mismatch <= MAX_MISMATCH_RAD).tolist()
     if len(use) < max(MIN_POSES, len(views) // 2 + 1):
@@ -102,72 +117,157 @@ def hand_eye(camera: Camera, views: Sequence[BoardView], mount_from_stand: Seque
             f"hand-eye: rotations of camera and robot between images differ (by {worst:.1f} degrees, median); check "
             "that images and poses are in the same order, and the unit of the angles"
         )
-    problem = _AllCorners(camera, [views[i] for i in use], [mount_from_stand[i] for i in use])
-    start = _linear([seen[i] for i in use], problem.robot)
-    found = minimise(start, problem.at, _moved, HAND_EYE_DAMPING, HAND_EYE_STOP)
-    _refuse_inverse(problem, [seen[i] for i in use], found.problem.cost)
-    known = _by_image(found.problem, problem.image)
-    _refuse_open(known.covariance, [seen[i] for i in use])
-    squared = found.problem.residual.reshape(-1, 2) ** 2 * problem.sigma[:, None] ** 2
-    by_image = {
-        problem.views[i].image: float(np.sqrt(squared[problem.image == i].sum(axis=1).mean()))
-        for i in range(len(problem.views))
-    }
-    off_mm, turned_rad = _residuals(*found.state, problem, [seen[i] for i in use])
+    views, seen, robot = [views[i] for i in use], [seen[i] for i in use], [mount_from_stand[i] for i in use]
+    problem = _PosesOfBoards(seen, robot, _covariances_seen(camera, views, seen), board_on_hand)
+    state, problem = _with_robot_noise(_linear(seen, robot), problem)
+    _refuse_inverse(problem, state)
+    known = _by_image(problem, state)
+    _refuse_open(known.covariance, seen)
+    predicted = [state[0] @ arm @ state[1] for arm in robot]
+    squares = [
+        ((camera.project(pose.apply(view.points()))[0] - view.pixels) ** 2).sum(axis=1)
+        for view, pose in zip(views, predicted, strict=True)
+    ]
+    off_mm, turned_rad = _residuals(views, seen, predicted)
     return HandEye(
-        cam_from_mount=found.state[0],
-        stand_from_board=found.state[1],
+        cam_from_mount=state[0],
+        stand_from_board=state[1],
         covariance=known.covariance,
-        # Each image measures six numbers: UNKNOWNS / 6 images determine the unknowns and say nothing about scatter.
-        freedom=effective_freedom(min(known.freedom, len(use) - UNKNOWNS / 6), known.overdispersion, UNKNOWNS),
-        rms_px=float(np.sqrt(squared.sum(axis=1).mean())),
-        image_rms_px=by_image,
+        robot_turn_rad=float(np.sqrt(problem.variances[0])),
+        robot_move_mm=float(np.sqrt(problem.variances[1])),
+        # Each image measures six numbers: UNKNOWNS / 6 images determine the unknowns and say nothing about scatter; of
+        # the others three each show one of the robot's two variances.
+        freedom=min(
+            effective_freedom(min(known.freedom, len(use) - UNKNOWNS / 6), known.overdispersion, UNKNOWNS),
+            3.0 * (len(use) - UNKNOWNS / 6),
+        ),
+        rms_px=float(np.sqrt(np.concatenate(squares).mean())),
+        image_rms_px={view.image: float(np.sqrt(own.mean())) for view, own in zip(views, squares, strict=True)},
         translation_residuals_mm=off_mm,
         rotation_residuals_rad=turned_rad,
-        left_out={views[i].image: float(mismatch[i]) for i in range(len(views)) if i not in use},
+        left_out={name: float(mismatch[i]) for i, name in enumerate(names) if i not in use},
     )
 
 
-class _AllCorners:
-    """The least-squares problem of all corners of all images in the two unknown poses."""
+State = tuple[Rigid3, Rigid3]
 
-    def __init__(self, camera: Camera, views: Sequence[BoardView], robot: Sequence[Rigid3]) -> None:
-        self.camera, self.views, self.robot = camera, list(views), list(robot)
-        self.image: IntArray = np.repeat(np.arange(len(views)), [len(view.grid) for view in views])
-        self.points = np.concatenate([view.points() for view in views])
-        self.pixels = np.concatenate([view.pixels for view in views])
-        self.sigma = np.concatenate([view.sigma_px for view in views])
-        self.rotation = np.stack([pose.rotation for pose in robot])[self.image]
-        self.translation = np.stack([pose.translation_mm for pose in robot])[self.image]
 
-    def at(self, state: tuple[Rigid3, Rigid3]) -> DenseProblem:
+@dataclass(frozen=True, eq=False, slots=True)
+class _PosesOfBoards:
+    """The least-squares problem of the N poses of the boards in the two unknown poses.
+
+    Attributes
+    ----------
+    seen, robot : poses of the board in the camera, and mount_from_stand.
+    covariance : (N, 6, 6) of `seen`.
+    board_on_hand : whether the stand is the robot's hand.
+    variances : (2,) of the robot's rotations, rad^2, and translations, mm^2.
+    """
+
+    seen: Sequence[Rigid3]
+    robot: Sequence[Rigid3]
+    covariance: FloatArray
+    board_on_hand: bool
+    variances: FloatArray = field(default_factory=lambda: np.zeros(2))
+
+    def linearised(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the steps (N, 6) from the poses seen to those predicted, and their derivatives (N, 6, 12) by the
+        state, and (N, 6, 6) by a rotation and translation of the hand in its own frame."""
+        (cam_from_mount, stand_from_board), count = state, len(self.seen)
+        seen_turn, seen_move = _stacked(self.seen)
+        turn, move = _stacked(self.robot)
+        cam_from_stand = cam_from_mount.rotation @ turn
+        in_stand = cam_from_stand @ stand_from_board.translation_mm
+        in_mount = in_stand + move @ cam_from_mount.rotation.T
+        off = np.empty((count, 6))
+        off[:, :3] = log_so3(cam_from_stand @ stand_from_board.rotation @ np.swapaxes(seen_turn, 1, 2))
+        off[:, 3:] = in_mount + cam_from_mount.translation_mm - seen_move
+        by_state, by_hand = np.zeros((count, 6, UNKNOWNS)), np.zeros((count, 6, 6))
+        by_state[:, :3, :3] = by_state[:, 3:, 3:6] = np.eye(3)
+        by_state[:, 3:, :3] = -skew(in_mount)
+        # A step turns the board in the stand about its own origin.
+        by_state[:, :3, 6:9] = by_state[:, 3:, 9:] = cam_from_stand
+        frame, lever = (cam_from_stand, in_stand) if self.board_on_hand else (cam_from_mount.rotation, in_mount)
+        by_hand[:, :3, :3] = by_hand[:, 3:, 3:] = frame
+        by_hand[:, 3:, :3] = -skew(lever) @ frame
+        return off, by_state, by_hand
+
+    def whitening(self, by_hand: FloatArray) -> FloatArray:
+        """Return W (N, 6, 6) with W V W^T = 1 of the covariances V of the steps."""
+        robot = by_hand * np.repeat(self.variances, 3)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance + robot @ np.swapaxes(by_hand, 1, 2))))
+
+    def at(self, state: State) -> DenseProblem:
         """Return residuals in sigmas and their derivatives by (w, v) of either pose."""
-        cam_from_mount, stand_from_board = state
-        turned = self.points @ stand_from_board.rotation.T
-        in_stand = turned + stand_from_board.translation_mm
-        in_mount = np.einsum("nij,nj->ni", self.rotation, in_stand) + self.translation
-        far = in_mount @ cam_from_mount.rotation.T
-        pixels, valid, d_pixels_d_point, _ = self.camera.project_with_jacobians(far + cam_from_mount.translation_mm)
-        to_cam = d_pixels_d_point @ (cam_from_mount.rotation @ self.rotation)
-        jacobian = np.concatenate(
-            [d_pixels_d_point @ -skew(far), d_pixels_d_point, to_cam @ -skew(turned), to_cam], axis=-1
-        )
-        scale = 1.0 / self.sigma[:, None]
-        residual = np.where(valid[:, None], (pixels - self.pixels) * scale, np.inf)
-        jacobian = np.where(valid[:, None, None], jacobian * scale[..., None], 0.0)
-        return DenseProblem(residual.reshape(-1), jacobian.reshape(-1, UNKNOWNS))
+        off, by_state, by_hand = self.linearised(state)
+        white = self.whitening(by_hand)
+        return DenseProblem((white @ off[..., None]).ravel(), (white @ by_state).reshape(-1, UNKNOWNS))
+
+    def with_variances_from(self, state: State) -> _PosesOfBoards:
+        """Return the problem with better variances, by the scatter at its optimum."""
+        off, by_state, by_hand = self.linearised(state)
+        white = self.whitening(by_hand)
+        rows, residual, shown = white @ by_state, (white @ off[..., None])[..., 0], white @ by_hand
+        inverse = scaled_pinv(np.einsum("nka,nkb->ab", rows, rows), OPEN_PART)
+        variances = []
+        for part, before in zip((shown[..., :3], shown[..., 3:]), self.variances, strict=True):
+            scatter = float((np.einsum("nka,nk->na", part, residual) ** 2).sum())
+            used = np.einsum("nka,nkb->ab", rows, part @ np.einsum("nka,nkb->nab", part, rows))
+            expected = float((part**2).sum() - np.trace(inverse @ used))
+            variances.append(before * np.sqrt(scatter / max(expected, np.finfo(float).tiny)))
+        return replace(self, variances=np.maximum(variances, LEAST_VARIANCE * self.scale()))
+
+    def scale(self) -> FloatArray:
+        """Return the mean variances (2,) of rotations and translations of the poses seen."""
+        each = np.einsum("nii->ni", self.covariance)
+        return np.array([each[:, :3].mean(), each[:, 3:].mean()])
+
+
+def _stacked(poses: Sequence[Rigid3]) -> tuple[FloatArray, FloatArray]:
+    return np.stack([pose.rotation for pose in poses]), np.stack([pose.translation_mm for pose in poses])
+
+
+def _with_robot_noise(start: State, problem: _PosesOfBoards) -> tuple[State, _PosesOfBoards]:
+    """Return the refined poses, and the problem with the robot's noise."""
+    off = problem.linearised(start)[0]
+    problem = replace(problem, variances=np.array([np.mean(off[:, :3] ** 2), np.mean(off[:, 3:] ** 2)]))
+    problem = replace(problem, variances=np.maximum(problem.variances, problem.scale()))
+    state = start
+    for _ in range(VARIANCE_ROUNDS):
+        state = minimise(state, problem.at, _moved, HAND_EYE_DAMPING, HAND_EYE_STOP).state
+        before, problem = problem.variances, problem.with_variances_from(state)
+        if np.all(
+            np.abs(problem.variances - before) <= VARIANCES_SETTLED * np.maximum(problem.variances, problem.scale())
+        ):
+            break
+    return state, problem
+
+
+def _covariances_seen(camera: Camera, views: Sequence[BoardView], seen: Sequence[Rigid3]) -> FloatArray:
+    """Return the covariances (N, 6, 6) of the boards' poses from the noise of their corners, which all residuals about
+    these poses scale."""
+    information, total, freedom = [], 0.0, 0
+    for view, pose in zip(views, seen, strict=True):
+        turned = view.points() @ pose.rotation.T
+        pixels, valid, by_point, _ = camera.project_with_jacobians(turned + pose.translation_mm)
+        scale = np.where(valid, 1.0 / view.sigma_px, 0.0)[:, None]
+        rows = scale[..., None] * np.concatenate([by_point @ -skew(turned), by_point], axis=-1)
+        rows, residual = np.where(valid[:, None, None], rows, 0.0), np.where(valid[:, None], pixels - view.pixels, 0.0)
+        information.append(np.einsum("nka,nkb->ab", rows, rows))
+        total += float(((scale * residual) ** 2).sum())
+        freedom += 2 * int(valid.sum()) - 6
+    return np.asarray(np.linalg.inv(information)) * (total / freedom if freedom > 0 and total > 0.0 else 1.0)
 
 
 def _residuals(
-    cam_from_mount: Rigid3, stand_from_board: Rigid3, problem: _AllCorners, seen: Sequence[Rigid3]
+    views: Sequence[BoardView], seen: Sequence[Rigid3], predicted: Sequence[Rigid3]
 ) -> tuple[FloatArray, FloatArray]:
     """Return distance (N,) mm and angle (N,) rad between the boards' poses seen and those predicted from the robot."""
     off_mm, turned = [], []
-    for view, arm, cam_from_board in zip(problem.views, problem.robot, seen, strict=True):
-        predicted = cam_from_mount @ arm @ stand_from_board
+    for view, one, other in zip(views, seen, predicted, strict=True):
         middle = view.points().mean(axis=0)
-        off_mm.append(np.linalg.norm(cam_from_board.apply(middle) - predicted.apply(middle)))
-        turned.append(cam_from_board.rotation @ predicted.rotation.T)
+        off_mm.append(np.linalg.norm(one.apply(middle) - other.apply(middle)))
+        turned.append(one.rotation @ other.rotation.T)
     return np.array(off_mm), rotation_angle(np.array(turned))
 
 
@@ -230,11 +330,11 @@ def _linear(seen: Sequence[Rigid3], robot: Sequence[Rigid3]) -> tuple[Rigid3, Ri
     return Rigid3(Rx, translations[:3]), Rigid3(Rz, translations[3:])
 
 
-def _refuse_inverse(problem: _AllCorners, seen: Sequence[Rigid3], cost: float) -> None:
+def _refuse_inverse(problem: _PosesOfBoards, state: State) -> None:
     """Raise InputError where the inverses of the robot's poses fit far better."""
-    other = _AllCorners(problem.camera, problem.views, [pose.inverse() for pose in problem.robot])
-    start = _linear(seen, other.robot)
-    found = minimise(start, other.at, _moved, HAND_EYE_DAMPING, HAND_EYE_STOP)
+    other = replace(problem, robot=[pose.inverse() for pose in problem.robot])
+    found = minimise(_linear(other.seen, other.robot), other.at, _moved, HAND_EYE_DAMPING, HAND_EYE_STOP)
+    cost = problem.at(state).cost
     if np.isfinite(found.problem.cost) and found.problem.cost * INVERSE_FITS_BETTER**2 < cost:
         raise InputError(
             "hand-eye: the inverse robot poses fit far better: either --inverse (the poses are hand_from_base) or "
@@ -242,19 +342,16 @@ def _refuse_inverse(problem: _AllCorners, seen: Sequence[Rigid3], cost: float) -
         )
 
 
-def _by_image(problem: DenseProblem, image: IntArray) -> Clustered:
-    """Return the covariance (12, 12) of the solution with images as independent units: an error of the robot's pose
-    shifts all corners of an image. Infinite where an unknown is undetermined."""
-    count = int(image.max()) + 1
-    rows, residual = problem.jacobian.reshape(-1, 2, UNKNOWNS), problem.residual.reshape(-1, 2)
-    information, score = np.zeros((count, UNKNOWNS, UNKNOWNS)), np.zeros((count, UNKNOWNS))
-    np.add.at(information, image, np.einsum("nka,nkb->nab", rows, rows))
-    np.add.at(score, image, np.einsum("nka,nk->na", rows, residual))
+def _by_image(problem: _PosesOfBoards, state: State) -> Clustered:
+    """Return the covariance (12, 12) of the solution with images as independent units. Infinite where an unknown is
+    undetermined."""
+    here = problem.at(state)
+    rows, residual = here.jacobian.reshape(-1, 6, UNKNOWNS), here.residual.reshape(-1, 6)
+    information, score = np.einsum("nka,nkb->nab", rows, rows), np.einsum("nka,nk->na", rows, residual)
     total = information.sum(axis=0)
     scale = root_diagonal(total)
     scaled = total / np.outer(scale, scale)
     if not np.linalg.eigvalsh(scaled)[0] > OPEN_PART:
         return Clustered(np.diag(np.full(UNKNOWNS, np.inf)), 1.0, float("inf"))
     unit = np.linalg.inv(scaled) / np.outer(scale, scale)
-    sigma = float(np.sqrt((residual**2).sum() / max(residual.size - UNKNOWNS, 1)))
-    return clustered_covariance(unit, information, score, np.zeros_like(total), sigma)
+    return clustered_covariance(unit, information, score, np.zeros_like(total), 1.0)

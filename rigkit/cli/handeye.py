@@ -53,6 +53,10 @@ def run(args: argparse.Namespace) -> int:
         f"{np.degrees(np.median(result.rotation_residuals_rad)):.3f} deg between the board's pose in the image and by "
         "the robot"
     )
+    print(
+        f"the robot's poses err by {result.robot_move_mm:.2f} mm along and {np.degrees(result.robot_turn_rad):.3f} deg "
+        "about each axis, as the scatter shows"
+    )
     for image, mismatch in result.left_out.items():
         print(f"left out: '{image}' rotated differently from the robot, by {np.degrees(mismatch):.1f} degrees")
     return code

@@ -210,6 +210,8 @@ HAND_EYE_FILE = file(
         "hand_from_board?": described(_ROBOT_POSE, "with it"),
         "covariance": described(matrix(), "of both poses (rad, mm), twelve by twelve"),
         "freedom?": described(nullable(NUMBER), "degrees of freedom of the covariance (Student's t); null: infinite"),
+        "robot_sigma_deg?": described(NUMBER, "rotations of the robot's poses, about each axis, by the scatter, deg"),
+        "robot_sigma_mm?": described(NUMBER, "their translations, along each axis, mm"),
         "rms_px": NUMBER,
         "image_rms_px?": described(table(NUMBER), "by image"),
         "median_apart_mm?": described(

@@ -130,7 +130,7 @@ def calibrate_hand_eye(
             raise InputError(f"no image of {len(paths)} shows board '{board.board_id}': {unreadable[0]}")
         raise CheckFailed(f"no image of {len(paths)} shows board '{board.board_id}'; check the board's file")
     with about(poses):
-        result = hand_eye(far_camera(camera), views, stands)
+        result = hand_eye(far_camera(camera), views, stands, board_on_hand=options.board_on_hand)
     if options.output is not None:
         write_atomic(options.output, hand_eye_text(result, options), force=options.force)
     return HandEyeCalibration(result, tuple(unreadable))
@@ -265,6 +265,8 @@ def hand_eye_text(result: HandEye, options: HandEyeOptions) -> str:
         second: result.stand_from_board.matrix()[:3].tolist(),
         "covariance": result.covariance.tolist(),
         "freedom": result.freedom,
+        "robot_sigma_deg": float(np.degrees(result.robot_turn_rad)),
+        "robot_sigma_mm": result.robot_move_mm,
         "rms_px": result.rms_px,
         "image_rms_px": result.image_rms_px,
         "median_apart_mm": float(np.median(result.translation_residuals_mm)),
