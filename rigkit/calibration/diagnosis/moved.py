@@ -12,7 +12,8 @@ separates more clearly than all of those is of two lenses.
 
 Two cameras on one mount see each board in two poses with always the same motion in between. In images of one camera no
 motion between poses occurs twice, unless the board was moved by equal steps: then an image is the end of one step and
-the start of the next, or there are other motions that occur as often. Images in which the board hardly moved are one.
+the start of the next, or there are other motions that occur as often. Boards that only turn about a point, as a robot's
+do at each of two places, must need two lenses as well. Images in which the board hardly moved are one.
 """
 
 from __future__ import annotations
@@ -231,7 +232,8 @@ class _Splits:
         significant and larger than for splits by the boards' places and by `other_causes` (N,) (`against`: see
         `AGAINST_PLACE`). Where it is a split by place itself, it is compared with a lens that differs in proportion to
         the place."""
-        apart = self._solved_apart(second)
+        parts = [np.flatnonzero(second[self.number] == side) for side in (False, True)]
+        apart = _solved_apart(self.observations, self.fit, self.state, parts)
         if not apart.sigmas > MIN_HALF_SIGMAS:
             return None
         count = np.bincount(self.number)
@@ -251,23 +253,23 @@ class _Splits:
                 return None
         return apart
 
-    def _solved_apart(self, second: BoolArray) -> _Difference:
-        """Return the lenses of two sets of images solved for separately. In standard deviations their difference is
-        estimated from the decrease of the cost: for one lens that is sigma^2 for each parameter."""
-        whole, split, count, cameras = 0.0, 0.0, 0, list[Camera]()
-        of_views = second[self.number]
-        for chosen in (np.flatnonzero(~of_views), np.flatnonzero(of_views)):
-            part, start = self.observations.subset(chosen), self.state.subset(chosen)
-            weight = np.where(self.fit.kept[chosen], part.weight, 0.0)
-            own = solve(part, start, weight=weight, prior_sigma_px=self.fit.sigma_px, cost_tolerance=FROM_OPTIMUM).state
-            whole += float(weighted_squares(start, part, weight).sum())
-            split += float(weighted_squares(own, part, weight).sum())
-            count += 2 * int(self.fit.kept[chosen].sum()) - 6 * len(chosen)
-            cameras.append(own.camera)
-        p = self.state.camera.parameters.size
-        variance = split / max(count - 2 * p, 1)
-        sigmas = float(np.sqrt(max(whole - split, 0.0) / (p * variance))) if variance > 0.0 else 0.0
-        return _Difference((cameras[0], cameras[1]), sigmas)
+
+def _solved_apart(observations: Observations, fit: Fit, state: State, parts: Sequence[IntArray]) -> _Difference:
+    """Return the lenses of two parts of the views, solved for separately; their difference, in standard deviations, by
+    the decrease of the cost: for one lens sigma^2 for each parameter."""
+    whole, split, count, cameras = 0.0, 0.0, 0, list[Camera]()
+    for chosen in parts:
+        part, start = observations.subset(chosen), state.subset(chosen)
+        weight = np.where(fit.kept[chosen], part.weight, 0.0)
+        own = solve(part, start, weight=weight, prior_sigma_px=fit.sigma_px, cost_tolerance=FROM_OPTIMUM).state
+        whole += float(weighted_squares(start, part, weight).sum())
+        split += float(weighted_squares(own, part, weight).sum())
+        count += 2 * int(fit.kept[chosen].sum()) - 6 * len(chosen)
+        cameras.append(own.camera)
+    p = state.camera.parameters.size
+    variance = split / max(count - 2 * p, 1)
+    sigmas = float(np.sqrt(max(whole - split, 0.0) / (p * variance))) if variance > 0.0 else 0.0
+    return _Difference((cameras[0], cameras[1]), sigmas)
 
 
 def moment(order: Sequence[str], some: Collection[str]) -> str:
@@ -298,7 +300,9 @@ def _places(observations: Observations, state: State) -> FloatArray:
     return np.stack([*pixels.T, off, np.linalg.norm(points, axis=1), *state.rotation[:, :2, 2].T])
 
 
-def two_cameras(calibration: Calibration, number: IntArray) -> Iterator[Finding]:
+def two_cameras(
+    calibration: Calibration, number: IntArray, solved: tuple[Observations, Fit] | None = None
+) -> Iterator[Finding]:
     """Yield a finding if the images are of two synchronous cameras; `number` (V,) are the `cluster_numbers` of the
     views' images."""
     images = [view.image for view in calibration.views]
@@ -319,6 +323,9 @@ def two_cameras(calibration: Calibration, number: IntArray) -> Iterator[Finding]
     chained = places(start[np.isin(number[start], number[end])])
     if enough and chained <= MAX_SHARE_CHAINED * together and others <= MAX_SHARE_OTHER:
         of_one = list(dict.fromkeys(images[k] for k in sorted(one[start].tolist())))
+        turned = _about_one_point(rotation[start], centre[start])
+        if turned and solved is not None and not _of_two_lenses(*solved, of_one, {images[k] for k in one[end]}):
+            return
         yield Finding.bad(
             f"images of two cameras are mixed: the board moves in the same way between '{images[one[start[0]]]}' and "
             f"'{images[one[end[0]]]}' and in {len(of_one) - 1} other pairs of images, as in stereo pairs, of which one "
@@ -326,6 +333,19 @@ def two_cameras(calibration: Calibration, number: IntArray) -> Iterator[Finding]
             "calibrate each camera from its own images, or both as a rig with [[cameras]]; leave out images "
             "that a program made from others",
         )
+
+
+def _about_one_point(rotation: FloatArray, centre: FloatArray) -> bool:
+    """Return whether boards with these poses (N, 3, 3) and (N, 3) mm turn about one of their points."""
+    rows = np.concatenate([rotation, np.broadcast_to(-np.eye(3), rotation.shape)], axis=2).reshape(-1, 6)
+    off = rows @ np.linalg.lstsq(rows, -centre.ravel())[0] + centre.ravel()
+    return float(np.sqrt(np.mean(off**2))) < SAME_MOTION * float(np.linalg.norm(centre, axis=1).mean())
+
+
+def _of_two_lenses(observations: Observations, fit: Fit, first: Collection[str], second: Collection[str]) -> bool:
+    """Return whether the lenses of two sets of images differ."""
+    parts = [np.flatnonzero(np.isin(observations.images, list(names))) for names in (first, second)]
+    return _solved_apart(observations, fit, fit.state.with_boards_held(), parts).sigmas > MIN_HALF_SIGMAS
 
 
 def _partners(

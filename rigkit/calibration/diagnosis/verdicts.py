@@ -152,7 +152,7 @@ def _residuals(
     solved: tuple[Observations, Fit] | None,
 ) -> tuple[list[Finding], list[Finding]]:
     """Return findings on two cameras mixed, and on other causes of the residuals."""
-    if mixed := list(two_cameras(c, c.clusters)):
+    if mixed := list(two_cameras(c, c.clusters, solved)):
         return mixed, []
     # If the lens changed at some image, the residuals of a common lens are no evidence for another change.
     but = CHANGES if worst(also) is Severity.BAD else ()

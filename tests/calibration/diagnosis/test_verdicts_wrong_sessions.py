@@ -79,6 +79,23 @@ def test_a_robot_or_a_board_held_still_is_one_camera(rng: np.random.Generator) -
         assert len(result.views) == len(centre) and "mixed" not in str(result.verdicts)
 
 
+@pytest.mark.parametrize("zoom", [0.0, 0.05], ids=["one camera", "two cameras"])
+def test_two_places_with_equal_tilts_are_of_two_cameras_only_with_two_lenses(
+    zoom: float, rng: np.random.Generator
+) -> None:
+    """Tilts about a point beside the board, as a robot's hand turns it."""
+    tilts = exp_so3(np.array([[0.0, 0.1, 0.0], [0.4, 0.2, 0.0], [-0.3, 0.3, 0.5]]))
+    middle = tilts @ np.array([60.0, -80.0, 100.0]) - tilts @ BOARD.points().mean(axis=0)
+    one, other = lens("reg"), lens("reg")
+    other = other.with_parameters(np.asarray(other.parameters) * np.array([*[1.0 + zoom] * 2, *[1.0] * 7]))
+    views = []
+    for name, camera, place in (("a", one, [-80.0, 0.0, 700.0]), ("b", other, [90.0, 40.0, 750.0])):
+        views += prefixed(seen(camera, tilts, middle + np.array(place), rng), name)
+    assert len(views) == 6
+    found = str(calibrate(views, SIZE, model="brown", board="flat", folds=0).verdicts)
+    assert ("mixed" in found) == (zoom > 0.0)
+
+
 @pytest.mark.parametrize("count", [7, 40])
 def test_boards_parallel_to_each_other(count: int, rng: np.random.Generator) -> None:
     """Said before seven images in place of eight."""
