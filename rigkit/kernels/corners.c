@@ -106,7 +106,8 @@ int64_t mark_known(const double *fresh, int64_t count, const double *known, int6
     int32_t *scratch = malloc((size_t)SQUARES_MEMORY(known_count) * sizeof(int32_t));
     if (!scratch)
         return 0;
-    fill_squares(known, known_count, reach, scratch, &squares);
+    /* Squares of less than a pixel gain nothing, and sides must be positive. */
+    fill_squares(known, known_count, reach > 1.0 ? reach : 1.0, scratch, &squares);
     for (int64_t i = 0; i < count; i++) {
         const double u = fresh[2 * i], v = fresh[2 * i + 1];
         const int64_t left = square_at(u - reach, squares.left, squares.side, squares.columns);

@@ -74,6 +74,13 @@ def test_levels(name: str, depth: type, in_numpy: Callable[..., list[Level]]) ->
         assert (ours.scale, ours.offset) == (theirs.scale, theirs.offset)
 
 
+@pytest.mark.parametrize("reach", [0.0, 0.3, 5.0, 1e4])
+def test_near_any(reach: float, rng: np.random.Generator) -> None:
+    known = rng.uniform(0.0, 500.0, (200, 2))
+    fresh = np.concatenate([known[::9], rng.uniform(-50.0, 550.0, (300, 2))])
+    assert np.array_equal(front.near_any(fresh, known, reach), reference.near_any(fresh, known, reach))
+
+
 @pytest.mark.parametrize("depth", [np.uint8, np.float32])
 @pytest.mark.parametrize("factor", [2, 4, 8])
 def test_shrinking(factor: int, depth: type, rng: np.random.Generator, in_numpy: Callable[..., np.ndarray]) -> None:
