@@ -50,8 +50,7 @@ static int make_sums(const plane_grid_t *g, sums_t *out)
             /* Column j of W F, and of the upper triangle of F'W F. */
             double Wf[3];
             for (int64_t i = 0; i < 3; i++)
-                at[(TERM_WF + 3 * i + j) * out->size] = Wf[i] =
-                    W[3 * i] * F[j] + W[3 * i + 1] * F[3 + j] + W[3 * i + 2] * F[6 + j];
+                at[(TERM_WF + 3 * i + j) * out->size] = Wf[i] = W[3 * i] * F[j] + W[3 * i + 1] * F[3 + j] + W[3 * i + 2] * F[6 + j];
             for (int64_t i = 0; i <= j; i++)
                 at[(TERM_N + i * (5 - i) / 2 + j) * out->size] = F[i] * Wf[0] + F[3 + i] * Wf[1] + F[6 + i] * Wf[2];
             at[(TERM_B + j) * out->size] = F[j] * Wz[0] + F[3 + j] * Wz[1] + F[6 + j] * Wz[2];
@@ -181,8 +180,8 @@ INLINE void add_bends(
         }
         /* The columns of W Q. */
         const double first[3] = {W[XX] * q[0] + W[XY] * dx, W[XY] * q[0] + W[YY] * dx, W[XZ] * q[0] + W[YZ] * dx};
-        const double second[3] = {W[XX] * q[1] + W[XY] * dy + W[XZ] * dx, W[XY] * q[1] + W[YY] * dy + W[YZ] * dx,
-                                  W[XZ] * q[1] + W[YZ] * dy + W[ZZ] * dx};
+        const double second[3] = {
+            W[XX] * q[1] + W[XY] * dy + W[XZ] * dx, W[XY] * q[1] + W[YY] * dy + W[YZ] * dx, W[XZ] * q[1] + W[YZ] * dy + W[ZZ] * dx};
         const double third[3] = {W[XX] * q[2] + W[XZ] * dy, W[XY] * q[2] + W[YZ] * dy, W[XZ] * q[2] + W[ZZ] * dy};
         bends->own[XX][l] += weight * (q[0] * first[0] + dx * first[1]);
         bends->own[XY][l] += weight * (q[0] * second[0] + dx * second[1]);
