@@ -62,8 +62,8 @@ def test_identify_and_handeye(capsys: pytest.CaptureFixture[str], monkeypatch: p
     assert "5 x 4" in printed.out and "seen in 2 of 2" in printed.out and "pairs/bad.png" in printed.err
     assert main(["board", "identify", "pairs", "-o", "image.png"]) == 2 and "--square-mm" in capsys.readouterr().err
 
-    def solved(camera: object, views: list[object], stands: list[object]) -> HandEye:
-        assert len(views) == 2
+    def solved(camera: object, views: list[object], stands: list[object], *, board_on_hand: bool) -> HandEye:
+        assert len(views) == 2 and not board_on_hand
         return HandEye.__new__(HandEye)
 
     monkeypatch.setattr("rigkit.workflows.handeye.hand_eye", solved)

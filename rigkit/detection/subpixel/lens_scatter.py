@@ -10,7 +10,7 @@ from rigkit.optim.damping import Damping, Stop
 
 PARAMETERS = 13
 """Homography to the directions of rays (8), principal point (2), focal length, two terms of the angle's series."""
-STARTS = 0.6, 1.5
+FOCAL_STARTS = 0.6, 1.5
 """Focal lengths, in half extents of the board's image, from which the fit starts: most of 180 degrees, and a fifth."""
 STEP = 1e-6
 """Change of a parameter for derivatives; parameters are of order 1."""
@@ -33,8 +33,8 @@ def lens_scatter(pixels: FloatArray, sigma_px: FloatArray) -> float:
     extent = float(np.abs(seen).max())
     seen, weight = seen / extent, extent / sigma_px[known][:, None]
     flat = np.linalg.lstsq(np.c_[grid, np.ones(len(grid))], seen, rcond=None)[0][:2].T
-    start = np.zeros((len(STARTS), PARAMETERS))
-    for own, focal in zip(start, STARTS, strict=True):
+    start = np.zeros((len(FOCAL_STARTS), PARAMETERS))
+    for own, focal in zip(start, FOCAL_STARTS, strict=True):
         own[[0, 1, 3, 4]], own[10] = flat.ravel() / focal, np.log(focal)
 
     def residuals(state: FloatArray) -> FloatArray:

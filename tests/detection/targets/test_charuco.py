@@ -138,24 +138,6 @@ def test_corners_are_added_between_markers_that_are_read_and_under_no_cover(rng:
     assert np.nanmax(np.linalg.norm(grown - truth, axis=2)) < 2.0
 
 
-@pytest.mark.parametrize("declared", [Charuco("DICT_5X5_100", 21.0, legacy=True), Charuco("DICT_6X6_100", 21.0)])
-def test_squares_of_another_board_name_none(declared: Charuco, rng: np.random.Generator) -> None:
-    board = replace(BOARD, rows=5)
-    image = one_board(rng, board=board, max_tilt_deg=20.0).render(supersample=2, noise_levels=2.0, rng=rng)
-    assert not any(item.board_id for item in detect_boards(image, [replace(board, pattern=declared)]))
-
-
-@pytest.mark.parametrize("columns", [7, 10, 11])
-def test_markers_of_a_board_with_other_columns_name_none(columns: int) -> None:
-    """The rows of markers agree one by one, each shifted further: up to 35 corners had wrong places."""
-    rng = np.random.default_rng(1)
-    board = replace(BOARD, pattern=Charuco("DICT_5X5_250", 21.0))
-    image = one_board(rng, board=board, square_px=24.0, max_tilt_deg=20.0).render(
-        supersample=2, noise_levels=2.0, rng=rng
-    )
-    assert not any(item.board_id for item in detect_boards(image, [replace(board, columns=columns)]))
-
-
 def test_parts_of_boards_alike_are_not_taken_for_one() -> None:
     """Each is cut by the frame, so that each lacks what the other shows."""
     camera = bench_camera("regular")
@@ -185,22 +167,6 @@ def test_two_boards_of_one_size_are_told_apart_by_their_markers(rng: np.random.G
     assert set(found) == set(names)
     for truth in scene.truth():
         assert np.abs(errors_by_place(found[truth.board_id], truth)).max() < 0.2
-
-
-def test_declared_as_a_chessboard_it_is_read_as_one(rng: np.random.Generator) -> None:
-    scene = one_board(rng, board=BOARD)
-    image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
-    (found,) = detect_boards(image, [Board("plain", 9, 6, 30.0, 30.0)])
-    assert (found.board_id, found.complete) == ("plain", True)
-    truth = scene.truth()[0]
-    off = [np.abs(errors_by_place(found, t)).max() for t in (truth, truth.turned(2))]
-    assert min(off) < 0.2
-
-
-def test_a_chessboard_is_no_charuco_board(rng: np.random.Generator) -> None:
-    scene = one_board(rng, board=Board("plain", 9, 6, 30.0, 30.0))
-    (found,) = detect_boards(scene.render(supersample=2, noise_levels=2.0, rng=rng), [BOARD])
-    assert found.board_id is None
 
 
 @pytest.mark.parametrize(
