@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -141,11 +141,11 @@ class Video:
 
 
 def read_timestamps(path: Path, cameras: Mapping[str, int]) -> dict[int, Mapping[str, int]]:
-    """Return moment -> camera -> frame number in the camera's video, from a CSV file with the columns TIMESTAMPS.
+    """Return moment -> camera -> frame number in the camera's video, from 0, from a CSV file with the columns
+    TIMESTAMPS.
 
     `cameras` : number of frames of each camera's video, 0 if unknown. `cam_id` is one of these cameras, or the number
-    at its end. Frame numbers that exceed a video start at the first one that the camera has in the file, because
-    recorders also count frames before the recording.
+    at its end.
 
     Raises InputError: a column is missing, a field is no integer, or a camera has no rows.
     """
@@ -164,13 +164,41 @@ def read_timestamps(path: Path, cameras: Mapping[str, int]) -> dict[int, Mapping
             ) from error
         if camera is not None:
             moments.setdefault(moment, {})[camera] = frame
-    for camera, count in cameras.items():
-        own = [frames[camera] for frames in moments.values() if camera in frames]
+    numbers = {c: sorted({frames[c] for frames in moments.values() if c in frames}) for c in cameras}
+    for camera, own in numbers.items():
         if not own:
             raise InputError(
                 f"'{path}' has no rows of camera '{camera}'; its cam_id must be the number at the end of its name"
             )
-        for frames in moments.values():
-            if camera in frames and max(own) >= count:
-                frames[camera] -= min(own)
-    return {moment: moments[moment] for moment in sorted(moments)}
+    places = _places_in_videos(path, numbers, cameras)
+    return {moment: {c: places[c][k] for c, k in moments[moment].items()} for moment in sorted(moments)}
+
+
+def _places_in_videos(
+    path: Path, numbers: Mapping[str, Sequence[int]], counts: Mapping[str, int]
+) -> dict[str, dict[int, int]]:
+    """Return camera -> number in the file -> number in the video, from the sorted numbers and the videos' counts.
+
+    Numbers are those in the video unless they exceed it. By one, where no camera has a 0: they count from 1. By more:
+    recorders count from before the recording, so that the first number is the video's first frame, of all cameras if
+    none has a 0. As many numbers as frames are these frames: dropped ones leave gaps in the numbers only.
+    """
+    over = {camera: own[-1] + 1 - counts[camera] for camera, own in numbers.items()}
+    without_zero, most = min(own[0] for own in numbers.values()) > 0, max(over.values())
+    places: dict[str, dict[int, int]] = {}
+    for camera, own in numbers.items():
+        first = own[0] if over[camera] > 0 or (without_zero and most > 0) else 0
+        if without_zero and most == 1:
+            first = 1
+        each = len(own) == counts[camera]
+        places[camera] = {number: k if each else number - first for k, number in enumerate(own)}
+        if not each and 0 < counts[camera] <= own[-1] - first:
+            _log.warning(
+                "'%s': camera '%s' has numbers of %d frames, its video %d; if this was cut from a longer one, frames "
+                "are not of one moment: number them as in the video, from 0",
+                path,
+                camera,
+                own[-1] - first + 1,
+                counts[camera],
+            )
+    return places

@@ -77,14 +77,39 @@ def test_hidden_files_of_a_folder_are_no_videos_and_no_images(tmp_path: Path) ->
     assert videos_inside(tmp_path) == [tmp_path]
 
 
-def test_timestamps_count_from_the_first_frame_of_each_camera(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("numbers", "counts", "places"),
+    [
+        ([[26, 27, 29], [30, 31, 32]], [4, 3], [[0, 1, 3], [0, 1, 2]]),  # a recorder counts before the recording
+        ([[26, 27, 29], [30, 31, 32]], [0, 0], [[0, 1, 3], [0, 1, 2]]),
+        ([[26, 27, 29], [30, 31, 32]], [30, 33], [[26, 27, 29], [30, 31, 32]]),  # numbers in the videos
+        ([[0, 1, 2], [5, 6, 7]], [3, 8], [[0, 1, 2], [5, 6, 7]]),
+        ([[0, 1, 2], [5, 6, 7]], [2, 9], [[0, 1, 2], [5, 6, 7]]),  # the first video is cut off
+        ([[1, 2, 3], [6, 7, 8]], [3, 8], [[0, 1, 2], [5, 6, 7]]),  # from 1
+        ([[26, 27, 28], [26, 27]], [3, 40], [[0, 1, 2], [0, 1]]),  # few frames of the second have a partner
+        ([[26, 29, 30], [26, 27, 30]], [3, 5], [[0, 1, 2], [0, 1, 4]]),  # dropped frames
+    ],
+)
+def test_numbers_of_timestamps_are_places_in_the_videos(
+    numbers: list[list[int]], counts: list[int], places: list[list[int]], tmp_path: Path
+) -> None:
     path = tmp_path / "timestamps.csv"
-    path.write_text("sync_index,cam_id,frame_index,frame_time\n7,0,26,1.0\n7,1,30,1.0\n8,1,31,1.1\n9,0,28,1.2\n")
-    moments = {7: {"cam_0": 0, "cam_1": 0}, 8: {"cam_1": 1}, 9: {"cam_0": 2}}
-    assert read_timestamps(path, {"cam_0": 0, "cam_1": 2}) == moments
-    # Those written by hand are the numbers in the video, which has more frames.
-    given = {7: {"cam_0": 26, "cam_1": 0}, 8: {"cam_1": 1}, 9: {"cam_0": 28}}
-    assert read_timestamps(path, {"cam_0": 29, "cam_1": 31}) == given
+    rows = [f"{k},{c},{number}\n" for c, own in enumerate(numbers) for k, number in enumerate(own)]
+    path.write_text("sync_index,cam_id,frame_index\n" + "".join(rows))
+    moments = read_timestamps(path, {f"cam_{c}": count for c, count in enumerate(counts)})
+    assert [[m[f"cam_{c}"] for m in moments.values() if f"cam_{c}" in m] for c in (0, 1)] == places
+
+
+def test_videos_cut_from_longer_ones_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "timestamps.csv"
+    path.write_text("sync_index,cam_id,frame_index\n7,0,500\n8,0,502\n9,0,700\n")
+    assert read_timestamps(path, {"cam_0": 100}) == {7: {"cam_0": 0}, 8: {"cam_0": 2}, 9: {"cam_0": 200}}
+    assert "camera 'cam_0' has numbers of 201 frames, its video 100" in caplog.text
+
+
+def test_timestamps_of_other_cameras_or_columns_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "timestamps.csv"
+    path.write_text("sync_index,cam_id,frame_index\n7,0,0\n")
     with pytest.raises(InputError, match="no rows of camera 'cam_4'"):
         read_timestamps(path, {"cam_0": 0, "cam_4": 0})
     path.write_text("time\n1\n")
