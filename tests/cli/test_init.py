@@ -17,7 +17,7 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibrations.calibration_file import load_calibration_or_camera
 from rigkit.io.manifests.manifest import load_dataset
-from rigkit.io.manifests.manifest_writer import ImageBoards, group_pairs
+from rigkit.io.manifests.manifest_writer import FoundPair, ImageBoards, group_pairs
 from rigkit.io.manifests.rig_session import load_rig_session
 from rigkit.io.manifests.session import load_session
 from rigkit.io.media.images import read_image
@@ -306,19 +306,54 @@ def test_impossible_angles_are_refused(declared: str, tmp_path: Path, capsys: py
 def test_pictures_of_results_are_no_pairs_and_paths_stay_as_typed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """One lacks a board; those of a folder have its name."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "seen").mkdir()
-    for side, number in (("left", 1), ("right", 2)):
+    for folder in ("seen", "first"):
+        (tmp_path / folder).mkdir()
+    for side, number, covered_px in (("left", 1, (800, 1240)), ("right", 2, (0, 0))):
         shutil.copy(IMAGES / "fisheye-general" / f"view{number}.jpg", f"{side}.jpg")
-        drawn = cv2.imread(f"{side}.jpg")
-        assert drawn is not None
+        shutil.copy(IMAGES / "fisheye-planar" / f"view{number}.jpg", f"first/view{number}.jpg")
+        drawn, other = cv2.imread(f"{side}.jpg"), cv2.imread(f"first/view{number}.jpg")
+        assert drawn is not None and other is not None
+        drawn[slice(*covered_px)] = 0
         cv2.imwrite(f"seen/{side}.png", cv2.circle(drawn, (40, 40), 20, (0, 0, 255), 2))
+        cv2.imwrite(f"seen/first_view{number}.png", other)
     options = ["--square-mm", "50", "--pose-type", "general", "--calibration", str(CALIBRATION)]
     assert main(["init", ".", *options]) == 0
     printed = capsys.readouterr()
     assert printed.out == "dataset.toml\n"
-    assert "left out: 'seen/left.png' and 'seen/right.png' show the boards where pair 'pair' does" in printed.err
-    assert [pair.pair_id for pair in load_dataset(tmp_path).pairs] == ["pair"]
+    for pictures, pair in (("left.png", "right.png"), "pair"), (("first_view1.png", "first_view2.png"), "first"):
+        words = " and ".join(f"'seen/{name}'" for name in pictures)
+        assert f"left out: {words} show the boards where pair '{pair}' does" in printed.err
+    assert [pair.pair_id for pair in load_dataset(tmp_path).pairs] == ["first", "pair"]
+
+
+BOTH = [((8, 6), (400.0, 380.0, 740.0, 730.0)), ((8, 6), (830.0, 380.0, 1170.0, 700.0))]
+
+
+@pytest.mark.parametrize(
+    ("image", "boards", "repeated"),
+    [
+        ("seen/a.png", BOTH, False),
+        ("seen/first_a.png", BOTH, True),
+        ("first/seen/a.png", BOTH, True),
+        ("first/seen/a.png", BOTH[1:], True),  # one is drawn over
+        ("first/seen/a.png", [((7, 6), (441.0, 381.0, 739.0, 731.0))], True),  # a column is
+        ("first/seen/a.png", [((8, 6), (441.0, 381.0, 739.0, 731.0))], False),  # farther away
+        ("first/seen/a.png", [((7, 6), (441.0, 381.0, 743.0, 731.0))], False),  # elsewhere
+        ("first/seen/a.png", [((9, 6), (440.0, 381.0, 739.0, 731.0))], False),  # of another kind
+        ("first/seen/a.png", [*BOTH, ((7, 6), (0.0, 0.0, 100.0, 100.0))], False),
+    ],
+)
+def test_pictures_of_results_show_boards_only_where_the_capture_does(
+    image: str, boards: list[tuple[tuple[int, int], tuple[float, ...]]], repeated: bool
+) -> None:
+    def pair(image: str, boards: list[tuple[tuple[int, int], tuple[float, ...]]]) -> FoundPair:
+        sizes, ends = zip(*boards, strict=True)
+        one = ImageBoards(Path(image), (1624, 1240), sizes, ends)
+        return FoundPair("p", one, one)
+
+    assert pair(image, boards).repeats(pair("first/a.jpg", BOTH)) == repeated
 
 
 def test_calibrations_of_other_programs_are_taken(tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ corners moves them. Boards of two captures are never all so near, in both images
 
 @dataclass(frozen=True, slots=True)
 class ImageBoards:
-    """The size of an image and of the complete boards found in it, and the (left, top, right, bottom) ends of all."""
+    """The size of an image and of the complete boards found in it, and the (left, top, right, bottom) ends of each."""
 
     image: Path
     size_px: tuple[int, int]
@@ -83,16 +83,27 @@ class FoundPair:
     second: ImageBoards
 
     def repeats(self, other: FoundPair) -> bool:
-        """Return whether both images are in deeper folders than those of `other`, and show boards only where these do:
-        pictures of results, or copies."""
-        return len(self.first.image.parts) > len(other.first.image.parts) and all(
-            mine.size_px == its.size_px and all(_is_among(ends, its.ends_px) for ends in mine.ends_px)
+        """Return whether both images are in deeper folders than those of `other`, or named after these and their
+        folders (`detect --overlay`), and show boards only where these do: pictures of results, or copies."""
+        return all(
+            (
+                len(mine.image.parts) > len(its.image.parts)
+                or mine.image.stem == f"{its.image.parent.name}_{its.image.stem}"
+            )
+            and mine.size_px == its.size_px
+            and all(_is_among(*board, its) for board in zip(mine.boards, mine.ends_px, strict=True))
             for mine, its in ((self.first, other.first), (self.second, other.second))
         )
 
 
-def _is_among(ends: Sequence[float], others: Sequence[Sequence[float]]) -> bool:
-    return any(max(abs(a - b) for a, b in zip(ends, one, strict=True)) < SAME_PLACE_PX for one in others)
+def _is_among(size: tuple[int, int], ends: Sequence[float], image: ImageBoards) -> bool:
+    """Return whether `image` shows the board, or a larger one, of which it lacks what was drawn over."""
+    for whole, others in zip(image.boards, image.ends_px, strict=True):
+        inside_px = np.multiply([1.0, 1.0, -1.0, -1.0], np.subtract(ends, others))
+        larger = whole[0] * whole[1] > size[0] * size[1]
+        if inside_px.min() > -SAME_PLACE_PX and (larger or inside_px.max() < SAME_PLACE_PX):
+            return True
+    return False
 
 
 def find_images(folder: Path) -> list[Path]:
@@ -113,10 +124,16 @@ def find_images(folder: Path) -> list[Path]:
 def image_boards(image: Path, size_px: tuple[int, int], detections: Sequence[BoardDetection]) -> ImageBoards:
     """Return what `detections` show: sizes (larger, smaller), the largest first, of boards that are complete or
     identified, and where they end."""
-    whole = [d for d in detections if d.complete or d.board_id is not None]
-    sizes = [(max(d.columns, d.rows), min(d.columns, d.rows)) for d in whole]
-    ends = [tuple(np.concatenate([d.pixels.min(axis=0), d.pixels.max(axis=0)]).tolist()) for d in whole]
-    return ImageBoards(image, size_px, tuple(sorted(sizes, reverse=True)), tuple(sorted(ends)))
+    found = [
+        (
+            (max(d.columns, d.rows), min(d.columns, d.rows)),
+            (*d.pixels.min(axis=0).tolist(), *d.pixels.max(axis=0).tolist()),
+        )
+        for d in detections
+        if d.complete or d.board_id is not None
+    ]
+    found.sort(reverse=True)
+    return ImageBoards(image, size_px, tuple(size for size, _ in found), tuple(ends for _, ends in found))
 
 
 def group_pairs(shown: Sequence[ImageBoards], root: Path) -> list[FoundPair]:

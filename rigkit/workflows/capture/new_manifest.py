@@ -64,8 +64,10 @@ def find_pairs(
         raise InputError(f"init: {what} is found in {counted(len(shown), 'image')}; {such}")
     pairs: list[FoundPair] = []
     repeated: list[tuple[FoundPair, FoundPair]] = []
-    # Captures are above the folders of their results.
-    for pair in sorted(group_pairs(shown, root), key=lambda one: len(one.first.image.parts)):
+    # Captures are above the folders of their results, whose names may have the captures' within them.
+    for pair in sorted(
+        group_pairs(shown, root), key=lambda one: (len(one.first.image.parts), len(one.first.image.stem))
+    ):
         before = next((one for one in pairs if pair.repeats(one)), None)
         if before is None:
             pairs.append(pair)
@@ -80,16 +82,14 @@ def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> Inpu
     Raises InputError if the file exists, unless `force`, or cannot be written, and for images of another size than the
     calibration of their camera.
     """
-    for pair in new.pairs:
-        for image, name in zip((pair.first, pair.second), new.cameras[pair.name], strict=True):
-            calibration = path.parent / new.calibrations[name]
-            if calibration.is_file():
-                require_size(
-                    image.size_px,
-                    f"image '{image.image}'",
-                    load_camera_or_calibration(calibration)[0].size_px,
-                    calibration,
-                )
+    for name, file in new.calibrations.items():
+        calibration = path.parent / file
+        if calibration.is_file():
+            size_px = load_camera_or_calibration(calibration)[0].size_px
+            for pair in new.pairs:
+                for image, own in zip((pair.first, pair.second), new.cameras[pair.name], strict=True):
+                    if own == name:
+                        require_size(image.size_px, f"image '{image.image}'", size_px, calibration)
     write_atomic(path, manifest_text(new, path.parent.resolve()), force=force)
     try:
         load_dataset(path)
