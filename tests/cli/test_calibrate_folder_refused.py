@@ -59,3 +59,6 @@ def test_a_file_without_suffix_that_exists_is_not_another_name(
     there.touch()
     assert main(["calibrate", str(pictures), "--board", "9x6x30", "-o", str(there)]) == 2
     assert f"'{there}' exists and is left as it is" in capsys.readouterr().err
+    # A board that cannot be is told first.
+    assert main(["calibrate", str(pictures), "--board", "9x6y30", "-o", str(there)]) == 2
+    assert "--board 9x6y30: write 9x6x25" in capsys.readouterr().err

@@ -42,7 +42,7 @@ from rigkit.geometry.rotation import angle_between, log_so3, unit
 from rigkit.io.manifests.rig_session import load_rig_session
 from rigkit.planning.candidates import board_poses_in_view
 from rigkit.planning.information import CornerError, SharedViews, median_motion, mount_error_px, mount_information
-from rigkit.workflows.capture.coach import open_coach
+from rigkit.workflows.capture.coach import _frames, open_coach
 from rigkit.workflows.options.coach import CoachOptions
 
 DRAWS = 120
@@ -151,6 +151,13 @@ def test_frames_of_several_cameras_are_kept_together(pairs: Sequence[list[np.nda
         again.look(pairs[0][:1])
     with pytest.raises(InputError, match="called alike"):
         open_coach(rig_options(tmp_path / "other", watch=(tmp_path / "a/left", tmp_path / "b/left")))
+
+
+def test_a_watched_folder_of_two_cameras_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for name in ("left01.png", "left02.png", "right01.png", "right02.png"):
+        (tmp_path / name).touch()
+    assert _frames(rig_options(tmp_path / "session", watch=(tmp_path,))) is not None
+    assert "of 2 cameras (left, right), and all are taken as one camera's" in caplog.text
 
 
 def test_two_images_come_in_one_upload(

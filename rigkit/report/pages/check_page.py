@@ -180,7 +180,11 @@ def check_table(check: CalibrationCheck) -> Table:
         rows.append(cells(change.hypothesis.words, f"{change.chance:.2g}", Cell(change.gain, best=named), amounts))
     none = cells("these images determine no change", "", None, "")
     heads = columns("if this alone changed | p-value of no such change | explains .1 | amount")
-    note = "Explains: by how much the weighted sum of squared errors falls with this change."
+    note = (
+        "Explains: by how much the weighted sum of squared errors falls with this change. Amounts, in this order: of a "
+        "lens the focal length, the principal point to the right and down, the distortion at the rim by the third, "
+        "fifth and seventh power of the radius; of a mount turns about, then shifts along x, y, z."
+    )
     return Table("causes", "Possible changes", heads, tuple(rows) or (none,), note)
 
 

@@ -118,6 +118,8 @@ def calibrate_folders(
     Raises InputError: no board given, no images, a file that cannot be written, and as `calibrate_session_file`;
     DegenerateError: the views do not determine a camera.
     """
+    for words in folder_options.boards:
+        board_of_words(words)  # refused before anything else is asked for
     folders = paths_of(folders)
     given = [inside for folder in folders for inside in videos_inside(folder)]
     videos = _videos_of(given, options.output)

@@ -39,6 +39,7 @@ from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.folder_session import session_of_future_images
 from rigkit.workflows.inputs.frames import moments_of_videos, numbers_of_moments, timestamps_next_to
+from rigkit.workflows.moments import warn_of_several_cameras
 from rigkit.workflows.options.cameras import Cache, CalibrateOptions
 from rigkit.workflows.options.coach import CoachOptions
 
@@ -233,5 +234,6 @@ def _frames(options: CoachOptions) -> Iterator[Frame] | None:
     if sum(bool(source) for source in (options.watch, options.video, options.device)) > 1:
         raise InputError("coach: frames come from one place: --watch, --video or --device")
     if options.watch:
+        warn_of_several_cameras(options.watch)
         return frames_of_folders(options.watch)
     return device_frames(options.device) if options.device else None
