@@ -328,7 +328,8 @@ def test_pictures_of_results_are_no_pairs_and_paths_stay_as_typed(
     assert [pair.pair_id for pair in load_dataset(tmp_path).pairs] == ["first", "pair"]
 
 
-BOTH = [((8, 6), (400.0, 380.0, 740.0, 730.0)), ((8, 6), (830.0, 380.0, 1170.0, 700.0))]
+Boards = list[tuple[tuple[int, int], tuple[float, ...]]]
+BOTH: Boards = [((8, 6), (400.0, 380.0, 740.0, 730.0)), ((8, 6), (830.0, 380.0, 1170.0, 700.0))]
 
 
 @pytest.mark.parametrize(
@@ -346,9 +347,9 @@ BOTH = [((8, 6), (400.0, 380.0, 740.0, 730.0)), ((8, 6), (830.0, 380.0, 1170.0, 
     ],
 )
 def test_pictures_of_results_show_boards_only_where_the_capture_does(
-    image: str, boards: list[tuple[tuple[int, int], tuple[float, ...]]], repeated: bool
+    image: str, boards: Boards, repeated: bool
 ) -> None:
-    def pair(image: str, boards: list[tuple[tuple[int, int], tuple[float, ...]]]) -> FoundPair:
+    def pair(image: str, boards: Boards) -> FoundPair:
         sizes, ends = zip(*boards, strict=True)
         one = ImageBoards(Path(image), (1624, 1240), sizes, ends)
         return FoundPair("p", one, one)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from detection_bench.scenes import one_board
@@ -10,7 +12,7 @@ from rigkit.core.boards import Board
 from rigkit.detection import lattices
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
-from rigkit.detection.new_corners import new_corners
+from rigkit.detection.new_corners import SAME_PX, new_corners, same_corner_px
 from rigkit.detection.searched_image import SearchedImage
 from rigkit.detection.subpixel.refined import RefinedLattice
 
@@ -40,6 +42,12 @@ def test_a_corner_in_a_hole_or_next_to_a_board_may_belong_to_it(cell: tuple[floa
     new, may_belong = new_corners([board_with_a_hole()], pixel)
     assert new.all()
     assert may_belong is belongs
+
+
+def test_the_same_corner_is_within_a_tenth_of_a_large_cell() -> None:
+    lattice = board_with_a_hole().lattice
+    assert same_corner_px(lattice) == SAME_PX
+    assert same_corner_px(replace(lattice, pixels=15.0 * lattice.pixels)) == pytest.approx(1.5 * STEP_PX)
 
 
 def test_a_whole_board_of_another_size_is_searched_for_once(

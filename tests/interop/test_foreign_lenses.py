@@ -145,14 +145,14 @@ def test_lenses_of_colmap_and_opencv_are_theirs(rng: np.random.Generator) -> Non
         theirs = pycolmap.Camera(model=kind, width=640, height=480, params=[*core, *terms])
         np.testing.assert_allclose(lens(rays)[0], theirs.img_from_cam(rays), atol=SAME_PX)
     d, K = np.array([-0.05, 0.01, 0.02, -0.03]), np.array([[250.0, 0.0, 320.0], [0.0, 251.0, 240.0], [0.0, 0.0, 1.0]])
+    still = np.zeros(3)
     for xi in (0.8, 1.2):
         pixels, seen = foreign_lenses.unified_brown_lens(core, xi, d)(rays)
-        still = np.zeros(3)
         np.testing.assert_allclose(
             pixels, cv2.omnidir.projectPoints(rays[None], still, still, K, xi, d[None])[0][0], atol=SAME_PX
         )
         assert seen.all()
-    prism, place, still = foreign_lenses.brown_prism_lens(core, np.array(PRISM)), rays / rays[:, 2:], np.zeros(3)
+    prism, place = foreign_lenses.brown_prism_lens(core, np.array(PRISM)), rays / rays[:, 2:]
     near = (rays[:, 2] > 0.7)[:, None]
     of_opencv = cv2.projectPoints(place, still, still, K, np.array(PRISM))[0][:, 0]
     np.testing.assert_allclose(np.where(near, prism(rays)[0], 0.0), np.where(near, of_opencv, 0.0), atol=SAME_PX)
