@@ -196,8 +196,8 @@ def describe_rig(rig: RigCalibration, checks: Sequence[Check]) -> str:
 
 
 def first_finding(camera: str, found: Sequence[Finding]) -> list[str]:
-    """Return the line of one camera of a rig: the rig is what counts, so its first finding, and how many more there
-    are."""
+    """Return the line of one camera of a rig, none without findings: of a rig only the first one counts, with the
+    number of the others."""
     bad = sum(finding.severity is Severity.BAD for finding in found[1:])
     more = f"; {counted(len(found) - 1, 'more finding')}{f' ({bad} bad)' if bad else ''} on the page (-r)"
     return [f"'{camera}' by itself: {finding}{more if len(found) > 1 else ''}" for finding in found[:1]]

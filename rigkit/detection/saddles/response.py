@@ -86,7 +86,9 @@ def grey_image(image: NDArray[np.generic]) -> GreyImage:
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[:, :, 0]
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (3, 4)):
-        raise InputError(f"image: expected (H, W) or (H, W, 3 or 4), got {array.shape}; pass what read_image returns")
+        raise InputError(
+            f"image: expected (H, W) or (H, W, 3 or 4), got {array.shape}; pass one image, as read_image returns it"
+        )
     if min(array.shape[:2]) < 16:
         raise InputError(
             f"image: {array.shape[1]}x{array.shape[0]} pixels are too few to hold a chessboard; give a whole picture"

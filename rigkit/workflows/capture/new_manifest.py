@@ -24,7 +24,7 @@ from rigkit.io.manifests.manifest_writer import (
     manifest_text,
 )
 from rigkit.io.media.images import read_image, require_size, to_grey
-from rigkit.workflows.inputs.camera_files import load_camera_or_calibration
+from rigkit.workflows.inputs.camera_files import camera_with_calibration
 from rigkit.workflows.inputs.identify_board import suggestion
 
 
@@ -85,7 +85,7 @@ def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> Inpu
     for name, file in new.calibrations.items():
         calibration = path.parent / file
         if calibration.is_file():
-            size_px = load_camera_or_calibration(calibration)[0].size_px
+            size_px = camera_with_calibration(calibration)[0].size_px
             for pair in new.pairs:
                 for image, own in zip((pair.first, pair.second), new.cameras[pair.name], strict=True):
                     if own == name:

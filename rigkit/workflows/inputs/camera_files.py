@@ -91,7 +91,7 @@ def camera_format(text: str) -> str | None:
     return "rigkit" if OURS.search(text) and found not in JSON_TOO else found
 
 
-def load_camera_or_calibration(path: str | Path) -> tuple[Camera, Calibration | None]:
+def camera_with_calibration(path: str | Path) -> tuple[Camera, Calibration | None]:
     """Return the camera of a file of rigkit or another tool, and the calibration if it is one; raises as
     `import_camera`."""
     calibration = calibration_of_file(path)

@@ -27,7 +27,7 @@ from rigkit.io.calibrations.calibration_file import calibration_text
 from rigkit.io.disk.reading import about
 from rigkit.io.manifests.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.workflows.calibration.calibrate import calibrate_camera
-from rigkit.workflows.inputs.camera_files import load_camera_or_calibration, warn_if_bad, warn_if_exact
+from rigkit.workflows.inputs.camera_files import camera_with_calibration, warn_if_bad, warn_if_exact
 from rigkit.workflows.options.clouds import DatasetOptions
 from rigkit.workflows.outputs.results import CALIBRATIONS, require_folder, write_results
 
@@ -143,7 +143,7 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool = False, progress: Progr
         try:
             if entry.calibration.is_file() and (name not in used or not recalibrate):
                 sources[name] = entry.calibration
-                known[name] = LoadedCamera(*load_camera_or_calibration(entry.calibration))
+                known[name] = LoadedCamera(*camera_with_calibration(entry.calibration))
                 whole = known[name].calibration
                 if name in used:
                     warn_if_bad(entry.calibration, () if whole is None else whole.verdicts)
