@@ -30,6 +30,7 @@ from rigkit.rectification.targets import target_camera
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_camera, import_pair, rig_of_file
 from rigkit.workflows.inputs.folder_session import cameras_in, images_of_camera
+from rigkit.workflows.inputs.frames import moments_beside
 from rigkit.workflows.moments import grouped_by_moment, warn_of_several_cameras
 from rigkit.workflows.options.base import FrameRule
 from rigkit.workflows.options.cameras import RectifyOptions
@@ -41,10 +42,11 @@ class _VideoFrame:
 
     video: Video
     number: int
+    moment: int
 
     @property
     def name(self) -> str:
-        return f"{self.number:06d}.png"
+        return f"{self.moment:06d}.png"
 
     def __str__(self) -> str:
         return f"{self.video.source}, frame {self.number}"
@@ -220,6 +222,11 @@ def _pairs(
         if is_video(one) != is_video(two) or Path(one).is_dir() != Path(two).is_dir():
             raise InputError(f"rectify: '{one}' and '{two}': give two images, two folders or two videos")
         own = [_sources(Path(image), stack) for image in images]
+        films = [[frame for frame in sources if isinstance(frame, _VideoFrame)] for sources in own]
+        counts = {Path(image): len(film) for image, film in zip(images, films, strict=True)}
+        timed = moments_beside(counts) if all(films) else None
+        if timed is not None:
+            return [[replace(film[at[k]], moment=moment) for moment, at in timed] for k, film in enumerate(films)], {}
         if len(own[0]) != len(own[1]):
             _log.warning(
                 f"rectify: '{one}' has {len(own[0])} frames and '{two}' {len(own[1])}: those of one number are paired"
@@ -246,7 +253,7 @@ def _sources(source: Path, stack: ExitStack) -> Sequence[Path | _VideoFrame]:
     if count == 0:
         raise InputError(f"rectify: no frame of video '{source}' can be decoded; convert it to MP4")
     opened = stack.enter_context(Video(source, colour=True))
-    return [_VideoFrame(opened, number) for number in range(count)]
+    return [_VideoFrame(opened, number, number) for number in range(count)]
 
 
 def _file(source: Path | _VideoFrame) -> Path:

@@ -370,6 +370,18 @@ def test_two_videos_frame_by_frame(tmp_path: Path, capsys: pytest.CaptureFixture
     )
     for name in poses:
         assert sorted(p.name for p in (tmp_path / "out" / name).iterdir()) == ["000000.png", "000001.png"]
+    # The right one began a frame later.
+    rows = "5,left,0\n6,left,1\n6,right,0\n7,left,2\n7,right,1\n"
+    (tmp_path / "timestamps.csv").write_text("sync_index,cam_id,frame_index\n" + rows)
+    assert main(["rectify", *both, "--rig", str(rig), "-o", str(tmp_path / "timed")]) == 0
+    for name, frame in (("left", 1), ("right", 0)):
+        timed = tmp_path / "timed" / name
+        assert sorted(p.name for p in timed.iterdir()) == ["000006.png", "000007.png"]
+        assert (timed / "000006.png").read_bytes() == (tmp_path / "out" / name / f"{frame:06d}.png").read_bytes()
+    (tmp_path / "timestamps.csv").write_text("sync_index,cam_id,frame_index\n5,left,0\n6,right,0\n")
+    assert main(["rectify", *both, "--rig", str(rig), "-o", str(tmp_path / "more")]) == 2
+    assert "no moment has a frame of every video, left and right" in capsys.readouterr().err
+    (tmp_path / "timestamps.csv").unlink()
     (tmp_path / "folder").mkdir()
     assert main(["rectify", both[0], str(tmp_path / "folder"), "--rig", str(rig), "-o", str(tmp_path / "more")]) == 2
     assert "two images, two folders or two videos" in capsys.readouterr().err

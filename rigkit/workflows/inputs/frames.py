@@ -61,6 +61,28 @@ def timestamps_next_to(sources: Sequence[Path]) -> Path | None:
     return path if len(sources) > 1 and path.is_file() else None
 
 
+def moments_beside(counts: Mapping[Path, int]) -> list[tuple[int, list[int]]] | None:
+    """Return the number and the frames, one of each video, of every moment of which all have a new frame, from the
+    timestamps.csv beside the videos; None without one. `counts` : their numbers of frames.
+
+    Raises InputError where there is no such moment, and as `read_timestamps`.
+    """
+    times = timestamps_next_to(list(counts))
+    if times is None:
+        return None
+    names, moments = [path.stem for path in counts], list[tuple[int, list[int]]]()
+    last = [-1] * len(names)
+    for moment, at in read_timestamps(times, dict(zip(names, counts.values(), strict=True))).items():
+        frames = [at.get(name, -1) for name in names]
+        # As in `_moments`: a recorder repeats the last frame where it has no new one.
+        if all(old < new < count for old, new, count in zip(last, frames, counts.values(), strict=True)):
+            moments.append((moment, frames))
+            last = frames
+    if not moments:
+        raise InputError(f"'{times}': no moment has a frame of every video, {' and '.join(names)}; correct it")
+    return moments
+
+
 def frames_of_videos(
     sources: Mapping[str, Path],
     folder: Path,
