@@ -12,21 +12,27 @@ least squares over all corners.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.solving.clustered import Clustered, clustered_covariance, effective_freedom, widening
+from rigkit.calibration.robot_noise import (
+    UNKNOWNS,
+    PosesOfBoards,
+    State,
+    covariance_by_image,
+    with_robot_noise,
+    wrong_pose,
+)
+from rigkit.calibration.solving.clustered import effective_freedom, widening
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
-from rigkit.core.arrays import FloatArray, root_diagonal, scaled_pinv
+from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import log_so3, nearest_rotation, rotation_angle, skew
-from rigkit.optim.damping import Damping, Stop
-from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
+from rigkit.geometry.rotation import nearest_rotation, rotation_angle, skew
 
 MIN_POSES = 3
 MAX_MISMATCH_RAD = np.radians(1.0)
@@ -34,18 +40,6 @@ MAX_MISMATCH_RAD = np.radians(1.0)
 MAX_SIGMA_OF_DISTANCE = 0.1
 """Largest standard deviation of a position, as a part of the boards' distance. Rotations about a single axis leave the
 position along it undetermined; with a second axis this limit decides."""
-OPEN_PART = 1e-12
-"""Relative eigenvalue of the information matrix up to which a direction is undetermined: rounding."""
-HAND_EYE_DAMPING = Damping(start=1e-4, ceiling=1e12)
-HAND_EYE_STOP = Stop(steps=60, predicted_gain=1e-14)
-UNKNOWNS = 12
-VARIANCE_ROUNDS = 60
-"""Estimates of the robot's noise, each with the poses at their optimum; variances that are zero only approach it."""
-VARIANCES_SETTLED = 1e-3
-"""Change of the variances, as a part of these or of those of poses as seen, that ends the estimates: a twentieth of
-what a thousand images would leave unknown."""
-LEAST_VARIANCE = 1e-9
-"""Robot noise of this part of the noise of boards' poses, as seen, is none, and stays above zero for rounding."""
 INVERSE_FITS_BETTER = 3.0
 """Robot poses are the wrong way round where their inverses fit so many times better."""
 
@@ -67,6 +61,8 @@ class HandEye:
     translation_residuals_mm, rotation_residuals_rad : (N,) for the images used, in their order: distance of the board's
         centre, and rotation angle, between the board's pose seen by the camera and that predicted from the robot.
     left_out : for each image left out, by how much (rad) its rotations differ from the robot's.
+    contradicting : for each image left out because the others contradict its robot pose, the rotation (rad) and the
+        translation (mm) of the hand that would explain it.
     """
 
     cam_from_mount: Rigid3
@@ -80,6 +76,7 @@ class HandEye:
     translation_residuals_mm: FloatArray
     rotation_residuals_rad: FloatArray
     left_out: dict[str, float]
+    contradicting: dict[str, tuple[float, float]]
 
     __repr__ = brief
 
@@ -111,19 +108,25 @@ def hand_eye(
     names, seen = [view.image for view in views], [_pose(camera, view) for view in views]
     mismatch = _mismatch(seen, mount_from_stand)
     use = np.flatnonzero(mismatch <= MAX_MISMATCH_RAD).tolist()
-    if len(use) < max(MIN_POSES, len(views) // 2 + 1):
+    fewest = max(MIN_POSES, len(views) // 2 + 1)
+    if len(use) < fewest:
         worst = float(np.degrees(np.median(mismatch)))
         raise InputError(
             f"hand-eye: rotations of camera and robot between images differ (by {worst:.1f} degrees, median); check "
             "that images and poses are in the same order, and the unit of the angles"
         )
     views, seen, robot = [views[i] for i in use], [seen[i] for i in use], [mount_from_stand[i] for i in use]
-    problem = _PosesOfBoards(seen, robot, _covariances_seen(camera, views, seen), board_on_hand)
-    state, problem = _with_robot_noise(_linear(seen, robot), problem)
+    problem = PosesOfBoards(seen, robot, _covariances_seen(camera, views, seen), board_on_hand)
+    state, problem = with_robot_noise(_linear(seen, robot), problem)
     _refuse_inverse(problem, state)
-    known = _by_image(problem, state)
+    left_out = {name: float(mismatch[i]) for i, name in enumerate(names) if i not in use}
+    contradicting = dict[str, tuple[float, float]]()
+    while len(views) > fewest and (wrong := wrong_pose(problem, state)) is not None:
+        worst, off, state, problem = wrong
+        contradicting[views.pop(worst).image] = off
+    known, seen = covariance_by_image(problem, state), list(problem.seen)
     _refuse_open(known.covariance, seen)
-    predicted = [state[0] @ arm @ state[1] for arm in robot]
+    predicted = [state[0] @ arm @ state[1] for arm in problem.robot]
     squares = [
         ((camera.project(pose.apply(view.points()))[0] - view.pixels) ** 2).sum(axis=1)
         for view, pose in zip(views, predicted, strict=True)
@@ -138,109 +141,16 @@ def hand_eye(
         # Each image measures six numbers: UNKNOWNS / 6 images determine the unknowns and say nothing about scatter; of
         # the others three each show one of the robot's two variances.
         freedom=min(
-            effective_freedom(min(known.freedom, len(use) - UNKNOWNS / 6), known.overdispersion, UNKNOWNS),
-            3.0 * (len(use) - UNKNOWNS / 6),
+            effective_freedom(min(known.freedom, len(views) - UNKNOWNS / 6), known.overdispersion, UNKNOWNS),
+            problem.freedom,
         ),
         rms_px=float(np.sqrt(np.concatenate(squares).mean())),
         image_rms_px={view.image: float(np.sqrt(own.mean())) for view, own in zip(views, squares, strict=True)},
         translation_residuals_mm=off_mm,
         rotation_residuals_rad=turned_rad,
-        left_out={name: float(mismatch[i]) for i, name in enumerate(names) if i not in use},
+        left_out=left_out,
+        contradicting=contradicting,
     )
-
-
-State = tuple[Rigid3, Rigid3]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _PosesOfBoards:
-    """The least-squares problem of the N poses of the boards in the two unknown poses.
-
-    Attributes
-    ----------
-    seen, robot : poses of the board in the camera, and mount_from_stand.
-    covariance : (N, 6, 6) of `seen`.
-    board_on_hand : whether the stand is the robot's hand.
-    variances : (2,) of the robot's rotations, rad^2, and translations, mm^2.
-    """
-
-    seen: Sequence[Rigid3]
-    robot: Sequence[Rigid3]
-    covariance: FloatArray
-    board_on_hand: bool
-    variances: FloatArray = field(default_factory=lambda: np.zeros(2))
-
-    def linearised(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the steps (N, 6) from the poses seen to those predicted, and their derivatives (N, 6, 12) by the
-        state, and (N, 6, 6) by a rotation and translation of the hand in its own frame."""
-        (cam_from_mount, stand_from_board), count = state, len(self.seen)
-        seen_turn, seen_move = _stacked(self.seen)
-        turn, move = _stacked(self.robot)
-        cam_from_stand = cam_from_mount.rotation @ turn
-        in_stand = cam_from_stand @ stand_from_board.translation_mm
-        in_mount = in_stand + move @ cam_from_mount.rotation.T
-        off = np.empty((count, 6))
-        off[:, :3] = log_so3(cam_from_stand @ stand_from_board.rotation @ np.swapaxes(seen_turn, 1, 2))
-        off[:, 3:] = in_mount + cam_from_mount.translation_mm - seen_move
-        by_state, by_hand = np.zeros((count, 6, UNKNOWNS)), np.zeros((count, 6, 6))
-        by_state[:, :3, :3] = by_state[:, 3:, 3:6] = np.eye(3)
-        by_state[:, 3:, :3] = -skew(in_mount)
-        # A step turns the board in the stand about its own origin.
-        by_state[:, :3, 6:9] = by_state[:, 3:, 9:] = cam_from_stand
-        frame, lever = (cam_from_stand, in_stand) if self.board_on_hand else (cam_from_mount.rotation, in_mount)
-        by_hand[:, :3, :3] = by_hand[:, 3:, 3:] = frame
-        by_hand[:, 3:, :3] = -skew(lever) @ frame
-        return off, by_state, by_hand
-
-    def whitening(self, by_hand: FloatArray) -> FloatArray:
-        """Return W (N, 6, 6) with W V W^T = 1 of the covariances V of the steps."""
-        robot = by_hand * np.repeat(self.variances, 3)
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance + robot @ np.swapaxes(by_hand, 1, 2))))
-
-    def at(self, state: State) -> DenseProblem:
-        """Return residuals in sigmas and their derivatives by (w, v) of either pose."""
-        off, by_state, by_hand = self.linearised(state)
-        white = self.whitening(by_hand)
-        return DenseProblem((white @ off[..., None]).ravel(), (white @ by_state).reshape(-1, UNKNOWNS))
-
-    def with_variances_from(self, state: State) -> _PosesOfBoards:
-        """Return the problem with better variances, by the scatter at its optimum."""
-        off, by_state, by_hand = self.linearised(state)
-        white = self.whitening(by_hand)
-        rows, residual, shown = white @ by_state, (white @ off[..., None])[..., 0], white @ by_hand
-        inverse = scaled_pinv(np.einsum("nka,nkb->ab", rows, rows), OPEN_PART)
-        variances = []
-        for part, before in zip((shown[..., :3], shown[..., 3:]), self.variances, strict=True):
-            scatter = float((np.einsum("nka,nk->na", part, residual) ** 2).sum())
-            used = np.einsum("nka,nkb->ab", rows, part @ np.einsum("nka,nkb->nab", part, rows))
-            expected = float((part**2).sum() - np.trace(inverse @ used))
-            variances.append(before * np.sqrt(scatter / max(expected, np.finfo(float).tiny)))
-        return replace(self, variances=np.maximum(variances, LEAST_VARIANCE * self.scale()))
-
-    def scale(self) -> FloatArray:
-        """Return the mean variances (2,) of rotations and translations of the poses seen."""
-        each = np.einsum("nii->ni", self.covariance)
-        return np.array([each[:, :3].mean(), each[:, 3:].mean()])
-
-
-def _stacked(poses: Sequence[Rigid3]) -> tuple[FloatArray, FloatArray]:
-    return np.stack([pose.rotation for pose in poses]), np.stack([pose.translation_mm for pose in poses])
-
-
-def _with_robot_noise(start: State, problem: _PosesOfBoards) -> tuple[State, _PosesOfBoards]:
-    """Return the refined poses, and the problem with the robot's noise."""
-    off = problem.linearised(start)[0]
-    problem = replace(problem, variances=np.array([np.mean(off[:, :3] ** 2), np.mean(off[:, 3:] ** 2)]))
-    problem = replace(problem, variances=np.maximum(problem.variances, problem.scale()))
-    state = start
-    for _ in range(VARIANCE_ROUNDS):
-        state = minimise(state, problem.at, _moved, HAND_EYE_DAMPING, HAND_EYE_STOP).state
-        before, problem = problem.variances, problem.with_variances_from(state)
-        if np.all(
-            np.abs(problem.variances - before) <= VARIANCES_SETTLED * np.maximum(problem.variances, problem.scale())
-        ):
-            break
-    return state, problem
 
 
 def _covariances_seen(camera: Camera, views: Sequence[BoardView], seen: Sequence[Rigid3]) -> FloatArray:
@@ -269,10 +179,6 @@ def _residuals(
         off_mm.append(np.linalg.norm(one.apply(middle) - other.apply(middle)))
         turned.append(one.rotation @ other.rotation.T)
     return np.array(off_mm), rotation_angle(np.array(turned))
-
-
-def _moved(state: tuple[Rigid3, Rigid3], step: DenseStep) -> tuple[Rigid3, Rigid3]:
-    return state[0].moved(step.change[:6]), state[1].moved(step.change[6:])
 
 
 def _pose(camera: Camera, view: BoardView) -> Rigid3:
@@ -330,28 +236,12 @@ def _linear(seen: Sequence[Rigid3], robot: Sequence[Rigid3]) -> tuple[Rigid3, Ri
     return Rigid3(Rx, translations[:3]), Rigid3(Rz, translations[3:])
 
 
-def _refuse_inverse(problem: _PosesOfBoards, state: State) -> None:
+def _refuse_inverse(problem: PosesOfBoards, state: State) -> None:
     """Raise InputError where the inverses of the robot's poses fit far better."""
     other = replace(problem, robot=[pose.inverse() for pose in problem.robot])
-    found = minimise(_linear(other.seen, other.robot), other.at, _moved, HAND_EYE_DAMPING, HAND_EYE_STOP)
-    cost = problem.at(state).cost
-    if np.isfinite(found.problem.cost) and found.problem.cost * INVERSE_FITS_BETTER**2 < cost:
+    found, cost = other.at(other.refined(_linear(other.seen, other.robot))).cost, problem.at(state).cost
+    if np.isfinite(found) and found * INVERSE_FITS_BETTER**2 < cost:
         raise InputError(
             "hand-eye: the inverse robot poses fit far better: either --inverse (the poses are hand_from_base) or "
             "--board-on-hand must change: give it, or leave it out if it is given"
         )
-
-
-def _by_image(problem: _PosesOfBoards, state: State) -> Clustered:
-    """Return the covariance (12, 12) of the solution with images as independent units. Infinite where an unknown is
-    undetermined."""
-    here = problem.at(state)
-    rows, residual = here.jacobian.reshape(-1, 6, UNKNOWNS), here.residual.reshape(-1, 6)
-    information, score = np.einsum("nka,nkb->nab", rows, rows), np.einsum("nka,nk->na", rows, residual)
-    total = information.sum(axis=0)
-    scale = root_diagonal(total)
-    scaled = total / np.outer(scale, scale)
-    if not np.linalg.eigvalsh(scaled)[0] > OPEN_PART:
-        return Clustered(np.diag(np.full(UNKNOWNS, np.inf)), 1.0, float("inf"))
-    unit = np.linalg.inv(scaled) / np.outer(scale, scale)
-    return clustered_covariance(unit, information, score, np.zeros_like(total), 1.0)

@@ -59,4 +59,9 @@ def run(args: argparse.Namespace) -> int:
     )
     for image, mismatch in result.left_out.items():
         print(f"left out: '{image}' rotated differently from the robot, by {np.degrees(mismatch):.1f} degrees")
+    for image, (turn, move) in result.contradicting.items():
+        print(
+            f"left out: the robot's pose of '{image}' is wrong by {move:.1f} mm and {np.degrees(turn):.2f} degrees, as "
+            "all other images have it"
+        )
     return code

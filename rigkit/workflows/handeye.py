@@ -272,5 +272,8 @@ def hand_eye_text(result: HandEye, options: HandEyeOptions) -> str:
         "median_apart_mm": float(np.median(result.translation_residuals_mm)),
         "median_apart_deg": float(np.degrees(np.median(result.rotation_residuals_rad))),
         "left_out_deg": {name: float(np.degrees(value)) for name, value in result.left_out.items()},
+        "contradicting": {
+            name: {"deg": float(np.degrees(turn)), "mm": move} for name, (turn, move) in result.contradicting.items()
+        },
     }
     return json_text(data)

@@ -116,6 +116,25 @@ def test_images_of_other_poses_are_left_out_and_named(rng: np.random.Generator) 
     assert np.abs(errors(result)[3:6]).max() < 2.0
 
 
+@pytest.mark.parametrize("board_on_hand", [False, True], ids=["camera", "board"])
+@pytest.mark.parametrize(("turn_rad", "move_mm"), [(0.0, 5.0), (8e-3, 0.0)], ids=["moved", "turned"])
+def test_a_wrong_robot_pose_is_left_out_and_named(
+    turn_rad: float, move_mm: float, board_on_hand: bool, rng: np.random.Generator
+) -> None:
+    views, reported = capture(rng, 8, board_on_hand=board_on_hand)
+    off = Rigid3(exp_so3(turn_rad * np.array([0.6, 0.8, 0.0])), move_mm * np.array([0.6, 0.0, 0.8]))
+    reported[2] = reported[2] @ off if board_on_hand else off @ reported[2]
+    result = hand_eye(lens("reg"), views, reported, board_on_hand=board_on_hand)
+    assert list(result.contradicting) == [views[2].image] and not result.left_out
+    assert len(result.image_rms_px) == len(result.translation_residuals_mm) == 7
+    turned, moved = result.contradicting[views[2].image]
+    # Its own noise, of up to three sigmas about and along each axis, and what the others leave unknown.
+    assert turned == pytest.approx(turn_rad, abs=1e-3) and moved == pytest.approx(move_mm, abs=0.7)
+    # The noise is that of the others, which 15 numbers show.
+    assert result.robot_turn_rad < 1.8 * ROBOT_TURN_RAD and result.robot_move_mm < 1.8 * ROBOT_MOVE_MM
+    assert np.abs(errors(result)[[3, 4, 5, 9, 10, 11]]).max() < 0.6
+
+
 def test_what_cannot_be_solved_is_said(rng: np.random.Generator) -> None:
     views, reported = capture(rng)
     with pytest.raises(InputError, match="same order"):
@@ -200,6 +219,10 @@ def test_from_rendered_images_on_the_command_line(tmp_path: Path, capsys: pytest
     assert np.linalg.norm(sigma) < 2.0
     assert main([*command, "--inverse"]) == 2
     assert "leave it out if it is given" in capsys.readouterr().err
+    name, x_mm, rest = rows[1].split(",", 2)
+    (tmp_path / "poses.csv").write_text("\n".join([rows[0], f"{name},{float(x_mm) + 9.0},{rest}", *rows[2:]]) + "\n")
+    assert main(command) == 0
+    assert f"the robot's pose of '{name}' is wrong by 9." in capsys.readouterr().out
     assert main(["pose", str(tmp_path / "images" / "0.png"), *known]) == 0
     assert "camera centre in the board's frame" in capsys.readouterr().out
     (tmp_path / "poses.csv").write_text("\n".join(rows[:-1]) + "\n")

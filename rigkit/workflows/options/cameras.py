@@ -164,7 +164,7 @@ class HandEyeOptions(WrittenFiles):
     ----------
     camera : the camera's calibration.
     board : the board, such as 9x6x25.
-    board_on_hand : the hand carries the board, the camera is fixed.
+    board_on_hand : the hand carries the board, the camera is fixed; the errors of the robot move what its hand carries.
     inverse : the poses are hand_from_base.
     output : write the result.
     """
