@@ -119,27 +119,31 @@ def hand_eye(
     problem = PosesOfBoards(seen, robot, _covariances_seen(camera, views, seen), board_on_hand)
     state, problem = with_robot_noise(_linear(seen, robot), problem)
     _refuse_inverse(problem, state)
-    left_out = {name: float(mismatch[i]) for i, name in enumerate(names) if i not in use}
     contradicting = dict[str, tuple[float, float]]()
     while len(views) > fewest and (wrong := wrong_pose(problem, state)) is not None:
         worst, off, state, problem = wrong
         contradicting[views.pop(worst).image] = off
-    known, seen = covariance_by_image(problem, state), list(problem.seen)
-    _refuse_open(known.covariance, seen)
+    left_out = {name: float(mismatch[i]) for i, name in enumerate(names) if i not in use}
+    return replace(_result(camera, views, problem, state), left_out=left_out, contradicting=contradicting)
+
+
+def _result(camera: Camera, views: Sequence[BoardView], problem: PosesOfBoards, state: State) -> HandEye:
+    """Return the calibration with these views; raises DegenerateError if they do not determine it."""
+    known = covariance_by_image(problem, state)
+    _refuse_open(known.covariance, problem.seen)
     predicted = [state[0] @ arm @ state[1] for arm in problem.robot]
     squares = [
         ((camera.project(pose.apply(view.points()))[0] - view.pixels) ** 2).sum(axis=1)
         for view, pose in zip(views, predicted, strict=True)
     ]
-    off_mm, turned_rad = _residuals(views, seen, predicted)
+    off_mm, turned_rad = _residuals(views, problem.seen, predicted)
     return HandEye(
         cam_from_mount=state[0],
         stand_from_board=state[1],
         covariance=known.covariance,
         robot_turn_rad=float(np.sqrt(problem.variances[0])),
         robot_move_mm=float(np.sqrt(problem.variances[1])),
-        # Each image measures six numbers: UNKNOWNS / 6 images determine the unknowns and say nothing about scatter; of
-        # the others three each show one of the robot's two variances.
+        # Each image measures six numbers: UNKNOWNS / 6 images determine the unknowns and say nothing about scatter.
         freedom=min(
             effective_freedom(min(known.freedom, len(views) - UNKNOWNS / 6), known.overdispersion, UNKNOWNS),
             problem.freedom,
@@ -148,8 +152,8 @@ def hand_eye(
         image_rms_px={view.image: float(np.sqrt(own.mean())) for view, own in zip(views, squares, strict=True)},
         translation_residuals_mm=off_mm,
         rotation_residuals_rad=turned_rad,
-        left_out=left_out,
-        contradicting=contradicting,
+        left_out={},
+        contradicting={},
     )
 
 

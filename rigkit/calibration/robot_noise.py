@@ -24,8 +24,8 @@ from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
 
 OPEN_PART = 1e-12
 """Relative eigenvalue of the information matrix up to which a direction is undetermined: rounding."""
-DAMPING = Damping(start=1e-4, ceiling=1e12)
-STOP = Stop(steps=60, predicted_gain=1e-14)
+HAND_EYE_DAMPING = Damping(start=1e-4, ceiling=1e12)
+HAND_EYE_STOP = Stop(steps=60, predicted_gain=1e-14)
 UNKNOWNS = 12
 VARIANCE_ROUNDS = 60
 """Estimates of the robot's noise, each with the poses at their optimum; variances that are zero only approach it."""
@@ -61,7 +61,7 @@ class PosesOfBoards:
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom of each variance."""
+        """Degrees of freedom of each variance: three an image show it, except in images that determine the unknowns."""
         return 3.0 * (len(self.seen) - UNKNOWNS / 6)
 
     def of(self, chosen: Sequence[int]) -> PosesOfBoards:
@@ -104,7 +104,7 @@ class PosesOfBoards:
 
     def refined(self, start: State) -> State:
         """Return the poses at the least cost."""
-        return minimise(start, self.at, _moved, DAMPING, STOP).state
+        return minimise(start, self.at, _moved, HAND_EYE_DAMPING, HAND_EYE_STOP).state
 
     def with_variances_from(self, state: State) -> PosesOfBoards:
         """Return the problem with better variances, by the scatter at its optimum."""
