@@ -163,8 +163,9 @@ class _Solution:
         require_determined(result, far.of_parameters_px)
         return result, far
 
-    def with_verdicts(self, result: Calibration, far: FarProjection) -> Calibration:
-        """Return what `assembled` returned, with its verdicts if the request asks for them."""
+    def with_verdicts(self, result: Calibration, far: FarProjection, *, may_move: bool = True) -> Calibration:
+        """Return what `assembled` returned, with its verdicts if the request asks for them; `may_move` as of
+        `diagnose`."""
         request, outcome = self.fits.request, self.outcome
         if not request.diagnosed:
             return result
@@ -179,6 +180,7 @@ class _Solution:
             in_force=in_force,
             solved=(observations, fit),
             order=self.fits.observations.images,
+            may_move=may_move,
         )
         return replace(result, verdicts=verdicts)
 
@@ -238,8 +240,10 @@ def _result(solution: _Solution) -> Calibration:
     """Return the result of a camera with its verdicts, with a moving pupil if requested or confirmed."""
     central, far = solution.assembled()
     request = solution.fits.request
-    if request.pupil == "central" or (request.pupil == "auto" and not may_move(central, far)):
+    if request.pupil == "central":
         return solution.with_verdicts(central, far)
+    if request.pupil == "auto" and not may_move(central, far):
+        return solution.with_verdicts(central, far, may_move=False)
     moving = solved_with_pupil(solution.outcome, solution.fits.observations, request)
     compared: Sequence[Candidate] = ()
     if moving is not None:

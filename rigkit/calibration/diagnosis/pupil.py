@@ -252,7 +252,7 @@ def modelled_pupil(calibration: Calibration) -> Iterator[Finding]:
 def may_move(calibration: Calibration, far: FarProjection) -> bool:
     """Return whether a moving pupil should be solved for: its first-order estimate is significant at ASKED_AT, or the
     lens is wide, and far points may be displaced by a relevant amount, against `far` of the calibration. The fit
-    decides then."""
+    decides then; all that `moving_pupil` says passes these limits, which are lower."""
     if calibration.corners.neighbour_correlation <= MIN_NEIGHBOUR_CORRELATION:
         return False
     pupil = MovingPupil.of(calibration)

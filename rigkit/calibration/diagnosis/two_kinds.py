@@ -162,12 +162,13 @@ class ImageScores:
         whole = pull.ravel() @ np.linalg.solve(every.reshape(k * p, k * p), pull.ravel())
         return float(whole - pull[0] @ np.linalg.solve(every[0, :, 0], pull[0]))
 
-    def best_split(self) -> tuple[BoolArray, float] | None:
+    def best_split(self, to_own: FloatArray | None = None) -> tuple[BoolArray, float] | None:
         """Return which images (N,) are of the second kind in the split that explains most, and the part that it
-        explains of what a lens for each image does; None with too few images, or where nothing is to be explained."""
+        explains of what a lens for each image does; None with too few images, or where nothing is to be explained.
+        `to_own` is the first result of `_own_roots`, if known."""
         if len(self.score) < 2 * self.min_images:
             return None
-        own, _ = self._own_amounts()
+        own = self._own_amounts(self._own_roots()[0] if to_own is None else to_own)
         explained, axes = float((own**2).sum()), np.linalg.svd(own, full_matrices=False)[2][:STARTS]
         across = np.einsum("kp,npq,kq->kn", axes, self.information, axes, optimize=True)
         amounts = axes @ self.score.T / np.maximum(across, np.finfo(float).tiny)
@@ -203,7 +204,8 @@ class ImageScores:
         becomes smaller, in the second an image that determines its lens better than others is not larger. Where other
         focal lengths from image to image explain as much as the two lenses (`explained_by_focus`), the first decides.
         """
-        own, back = self._own_amounts()
+        to_own, back = self._own_roots()
+        own = self._own_amounts(to_own)
         first, other = self._lenses(second)
         along = self.information @ (other - first)
         amount, explained = _amounts(along, other - first, self.score)
@@ -221,25 +223,29 @@ class ImageScores:
     ) -> bool:
         """Return whether no more than this part of random draws have a best split with this share: scores are `rest`
         (N, P) and those by `back` (N, P, Q) of amounts that are uniformly distributed along `spread` (K, Q)."""
-        rng, reached = np.random.default_rng(0), 1
+        rng, reached, (to_own, _) = np.random.default_rng(0), 1, self._own_roots()
         for _ in range(DRAWS):
             even = np.sqrt(12.0) * (rng.random((len(rest), len(spread))) - 0.5) @ spread
             score = rest + (back @ even[..., None])[..., 0]
             # Of one lens that was fitted to all of them.
-            drawn = replace(self, score=score - self.information @ score.sum(axis=0)).best_split()
+            drawn = replace(self, score=score - self.information @ score.sum(axis=0)).best_split(to_own)
             reached += drawn is not None and drawn[1] >= share
             if reached > chance * (DRAWS + 1):
                 return False
         return True
 
-    def _own_amounts(self) -> tuple[FloatArray, FloatArray]:
+    def _own_amounts(self, to_own: FloatArray) -> FloatArray:
         """Return the images' scores on combinations of unit information (N, P), whose squares are what a lens of its
-        own explains of each image, and the matrices (N, P, P) that make scores of them."""
+        own explains of each image."""
+        return np.asarray((to_own @ self.score[..., None])[..., 0])
+
+    def _own_roots(self) -> tuple[FloatArray, FloatArray]:
+        """Return the matrices (N, P, P) that make amounts of `_own_amounts` of scores, and those that make scores of
+        them."""
         values, vectors = np.linalg.eigh(self.information)
         size, turned = np.sqrt(np.maximum(values, np.finfo(float).tiny)), np.swapaxes(vectors, -1, -2)
         inverse = np.where(values > MIN_OWN_INFORMATION * values[:, -1:], 1.0 / size, 0.0)
-        own = (vectors * inverse[:, None]) @ (turned @ self.score[..., None])
-        return own[..., 0], (vectors * size[:, None]) @ turned
+        return (vectors * inverse[:, None]) @ turned, (vectors * size[:, None]) @ turned
 
     def _alternated(self, second: BoolArray) -> BoolArray:
         """Return the splits (G, N) that alternating leads to from first guesses."""

@@ -86,6 +86,7 @@ def diagnose(
     in_force: Collection[str] = (),
     solved: tuple[Observations, Fit] | None = None,
     order: Sequence[str] = (),
+    may_move: bool = True,
 ) -> tuple[Finding, ...]:
     """Return the verdicts, the headline first.
 
@@ -95,12 +96,13 @@ def diagnose(
     far : result of `FarProjection.of`, if known.
     in_force : those of "model" and "board_shape" that were "auto", so that this is no remedy.
     solved, order : observations and fit of the calibration, if known, and the names of all images in the order given.
+    may_move : whether the entrance pupil may move, by `pupil.may_move`.
     """
     far = FarProjection.of(calibration) if far is None else far
     upright = list(boards_never_rotated(calibration))
     stretched = list(stretched_images(calibration, upright=bool(upright)))
     extent = Extent.of(calibration)
-    mixed, change = _residuals(calibration, far, also, solved)
+    mixed, change = _residuals(calibration, far, also, solved, may_move=may_move)
     # With the images of two cameras mixed, residuals are not informative about views, boards and model.
     unlike, unclear = ([], []) if mixed else _views(calibration)
     pattern = [] if mixed else list(_pattern(calibration, in_force, bool(change)))
@@ -150,6 +152,8 @@ def _residuals(
     far: FarProjection,
     also: Sequence[Finding],
     solved: tuple[Observations, Fit] | None,
+    *,
+    may_move: bool,
 ) -> tuple[list[Finding], list[Finding]]:
     """Return findings on two cameras mixed, and on other causes of the residuals."""
     if mixed := list(two_cameras(c, c.clusters, solved)):
@@ -161,7 +165,8 @@ def _residuals(
         # Such boards do not determine the lens, and its errors look like shears and zooms that differ between images.
         change = [finding for finding in change if finding.severity is Severity.BAD]
     # A moving pupil looks a little like a zoom in every image, but no change between images looks like a pupil.
-    return [], change if worst(change) is Severity.BAD else list(moving_pupil(c, far)) or change
+    pupil = list(moving_pupil(c, far)) if may_move and worst(change) is not Severity.BAD else []
+    return [], pupil or change
 
 
 def diagnose_session(
