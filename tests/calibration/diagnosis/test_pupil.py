@@ -13,7 +13,14 @@ from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty
 from rigkit.calibration.compare import compare_calibrations
 from rigkit.calibration.diagnosis.changing import changing
-from rigkit.calibration.diagnosis.pupil import PUPIL_SIGNIFICANCE, MovingPupil, pupil_is_significant, solved_again
+from rigkit.calibration.diagnosis.pupil import (
+    PUPIL_SIGNIFICANCE,
+    MovingPupil,
+    may_move,
+    moving_pupil,
+    pupil_is_significant,
+    solved_again,
+)
 from rigkit.calibration.diagnosis.verdicts import diagnose
 from rigkit.calibration.diagnosis.view_evidence import view_evidence
 from rigkit.calibration.pupil import SolvedPupil
@@ -118,6 +125,25 @@ def test_a_moving_pupil_is_not_reported_as_a_change_between_images() -> None:
     found = session(NEAR, 4.0, 4)
     assert "rolling shutter" in str(changing(found))
     assert MESSAGE in found.verdicts[0].message and "rolling shutter" not in str(found.verdicts)
+
+
+def test_what_is_reported_of_a_pupil_is_also_asked_about(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that lenses whose pupils may not move need not be asked again."""
+    found = session(NEAR, MM_PER_RAD2, 0)
+    far, pupil, reported = FarProjection.of(found), pupil_of(found), 0
+    for part in np.geomspace(0.01, 3.0, 30).tolist():
+        for sigmas in (0.5, 3.5, 10.0):
+            amount = part * pupil.mm_per_rad2
+            other = replace(
+                pupil,
+                mm_per_rad2=amount,
+                sigma_mm_per_rad2=abs(amount) / sigmas + 1e-9,
+                parameter_changes=part * pupil.parameter_changes,
+            )
+            monkeypatch.setattr(MovingPupil, "of", lambda _, one=other: one)
+            assert may_move(found, far) or not list(moving_pupil(found, far))
+            reported += len(list(moving_pupil(found, far)))
+    assert reported > 3
 
 
 def test_distant_boards_do_not_determine_a_moving_pupil() -> None:
