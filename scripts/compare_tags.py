@@ -136,7 +136,7 @@ def tracked(paths: Sequence[Path], board: Board, calibration: Path, body: Path, 
     fitted = hand_eye(camera, views, [hand.at(t).inverse() @ stand.at(t) for t in moments])
     off_mm, angles = fitted.translation_residuals_mm, np.degrees(fitted.rotation_residuals_rad)
     print(
-        f"{len(moments)} images: median {np.median(off_mm):.2f} mm, {np.median(angles):.3f} deg; "
+        f"{len(off_mm)} images: median {np.median(off_mm):.2f} mm, {np.median(angles):.3f} deg; "
         f"largest {off_mm.max():.2f} mm, {angles.max():.3f} deg"
     )
 

@@ -239,7 +239,7 @@ def _pose_rows(
     bench: Bench, tool: str, variant: str, camera: Camera, views: Views, stands: Sequence[Rigid3]
 ) -> Iterator[Row]:
     fitted = hand_eye(camera, views, stands)
-    how = f"median of {len(views)} images after one hand-eye fit"
+    how = f"median of {len(fitted.image_rms_px)} images after one hand-eye fit"
     off_mm = float(np.median(fitted.translation_residuals_mm))
     turned = float(np.degrees(np.median(fitted.rotation_residuals_rad)))
     yield bench.row("board against motion capture", tool, off_mm, "mm", variant=variant, how=how)
