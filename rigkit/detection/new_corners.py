@@ -37,8 +37,9 @@ def _may_belong(item: RefinedLattice, pixels: FloatArray) -> bool:
     """Return whether one of `pixels` (N, 2) is at an empty place of a lattice or next to it."""
     wide = item.lattice.padded((1, 1), (1, 1))
     places = predicted(wide.pixels, ~wide.known)
-    sides = places.cell_px()
-    return bool(near_any(pixels, places.pixels, NEXT_CELLS * float(np.median(sides))).any())
+    # Far from all corners nothing is predicted.
+    places = places.of(places.support > 0.0)
+    return bool(near_any(pixels, places.pixels, NEXT_CELLS * float(np.median(places.cell_px()))).any())
 
 
 def same_corner_px(lattice: Lattice) -> float:

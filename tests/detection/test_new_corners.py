@@ -13,6 +13,7 @@ from rigkit.detection import lattices
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.new_corners import SAME_PX, new_corners, same_corner_px
+from rigkit.detection.saddles.response import Level, grey_image
 from rigkit.detection.searched_image import SearchedImage
 from rigkit.detection.subpixel.refined import RefinedLattice
 
@@ -48,6 +49,52 @@ def test_the_same_corner_is_within_a_tenth_of_a_large_cell() -> None:
     lattice = board_with_a_hole().lattice
     assert same_corner_px(lattice) == SAME_PX
     assert same_corner_px(replace(lattice, pixels=15.0 * lattice.pixels)) == pytest.approx(1.5 * STEP_PX)
+
+
+def test_a_corner_next_to_a_board_that_is_mostly_covered_may_belong_to_it() -> None:
+    # Of most empty places nothing is predicted.
+    pixels = np.stack(np.meshgrid(np.arange(22.0), np.arange(22.0)), axis=-1) * STEP_PX + (200.0, 100.0)
+    pixels[3:, 3:] = np.nan
+    one = np.where(np.isnan(pixels[..., 0]), np.nan, 1.0)
+    found = RefinedLattice(Lattice(pixels, one, True), 0.1 * one, one, one, one)
+    assert new_corners([found], np.array([[3.5, 7.0]]) * STEP_PX + (200.0, 100.0))[1]
+    assert not new_corners([found], np.array([[0.4, 0.3]]))[1]
+
+
+def test_coarser_levels_are_left_once_one_shows_nothing_new(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    levels: list[int] = []
+    coarser = SearchedImage.coarser
+
+    def counted(self: SearchedImage, without: int) -> SearchedImage | None:
+        levels.append(without)
+        return coarser(self, without)
+
+    monkeypatch.setattr(SearchedImage, "coarser", counted)
+    image = one_board(rng, board=Board("b", 8, 6, 30.0, 30.0)).render(noise_levels=2.0, rng=rng)
+    (found,) = detect_boards(image, [Board("larger", 9, 7, 30.0, 30.0)])
+    assert found.complete and not found.board_id
+    assert levels == [1] and len(SearchedImage.of(grey_image(image)).levels) > 2
+
+
+@pytest.mark.parametrize(("columns", "rows", "times"), [(9, 6, 1), (20, 14, 2)])
+def test_edges_are_tested_once_but_of_boards_that_were_tested_before_they_were_grown(
+    columns: int, rows: int, times: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tested: list[int] = []
+    test = lattices.has_edge_offset
+
+    def counted(lattice: Lattice, finest: Level) -> bool:
+        tested.append(lattice.count)
+        return test(lattice, finest)
+
+    monkeypatch.setattr(lattices, "has_edge_offset", counted)
+    board = Board("b", columns, rows, 30.0, 30.0)
+    image = one_board(rng, board=board, square_px=20.0, max_tilt_deg=20.0).render(noise_levels=2.0, rng=rng)
+    (found,) = detect_boards(image, [board])
+    assert found.complete
+    assert len(tested) == times and tested[-1] == columns * rows
 
 
 def test_a_whole_board_of_another_size_is_searched_for_once(
