@@ -28,6 +28,12 @@ SEEN_OF_LINE = 0.5
 right side it is 0.5 and more (motion of 15 px), beyond the border 0."""
 
 
+CLEARLY_MORE_CERTAIN = 2.0
+"""Smallest ratio of the sigmas of a board fitted in the image, with a camera's help, to those in a resampled part for
+the latter to count: both are of the same pixels, the camera adds knowledge of the lines, and sigmas of blurred corners
+are true to a factor of about 1.5. On 89 REAL boards made worse it is the same from 1.5 to 3."""
+
+
 class ChessboardFinder(Finder):
     """Returns all lattices that no other finder has used, of any size."""
 
@@ -48,11 +54,11 @@ class ChessboardFinder(Finder):
 def _with_more_certain(
     found: Sequence[BoardDetection], others: Sequence[BoardDetection], same_px: float
 ) -> list[BoardDetection]:
-    """Return `found` with `others` in place of those of mostly the same corners that know less of where they are."""
+    """Return `found` with `others` in place of those of mostly the same corners that are far less certain."""
     out = list(found)
     for other in others:
         same = [one for one in out if 2 * int(near_any(one.pixels, other.pixels, same_px).sum()) > len(one.grid)]
-        if sum(_information(one) for one in same) < _information(other):
+        if CLEARLY_MORE_CERTAIN**2 * sum(_information(one) for one in same) < _information(other):
             out = [one for one in out if not any(one is less for less in same)] + [other]
     return out
 

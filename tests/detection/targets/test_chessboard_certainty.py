@@ -25,3 +25,9 @@ def test_more_certain_corners_replace_the_same_ones(certain: int) -> None:
     vague, sure, other = seen(4.0, certain=certain), seen(0.6, at=306.0), seen(4.0, at=4000.0)
     assert _with_more_certain([vague, other], [sure], SAME_PX) == [other, sure]
     assert _with_more_certain([sure, other], [vague], SAME_PX) == [sure, other]
+
+
+def test_a_little_more_certain_corners_replace_none() -> None:
+    # Of the same pixels the camera knows the lines.
+    by_camera, part = seen(0.10), seen(0.07, at=301.0)
+    assert _with_more_certain([by_camera], [part], SAME_PX) == [by_camera]
