@@ -22,6 +22,7 @@ from rigkit.core.errors import CheckFailed, DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
+from rigkit.detection.larger_grid import larger_grid
 from rigkit.geometry.board_pose import BoardPose, board_poses
 from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.calibrations.calibration_file import load_calibration
@@ -29,7 +30,7 @@ from rigkit.io.disk.json_reader import json_text
 from rigkit.io.disk.reading import about, paths_of
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.io.manifests.robot_poses import read_robot_poses
-from rigkit.io.media.images import read_image_of
+from rigkit.io.media.images import read_image, read_image_of
 from rigkit.validation.monitoring.evidence import Monitored
 from rigkit.validation.monitoring.watch import monitored_camera
 from rigkit.workflows.detect import images_in
@@ -155,6 +156,9 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
             )
         why = why_not_detected([Path(image)], [known]) or "check focus and the board's file"
         raise CheckFailed(f"'{image}' does not show board '{known.board_id}'; {why}")
+    larger = larger_grid(read_image(image), seen, [known])
+    if larger is not None:
+        _log.warning(f"check columns and rows: in '{image}' {larger}")
     with about(camera, image):
         found, valid = _poses(lens, view)
         points = view.points()[valid]

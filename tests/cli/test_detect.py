@@ -13,7 +13,10 @@ from helpers.detection_scenes import single
 
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.detection.detect import detect_boards
 from rigkit.io.corners.corners_file import read_corners
+from rigkit.io.media.images import read_image
 from rigkit.workflows.detect import detect_in_images
 from rigkit.workflows.options.cameras import DetectOptions, FolderOptions
 
@@ -161,6 +164,18 @@ def test_a_single_folder_and_board_need_no_list_in_python(images: Path) -> None:
     )
     assert one.found.keys() == listed.found.keys() and len(one.found) == 3
     assert FolderOptions(boards="9x6x30") == FolderOptions(boards=("9x6x30",))  # type: ignore[arg-type]
+
+
+def test_a_whole_board_of_which_parts_pass_for_the_given_one_is_told(
+    images: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = detect_boards(read_image(images / "0.png"))[0]
+    inside = whole.grid[:, 0] < 8
+    part = BoardDetection("board-8x6x30", 8, 6, whole.grid[inside], whole.pixels[inside], whole.sigma_px[inside])
+    monkeypatch.setattr("rigkit.workflows.detect.detect_boards", lambda *_, **__: (part,))
+    assert main(["detect", str(images / "0.png"), "--board", "8x6x30", "--jobs", "1"]) == 0
+    words = f"check columns and rows: in '{images / '0.png'}' 9 x 6 inner corners are seen, 8 x 6 are declared"
+    assert words in capsys.readouterr().err
 
 
 def test_images_of_a_larger_board_are_told_though_others_show_the_given_one(

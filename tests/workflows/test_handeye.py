@@ -59,3 +59,6 @@ def test_pose_uses_the_measured_corners(
     assert not caplog.records
     assert not placed("6x8x30", "board-6x8x30").board_measured
     assert "a board of 8x6, taken here as flat" in caplog.text
+    monkeypatch.setattr(handeye, "larger_grid", lambda *_: "9 x 6 inner corners are seen")
+    placed("8x6x30", "board-8x6x30")
+    assert "image.png' 9 x 6 inner corners are seen" in caplog.text
