@@ -125,23 +125,14 @@ def place_part(image: GreyImage, refined: RefinedLattice, sizes: Sequence[tuple[
     refined : a part of a board; lattices of a known size are returned unchanged.
     sizes : (columns, rows) of the possible boards, which may be swapped.
     """
-    larger = further_lines(refined.lattice, sizes)
-    if (0, 0) in larger:
-        return refined
-    return part_between(image, refined, larger, board_sides(image, refined.lattice)) if larger else None
-
-
-def further_lines(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return how many more columns and rows the boards of the `sizes`, which may be swapped, have than `lattice`."""
-    columns, rows = lattice.size
+    columns, rows = refined.lattice.size
     known = {size for c, r in sizes for size in ((c, r), (r, c))}
-    return [(c - columns, r - rows) for c, r in known if c >= columns and r >= rows]
-
-
-def part_between(
-    image: GreyImage, refined: RefinedLattice, larger: Sequence[tuple[int, int]], every: Sequence[BoardSide]
-) -> RefinedLattice | None:
-    """Return `refined` as by `place_part`, from the `further_lines` of boards and its `board_sides`."""
+    if (columns, rows) in known:
+        return refined
+    larger = [(c - columns, r - rows) for c, r in known if c >= columns and r >= rows]
+    if not larger:
+        return None
+    every = board_sides(image, refined.lattice)
     cell_px = fit_cells(refined.lattice.pixels, refined.lattice.known).cell_px()
     if known_median(refined.blur_px) > EDGE_WIDTH * float(np.median(cell_px)):
         every = _with_blurred_borders(image, refined.lattice, every)

@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
-from rigkit.detection.checks.border import BoardSide, Side, board_sides, further_lines, part_between, place_part
+from rigkit.detection.checks.border import place_part
 from rigkit.detection.checks.validate import part_of_known_size
 from rigkit.detection.guided.guided import completed
 from rigkit.detection.guided.rejoin import rejoined
@@ -38,14 +38,16 @@ class ChessboardFinder(Finder):
     """Returns all lattices that no other finder has used, of any size."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
+        # The search may stretch the image to the levels of its lattices, which clips those of corners that it missed.
+        grey = search.grey
         # The camera predicts corners in the image itself, not in resampled parts.
         plain = [item for item in search.lattices if item.picture is None or search.camera is not None]
-        out = _in_image(search.grey, plain, boards, search.camera, quick=search.quick)
+        out = _in_image(grey, plain, boards, search.camera, quick=search.quick)
         for item in search.lattices:
             if (picture := item.picture) is not None:
-                there = _in_image(search.grey, [item], boards, picture=picture, quick=search.quick)
+                there = _in_image(grey, [item], boards, picture=picture, quick=search.quick)
                 # Corners that are too oblique in the resampled part may be found in the image itself.
-                mine = [completed(search.grey, _out_of(picture, found), boards, None) for found in there]
+                mine = [completed(grey, _out_of(picture, found), boards, None) for found in there]
                 same_px = same_corner_px(item.lattice)
                 out = out + mine if search.camera is None else _with_more_certain(out, mine, same_px)
         return out
@@ -102,7 +104,7 @@ def _placed(
 ) -> list[RefinedLattice]:
     """Return the lattices, those of parts of a board on the grid of the whole board where their position is known."""
     sizes = tuple(dict.fromkeys(board.size for board in boards))
-    tried = [(item, _on_grid(grey, item, boards, sizes)) for item in lattices]
+    tried = [(item, place_part(grey, item, sizes) or _with_missed_line(grey, item, boards)) for item in lattices]
     placed = [item for _, item in tried if item is not None]
     parts = [item for item, known in tried if known is None]
     if camera is None or len(parts) < 2:
@@ -110,25 +112,10 @@ def _placed(
     return [*placed, *(place_part(grey, item, sizes) or item for item in rejoined(parts, boards, camera))]
 
 
-def _on_grid(
-    grey: GreyImage, item: RefinedLattice, boards: Sequence[Board], sizes: Sequence[tuple[int, int]]
-) -> RefinedLattice | None:
-    """Return a lattice on the grid of one of the `boards`, of these `sizes`; None if its position is ambiguous."""
-    larger = further_lines(item.lattice, sizes)
-    if (0, 0) in larger:
-        return item
-    if not larger:
-        return None
-    sides = board_sides(grey, item.lattice)
-    return part_between(grey, item, larger, sides) or _with_missed_line(grey, item, boards, sides)
-
-
-def _with_missed_line(
-    grey: GreyImage, item: RefinedLattice, boards: Sequence[Board], sides: Sequence[BoardSide]
-) -> RefinedLattice | None:
+def _with_missed_line(grey: GreyImage, item: RefinedLattice, boards: Sequence[Board]) -> RefinedLattice | None:
     """Return a lattice that lacks one row or column of a board on the board's grid; None if its position is ambiguous.
 
-    With blur and motion the border of the board is not visible in its `sides`, but some of the missed corners are.
+    With blur and motion the border of the board is not visible (`place_part`), but some of the missed corners are.
     """
     options = []
     for board in boards:
@@ -136,18 +123,12 @@ def _with_missed_line(
             across, down = (whole - seen for whole, seen in zip(size, item.lattice.size, strict=True))
             if sorted((across, down)) != [0, 1]:
                 continue
-            # Both sides are completed at once, as on a board of one more line.
-            at = 1 if across else 0
-            open_ended = [int(one.side is not Side.BORDER) for one in (sides[at], sides[at + 2])]
-            ends = [(open_ended[0] * more, open_ended[1] * more) for more in (down, across)]
-            start = _detection(item.padded(*ends))
-            larger = replace(board, columns=start.columns, rows=start.rows)
-            line = completed(grey, start, [larger], None).grid[:, 1 - at] if any(open_ended) else np.zeros(0)
-            last = item.lattice.size[1 - at] + open_ended[0]
-            for before, seen, place in ((1, open_ended[0], 0), (0, open_ended[1], last)):
-                share = np.count_nonzero(line == place) / (size[1] if across else size[0]) if seen else 0.0
+            for before in (0, 1):
                 rows, columns = ((before * more, more - before * more) for more in (down, across))
-                options.append((share, item.padded(rows, columns)))
+                placed = item.padded(rows, columns)
+                start = _detection(placed.turned(quarter_turns(placed.lattice, [board.size])))
+                added = len(completed(grey, start, [board], None).grid) - len(start.grid)
+                options.append((added / (size[1] if across else size[0]), placed))
     shares = sorted(share for share, _ in options)
     if len(options) < 2 or shares[-1] - shares[-2] < SEEN_OF_LINE:
         return None

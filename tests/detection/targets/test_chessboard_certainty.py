@@ -1,4 +1,4 @@
-"""Boards found in the image with a camera's help, and in a resampled part of it: the more certain corners count."""
+"""Where the corners of chessboards are completed: in the image as it is, or in a resampled part of it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from rigkit.core.detections import BoardDetection
-from rigkit.detection.targets.chessboard import _with_more_certain
+from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.targets import chessboard
+from rigkit.detection.targets.base import Search
+from rigkit.detection.targets.chessboard import ChessboardFinder, _with_more_certain
 
 GRID = np.stack(np.meshgrid(np.arange(6), np.arange(4)), axis=-1).reshape(-1, 2)
 SAME_PX = 30.0
@@ -31,3 +34,18 @@ def test_a_little_more_certain_corners_replace_none() -> None:
     # Of the same pixels the camera knows the lines.
     by_camera, part = seen(0.10), seen(0.07, at=301.0)
     assert _with_more_certain([by_camera], [part], SAME_PX) == [by_camera]
+
+
+def test_corners_are_added_in_the_image_before_it_is_stretched(monkeypatch: pytest.MonkeyPatch) -> None:
+    # In an image of 16 bits (REAL, thermal) the missed corner is darker than those found.
+    class Stretching(Search):
+        @property
+        def lattices(self) -> list[RefinedLattice]:
+            self.grey = np.zeros((20, 20), np.float32)
+            return []
+
+    images: list[np.ndarray] = []
+    monkeypatch.setattr(chessboard, "_in_image", lambda grey, *_, **__: images.append(grey) or [])
+    given = np.ones((20, 20), np.float32)
+    ChessboardFinder().find(Stretching(given, (), 9, None), ())
+    assert images[0] is given
