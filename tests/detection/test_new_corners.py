@@ -10,6 +10,7 @@ from detection_bench.scenes import one_board
 
 from rigkit.core.boards import Board
 from rigkit.detection import lattices
+from rigkit.detection.checks.validate import has_edge_offset
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.new_corners import SAME_PX, new_corners, same_corner_px
@@ -83,11 +84,10 @@ def test_edges_are_tested_once_but_of_boards_that_were_tested_before_they_were_g
     columns: int, rows: int, times: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tested: list[int] = []
-    test = lattices.has_edge_offset
 
     def counted(lattice: Lattice, finest: Level) -> bool:
         tested.append(lattice.count)
-        return test(lattice, finest)
+        return has_edge_offset(lattice, finest)
 
     monkeypatch.setattr(lattices, "has_edge_offset", counted)
     board = Board("b", columns, rows, 30.0, 30.0)

@@ -19,7 +19,7 @@ def seen(sigma_px: float, *, at: float = 300.0, certain: int = 0) -> BoardDetect
     """Return a board of 6 x 4 corners 300 px apart; `certain` of them with sigmas of 0.1 px."""
     sigmas = np.full(len(GRID), sigma_px)
     sigmas[:certain] = 0.1
-    return BoardDetection(None, 6, 4, GRID, at + 300.0 * GRID, sigmas)
+    return BoardDetection(None, 6, 4, GRID, (at + 300.0 * GRID).astype(np.float64), sigmas)
 
 
 @pytest.mark.parametrize("certain", [0, 2])
@@ -45,7 +45,12 @@ def test_corners_are_added_in_the_image_before_it_is_stretched(monkeypatch: pyte
             return []
 
     images: list[np.ndarray] = []
-    monkeypatch.setattr(chessboard, "_in_image", lambda grey, *_, **__: images.append(grey) or [])
+
+    def in_image(grey: np.ndarray, *_: object, **__: object) -> list[BoardDetection]:
+        images.append(grey)
+        return []
+
+    monkeypatch.setattr(chessboard, "_in_image", in_image)
     given = np.ones((20, 20), np.float32)
     ChessboardFinder().find(Stretching(given, (), 9, None), ())
     assert images[0] is given
