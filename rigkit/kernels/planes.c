@@ -146,9 +146,9 @@ INLINE void solve_planes(fits_t *fits)
 }
 
 /* Sums of the fit of a curvature k = (uu, uv, vv) together with a plane: F'W Q, Q'W Q (upper triangle) and Q'W (z - F m), where
- * a neighbour measures z = F m + Q k. */
+ * a neighbour measures z = F m + Q k, about the plane m whose weights those of the fit are. */
 typedef struct {
-    double mixed[9][LANES], own[UPPER][LANES], pull[3][LANES];
+    double mixed[9][LANES], own[UPPER][LANES], pull[3][LANES], plane[3][LANES];
 } bends_t;
 
 /* Add a neighbour at `there`, (x, y) px away from the node, to the sums of the curvature. A plane fitted to a curved surface in a
@@ -200,6 +200,7 @@ INLINE void add_all_bends(
     const plane_grid_t *g, const sums_t *sums, const double *here, const fits_t *fits, double loss, bends_t *bends)
 {
     memset(bends, 0, sizeof *bends);
+    memcpy(bends->plane, fits->plane, sizeof bends->plane);
     for (int64_t dr = -g->reach; dr <= g->reach; dr++)
         for (int64_t dc = -g->reach; dc <= g->reach; dc++) {
             const double *there = here + dr * sums->columns + dc;
@@ -220,6 +221,8 @@ static void write_node(const fits_t *fits, const bends_t *curved, int64_t l, int
     for (int64_t k = 0; k < 3; k++) {
         out[PLANES][3 * at + k] = fits->plane[k][l];
         out[PULL][3 * at + k] = curved->pull[k][l];
+        for (int64_t n = 0; n < 3; n++)
+            out[PULL][3 * at + k] -= curved->mixed[3 * n + k][l] * (fits->plane[n][l] - curved->plane[n][l]);
         square -= fits->sum[TERM_B + k][l] * fits->plane[k][l];
     }
     out[SQUARES][at] = square > 0.0 ? square : 0.0;
@@ -258,6 +261,7 @@ FOR_EACH_PROCESSOR int64_t fit_planes(
                 memcpy(fits.sum[k], here + k * sums.size, sizeof fits.sum[k]);
             memcpy(fits.own, fits.sum, sizeof fits.own);
             solve_planes(&fits);
+            bends_t curved;
             for (int64_t round = 0; round < g->rounds; round++) {
                 memset(fits.sum, 0, sizeof fits.sum);
                 for (int64_t dr = -g->reach; dr <= g->reach; dr++)
@@ -268,10 +272,10 @@ FOR_EACH_PROCESSOR int64_t fit_planes(
                         else
                             add_neighbours(&sums, there, 0, loss, &fits);
                     }
+                if (round == g->rounds - 1)
+                    add_all_bends(g, &sums, here, &fits, loss, &curved);
                 solve_planes(&fits);
             }
-            bends_t curved;
-            add_all_bends(g, &sums, here, &fits, loss, &curved);
             for (int64_t l = 0; l < LANES && start + l < g->columns; l++) {
                 const int64_t at = row * g->columns + start + l;
                 if (!(here[TERM_SEEN * sums.size + l] > 0.0 && isfinite(fits.plane[0][l])))

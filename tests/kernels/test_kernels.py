@@ -124,14 +124,15 @@ def test_a_structure_keeps_the_copies_that_it_points_to() -> None:
     """What is copied for a structure must live as long as that: the memory of a copy is soon another's."""
     whole = np.arange(8.0)[None, :, None].repeat(3, axis=2)
     matrices = np.zeros((1, 4, 3, 3))
-    fit = {"reach": 1, "rounds": 1, "turn": 1.0, "step": 1.0}
-    arrays = {
-        "information": matrices,
-        "frames": matrices,
-        "offsets": matrices[..., 0, :2],
-        "windows": matrices[..., 0, 0],
+    fit = {
+        "offsets": np.zeros((1, 4, 2)),
+        "windows": np.zeros((1, 4)),
+        "reach": 1,
+        "rounds": 1,
+        "turn": 1.0,
+        "step": 1.0,
     }
-    grid = make_struct("plane_grid_t", values=whole[:, ::2], **arrays, **fit)
+    grid = make_struct("plane_grid_t", values=whole[:, ::2], information=matrices, frames=matrices, **fit)
     others = [np.full((1, 4, 3), 7.0) for _ in range(50)]
     read = np.ctypeslib.as_array((ctypes.c_double * 12).from_address(grid.values)).reshape(1, 4, 3)
     np.testing.assert_array_equal(read, whole[:, ::2])

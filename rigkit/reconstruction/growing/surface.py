@@ -9,7 +9,6 @@ downweights neighbours on another surface.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
@@ -19,9 +18,10 @@ import numpy as np
 from rigkit.affine.normal import linear_gauge
 from rigkit.affine.refine_patches import FLOOR_PX, WINDOW_OF_PATCH, curvature_shift, levels_of_larger, window_variance
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import TINY, BoolArray, FloatArray, IntArray, Normals, Points
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Normals, Points
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import unit
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.kernels.planes import PlaneFits, fitted_planes
 from rigkit.optim.local_variances import of_redescending, shrunk_variances
@@ -35,15 +35,16 @@ TURN_OF_LOSS = 2.385
 """Scale of the robust loss, in standard deviations of a component."""
 MIN_NODE_SUPPORT = 0.1
 """Least sum of weights over the number of nodes around; below, a plane is fitted to little more than its own node."""
-CURVATURE_ROUNDS = 3
-"""Curvature raises the noise that the residuals show, which hides curvature: the noise settles in two or three."""
+REACH_OF_SWEEP = 2
+"""Times as far apart as of patches are curvatures compared of a sweep, whose errors reach further than a plane."""
 Row = tuple[float, ...]
 SLOPES, BENDS = (-1.0, 1.0), (1.0, -2.0, 1.0)
 """Weights of planes in a row that are compared. Curvature adds to first differences, more edges in between to second
-ones: the noise is what both show at most. A sweep's errors reach further than a plane and look like curvature, so only
+ones: noise is no more than both show. A sweep's errors reach further than a plane and look like curvature, so only
 first differences show them."""
 OPEN_CURVATURE = 1e-6
-"""Smallest relative eigenvalue of the information on a curvature: less is rounding of nodes in a line."""
+"""Least information on a curvature beside a plane, over that without one (a determinant): rounding of nodes in a line
+leaves less."""
 MIN_COMPARED = 200
 """Least number of pairs of planes whose median ratio is known to a tenth."""
 GROUPS_A_DOUBLING = 2
@@ -166,9 +167,8 @@ class PairRays:
         Without it patches with strong texture contradict each other, and hardly any plane has support.
         """
         at = self.grown.valid
+        place = np.where(self.grown.swept[at], 0.0, FLOOR_PX * 2.0 ** self.grown.coarser[at])
         affinity = np.where(self.grown.swept[at], 0.0, FLOOR_PX / HALF_WIDTH)
-        # Independent errors of pixels move a patch by what they turn it by times its window's standard deviation.
-        place = WINDOW_OF_PATCH * HALF_WIDTH * 2.0 ** self.grown.coarser[at] * affinity
         sigmas = np.repeat(np.stack([place, affinity], axis=1), [2, 4], axis=1)
         return np.asarray(sigmas[:, :, None] ** 2 * np.eye(6), np.float64)
 
@@ -211,7 +211,7 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
     Their covariance is scaled twice. First by the local residuals of the nodes around, as far as these vary by more
     than chance: windows with another surface, a highlight or a bend have larger errors. Then by the disagreement of
     planes that share no node but have similar residuals, because neighbouring patches share pixels. A curvature of the
-    surface is fitted along with each plane; the share of it that is not noise moves the plane.
+    surface is fitted along with each plane; the share of it that others around agree on moves the plane.
     Nodes of a sweep are scaled separately, because its errors are correlated over larger distances. `shared_px` is an
     error along the epipolar lines that is common to all nodes around.
 
@@ -244,9 +244,18 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
         valid.astype(np.float64), -1, (2 * reach + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT
     )
     freedom = np.maximum(3.0 * around * step**2 / (0.5 * WINDOW_AREA_PX), 1.0)
-    plane, curved = fits.planes.copy(), _curvatures(fits, spread)
-    for alike, stencils in ((keep & measured.swept, [SLOPES]), (keep & ~measured.swept, [SLOPES, BENDS])):
-        noise, share = _noise(fits, only(alike, spread), curved.gain, freedom, stencils, 2 * reach)
+    plane, curved, lag = fits.planes.copy(), _curvatures(fits, spread), 2 * reach
+    sweep, patches = keep & measured.swept, keep & ~measured.swept
+    for alike, stencils, apart in ((sweep, [SLOPES], REACH_OF_SWEEP * lag), (patches, [SLOPES, BENDS], lag)):
+        share = _share_of_curvature(curved, alike, apart, lag + 1)
+        squares = fits.squares - share * (2.0 - share) * np.sum(curved.bend * curved.pull, axis=-1)
+        missed = of_redescending(squares / (3.0 * fits.support), TURN_OF_LOSS)
+        local = np.full(valid.shape, np.nan)
+        local[alike] = shrunk_variances(missed[alike], freedom[alike])
+        planes, stated = only(alike, fits.planes), local[..., None, None] * spread
+        scale = np.min([_disagreement(planes, stated, local, lag, row) for row in stencils], axis=0)
+        # Never below the stated noise of the patches.
+        noise = np.maximum(local * np.maximum(scale, 1.0) ** 2, 1.0)
         plane[alike] -= (share[..., None] * curved.shift)[alike]
         spread[alike] = (noise[..., None, None] * (spread + share[..., None, None] * curved.covariance))[alike]
     spread += ((shared_px / measured.slope) ** 2)[..., None, None] * ray[..., :, None] * ray[..., None, :]
@@ -265,65 +274,56 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
 
 
 class _Curvatures(NamedTuple):
-    """What planes (R, C, 3) are off by, `shift`, as the surface is curved around their nodes, with its covariance
-    (R, C, 3, 3) for values of the stated noise, and the decrease (R, C) `gain` of the squares by these curvatures. Zero
-    where the nodes around do not determine a curvature."""
+    """Curvatures `bend` (R, C, 3) fitted with planes, the sides `pull` (R, C, 3) of their equations: bend . pull is the
+    decrease of the squares. Planes are off by `shift` (R, C, 3), with its covariance (R, C, 3, 3) for values of the
+    stated noise. Zero where the nodes around do not determine a curvature."""
 
+    bend: FloatArray
+    pull: FloatArray
     shift: FloatArray
     covariance: FloatArray
-    gain: FloatArray
 
 
 def _curvatures(fits: PlaneFits, spread: FloatArray) -> _Curvatures:
     """Return the curvatures fitted with the planes of the covariances `spread` (R, C, 3, 3), NaN without one."""
-    out = _Curvatures(np.zeros(fits.planes.shape), np.zeros(spread.shape), np.zeros(spread.shape[:2]))
+    bend, pull, shift = np.zeros((3, *fits.planes.shape))
+    covariance = np.zeros(spread.shape)
     by_bend = spread @ fits.mixed
     own = fits.bends - np.swapaxes(fits.mixed, -1, -2) @ by_bend
-    size = np.sqrt(np.maximum(np.diagonal(own, axis1=-2, axis2=-1), 0.0))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        own /= size[..., None] * size[..., None, :]
-    known: BoolArray = np.asarray(np.isfinite(own).all(axis=(-1, -2)))
-    known[known] = np.linalg.eigvalsh(own[known])[:, 0] > OPEN_CURVATURE
-    root = 1.0 / size[known]
-    inverse = np.linalg.inv(own[known]) * root[:, :, None] * root[:, None, :]
-    by_bend, pull = by_bend[known], fits.pull[known]
-    bend = (inverse @ pull[..., None])[..., 0]
-    out.shift[known] = (by_bend @ bend[..., None])[..., 0]
-    out.covariance[known] = by_bend @ inverse @ np.swapaxes(by_bend, 1, 2)
-    out.gain[known] = np.sum(bend * pull, axis=-1)
-    return out
+    # Beside what there is without a plane: what a plane explains, too, leaves rounding.
+    diagonal = np.diagonal(fits.bends, axis1=-2, axis2=-1)
+    known: BoolArray = np.asarray(np.isfinite(own).all(axis=(-1, -2)) & (diagonal > 0.0).all(axis=-1))
+    size = np.sqrt(diagonal[known])
+    both = size[:, :, None] * size[:, None, :]
+    known[known] = closed = np.linalg.det(own[known] / both) > OPEN_CURVATURE
+    by_bend, inverse = by_bend[known], np.linalg.inv(own[known] / both[closed]) / both[closed]
+    pull[known] = fits.pull[known]
+    bend[known] = (inverse @ pull[known][..., None])[..., 0]
+    shift[known] = (by_bend @ bend[known][..., None])[..., 0]
+    covariance[known] = by_bend @ inverse @ np.swapaxes(by_bend, 1, 2)
+    return _Curvatures(bend, pull, shift, covariance)
 
 
-def _noise(
-    fits: PlaneFits, spread: FloatArray, gain: FloatArray, freedom: FloatArray, stencils: Sequence[Row], lag: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return the variances (R, C) of alike nodes over those stated, never less than these, and the shares (R, C) of the
-    curvatures that are not noise.
+def _share_of_curvature(curved: _Curvatures, alike: BoolArray, lag: int, side: int) -> FloatArray:
+    """Return the share (R, C) of the curvatures that alike nodes `lag` apart, which share no node around, agree on: the
+    sum of their products over that of their squares, of the nodes within `side` nodes.
 
-    `spread` (R, C, 3, 3) are the stated covariances of their planes, NaN elsewhere, `freedom` (R, C) the degrees of
-    freedom of the residuals; planes that share no node are `lag` nodes apart.
+    Noise has no mean product, so that the share is Wiener's. Nor has what a crease or an edge of depth makes look like
+    curvature: across it neighbours have none. So the lesser share, of rows and of columns, counts.
     """
-    alike = np.isfinite(spread[..., 0, 0])
-    share = np.ones(alike.shape)
-    for _ in range(CURVATURE_ROUNDS):
-        missed = of_redescending((fits.squares - share * (2.0 - share) * gain) / (3.0 * fits.support), TURN_OF_LOSS)
-        local = np.full(alike.shape, np.nan)
-        local[alike] = shrunk_variances(missed[alike], freedom[alike])
-        planes, stated = only(alike, fits.planes), local[..., None, None] * spread
-        scale = np.min([_disagreement(planes, stated, local, lag, row) for row in stencils], axis=0)
-        noise = np.maximum(local * np.maximum(scale, 1.0) ** 2, 1.0)
-        share = _share_of_curvature(gain / (3.0 * noise), alike, lag + 1)
-    return noise, share
-
-
-def _share_of_curvature(ratio: FloatArray, alike: BoolArray, side: int) -> FloatArray:
-    """Return the share (R, C) of the fitted curvatures that is not noise: Wiener's, from the mean around each node of
-    the `ratio` (R, C) of their squares to those of noise."""
-    total, count = (
-        cv2.boxFilter(values, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for values in (np.where(alike, ratio, 0.0), alike.astype(np.float64))
-    )
-    return np.asarray(np.where(alike, 1.0 - np.minimum(count / np.maximum(total, TINY), 1.0), 0.0))
+    shares, known = [], alike & curved.pull.any(axis=-1)
+    for turned in (False, True):
+        bend, pull = (np.swapaxes(v, 0, 1) if turned else v for v in (curved.bend, curved.pull))
+        here = known.T if turned else known
+        sums, both = np.zeros((2, *here.shape)), here[:-lag] & here[lag:]
+        for one, other in ((np.s_[:-lag], np.s_[lag:]), (np.s_[lag:], np.s_[:-lag])):
+            for total, neighbour in zip(sums, (other, one), strict=True):
+                total[one] += np.where(both, np.sum(pull[one] * bend[neighbour], axis=-1), 0.0)
+        product, square = (cv2.boxFilter(v, -1, (side, side), None, (-1, -1), False, cv2.BORDER_CONSTANT) for v in sums)
+        # Squares that sum to less than that of one noisy value show nothing.
+        share = np.clip(product / np.maximum(square, 1.0), 0.0, 1.0)
+        shares.append(share.T if turned else share)
+    return np.where(alike, np.minimum(*shares), 0.0)
 
 
 def _disagreement(plane: FloatArray, covariance: FloatArray, scatter: FloatArray, lag: int, stencil: Row) -> FloatArray:
@@ -341,12 +341,14 @@ def _disagreement(plane: FloatArray, covariance: FloatArray, scatter: FloatArray
         n, v, s = (np.swapaxes(values, 0, 1) if turned else values for values in (normals, variance, scatter))
         places = [np.s_[k * lag : max(len(n) - span, 0) + k * lag] for k in range(len(stencil))]
         off = np.sum([w * n[at] for w, at in zip(stencil, places, strict=True)], axis=0)
-        middle = n[places[len(stencil) // 2]]
+        # Bends are what is across the mean; slopes are so anyhow.
+        middle = unit(np.sum([n[at] for at in places], axis=0))
         off -= np.sum(off * middle, axis=-1, keepdims=True) * middle
+        angle = 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(off, axis=-1), 1.0))
         both = np.sum([w * w * v[at] for w, at in zip(stencil, places, strict=True)], axis=0)
         weighted = np.sum([w * w * (v * s)[at] for w, at in zip(stencil, places, strict=True)], axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratios.append((np.linalg.norm(off, axis=-1) / np.sqrt(both)).ravel())
+            ratios.append((angle / np.sqrt(both)).ravel())
             scatters.append((weighted / both).ravel())
     ratio, at = np.concatenate(ratios), np.concatenate(scatters)
     known = np.isfinite(ratio) & (at > 0.0)

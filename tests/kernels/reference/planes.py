@@ -44,13 +44,14 @@ def fitted_planes(
                 right[here] += weight[..., None] * own_right[there]
                 support[here] += weight
                 squares[here] += weight * size[there]
+        before = plane
         plane, spread = solved(normal, right, valid)
     squares -= np.sum(right * plane, axis=-1)
     mixed, bends, pull = np.zeros_like(own), np.zeros_like(own), np.zeros_like(own_right)
     for dv in range(-reach, reach + 1):
         for du in range(-reach, reach + 1):
             here, there = shifted(valid.shape, dv, du)
-            miss = z[there] - (F[there] @ np.nan_to_num(plane[here])[..., None])[..., 0]
+            miss = z[there] - (F[there] @ np.nan_to_num(before[here])[..., None])[..., 0]
             square = np.einsum("...i,...ij,...j->...", miss, W[there], miss)
             weight = np.where(valid[there] & valid[here], 1.0 / (1.0 + square / (3.0 * turn**2)) ** 2, 0.0)
             Q = by_curvature(step * np.array([du, dv]) - offsets[here], offsets[there], windows[there])
@@ -58,6 +59,8 @@ def fitted_planes(
             mixed[here] += weight[..., None, None] * (weighted[there] @ Q)
             bends[here] += weight[..., None, None] * (turned @ Q)
             pull[here] += weight[..., None] * (turned @ miss[..., None])[..., 0]
+    # The weights are those of the fit, by the plane before; the right side is at the plane after.
+    pull -= (np.swapaxes(mixed, -1, -2) @ np.nan_to_num(plane - before)[..., None])[..., 0]
     of_curvature = [np.where(valid.reshape(*valid.shape, *[1] * (v.ndim - 2)), v, np.nan) for v in (mixed, bends, pull)]
     return (
         plane,

@@ -11,7 +11,7 @@ from helpers.textured_scene import CAM2_FROM_CAM1, LENSES, SMALL_LENSES, Corner
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import TILTS, match_affine_features
-from rigkit.affine.refine_patches import FLOOR_PX, WINDOW_OF_PATCH
+from rigkit.affine.refine_patches import FLOOR_PX
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.progress import silent
@@ -85,11 +85,10 @@ def test_texture_does_not_make_a_patch_surer_than_its_interpolation() -> None:
     sigma_px = np.sqrt(measured.covariance[..., 0, 0]) * measured.slope
     patches = grown.valid & ~grown.swept & np.isfinite(sigma_px)
     stated = np.sqrt(np.einsum("nii->ni", grown.covariance[patches])[:, :2].max(axis=1))
-    floor = WINDOW_OF_PATCH * FLOOR_PX
-    assert np.median(stated) < floor
-    assert sigma_px[patches].min() >= floor
+    assert np.median(stated) < 0.5 * FLOOR_PX
+    assert sigma_px[patches].min() >= FLOOR_PX
     # Along the epipolar line, as the direction of the largest is not known here.
-    assert np.all(sigma_px[patches] <= 1.01 * np.hypot(np.sqrt(2.0) * stated, floor * 2.0 ** grown.coarser[patches]))
+    assert np.all(sigma_px[patches] <= 1.01 * np.hypot(np.sqrt(2.0) * stated, FLOOR_PX * 2.0 ** grown.coarser[patches]))
 
 
 @pytest.mark.parametrize("lens", LENSES)
