@@ -142,13 +142,18 @@ def test_curvature_is_what_neighbours_agree_on_noise_and_creases_are_none(
 
 
 def test_nodes_in_a_line_do_not_determine_a_curvature(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
     monkeypatch.setattr(fitting, "MIN_NODE_SUPPORT", 0.5 * fitting.MIN_NODE_SUPPORT)
-    monkeypatch.setattr(fitting, "_share_of_curvature", lambda curved, alike, *_: seen.append(curved) or 1.0 * alike)
+    seen, true = [], fitting._curvatures
+
+    def spied(*args: Any) -> Any:
+        seen.append(true(*args))
+        return seen[-1]
+
+    monkeypatch.setattr(fitting, "_curvatures", spied)
     row = np.where(np.arange(SHAPE[0])[:, None] == 10, 1.0, np.nan) * np.ones(SHAPE)
     alone = fitted(row, np.random.default_rng(2))
     assert np.isfinite(alone.plane[10, 5:-5]).all()
-    assert all(not curved.shift.any() and not curved.covariance.any() for curved in seen)
+    assert not seen[-1].shift.any() and not seen[-1].covariance.any()
 
 
 def test_planes_at_right_angles_disagree_by_right_angles() -> None:
