@@ -9,6 +9,7 @@ downweights neighbours on another surface.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
@@ -240,22 +241,15 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
     spread = np.full(fits.normals.shape, np.nan)
     spread[keep] = _inverse(fits.normals[keep])
     # Squares of values with Gaussian correlation have half the correlation area.
-    around = cv2.boxFilter(
-        valid.astype(np.float64), -1, (2 * reach + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT
-    )
-    freedom = np.maximum(3.0 * around * step**2 / (0.5 * WINDOW_AREA_PX), 1.0)
+    area = _sum_around(valid.astype(np.float64), 2 * reach + 1) * step**2
+    freedom = np.maximum(3.0 * area / (0.5 * WINDOW_AREA_PX), 1.0)
     plane, curved, lag = fits.planes.copy(), _curvatures(fits, spread), 2 * reach
     sweep, patches = keep & measured.swept, keep & ~measured.swept
     for alike, stencils, apart in ((sweep, [SLOPES], REACH_OF_SWEEP * lag), (patches, [SLOPES, BENDS], lag)):
         share = _share_of_curvature(curved, alike, apart, lag + 1)
         squares = fits.squares - share * (2.0 - share) * np.sum(curved.bend * curved.pull, axis=-1)
-        missed = of_redescending(squares / (3.0 * fits.support), TURN_OF_LOSS)
-        local = np.full(valid.shape, np.nan)
-        local[alike] = shrunk_variances(missed[alike], freedom[alike])
-        planes, stated = only(alike, fits.planes), local[..., None, None] * spread
-        scale = np.min([_disagreement(planes, stated, local, lag, row) for row in stencils], axis=0)
-        # Never below the stated noise of the patches.
-        noise = np.maximum(local * np.maximum(scale, 1.0) ** 2, 1.0)
+        variances = of_redescending(squares / (3.0 * fits.support), TURN_OF_LOSS)
+        noise = _noise(only(alike, fits.planes), spread, variances, freedom, stencils, lag)
         plane[alike] -= (share[..., None] * curved.shift)[alike]
         spread[alike] = (noise[..., None, None] * (spread + share[..., None, None] * curved.covariance))[alike]
     spread += ((shared_px / measured.slope) ** 2)[..., None, None] * ray[..., :, None] * ray[..., None, :]
@@ -319,11 +313,28 @@ def _share_of_curvature(curved: _Curvatures, alike: BoolArray, lag: int, side: i
         for one, other in ((np.s_[:-lag], np.s_[lag:]), (np.s_[lag:], np.s_[:-lag])):
             for total, neighbour in zip(sums, (other, one), strict=True):
                 total[one] += np.where(both, np.sum(pull[one] * bend[neighbour], axis=-1), 0.0)
-        product, square = (cv2.boxFilter(v, -1, (side, side), None, (-1, -1), False, cv2.BORDER_CONSTANT) for v in sums)
+        product, square = (_sum_around(v, side) for v in sums)
         # Squares that sum to less than that of one noisy value show nothing.
         share = np.clip(product / np.maximum(square, 1.0), 0.0, 1.0)
         shares.append(share.T if turned else share)
     return np.where(alike, np.minimum(*shares), 0.0)
+
+
+def _sum_around(values: FloatArray, side: int) -> FloatArray:
+    return np.asarray(cv2.boxFilter(values, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT))
+
+
+def _noise(
+    plane: FloatArray, spread: FloatArray, variances: FloatArray, freedom: FloatArray, stencils: Sequence[Row], lag: int
+) -> FloatArray:
+    """Return the variances (R, C) of the measurements over those stated, never less than these, from the `variances` of
+    their residuals with `freedom` and how much planes that share no node, `lag` apart, disagree."""
+    alike = np.isfinite(plane[..., 0])
+    local = only(alike, np.zeros(alike.shape))
+    local[alike] = shrunk_variances(variances[alike], freedom[alike])
+    stated = local[..., None, None] * spread
+    scale = np.min([_disagreement(plane, stated, local, lag, row) for row in stencils], axis=0)
+    return np.asarray(np.maximum(local * np.maximum(scale, 1.0) ** 2, 1.0))
 
 
 def _disagreement(plane: FloatArray, covariance: FloatArray, scatter: FloatArray, lag: int, stencil: Row) -> FloatArray:
