@@ -9,7 +9,7 @@ from kernels.reference import planes as reference
 from rigkit.geometry.rotation import unit
 from rigkit.kernels.planes import PlaneFits, fitted_planes
 
-REACH, ROUNDS, TURN = 3, 5, 2.385
+REACH, ROUNDS, TURN, STEP = 3, 5, 2.385, 4.0
 ROUNDING = 1e-4
 """Both solve badly scaled systems of three unknowns, twice as many digits lost as kept; the loss has several minima."""
 
@@ -17,7 +17,7 @@ ROUNDING = 1e-4
 def step_edge(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     """Two planes side by side, seen by a pinhole of 300 px; values, information, frames, and the truth."""
     rows, columns = 20, 30
-    v, u = np.mgrid[:rows, :columns] * 4.0
+    v, u = np.mgrid[:rows, :columns] * STEP
     x = np.stack([(u - 60.0) / 300.0, (v - 40.0) / 300.0, np.ones_like(u)], axis=-1)
     rays = unit(x)
     length = np.linalg.norm(x, axis=-1)[..., None]
@@ -34,16 +34,34 @@ def step_edge(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
 def fitted(values: np.ndarray, information: np.ndarray, frames: np.ndarray, reach: int = REACH) -> PlaneFits:
     """Return the planes through values at their nodes, 4 px apart, of windows without extent."""
     shape = values.shape[:2]
-    flat = {"offsets": np.zeros((*shape, 2)), "windows": np.zeros(shape), "step": 4.0}
-    return fitted_planes(values, information, frames, **flat, reach=reach, rounds=ROUNDS, turn=TURN)
+    return fitted_planes(
+        values,
+        information,
+        frames,
+        offsets=np.zeros((*shape, 2)),
+        windows=np.zeros(shape),
+        step=STEP,
+        reach=reach,
+        rounds=ROUNDS,
+        turn=TURN,
+    )
 
 
 def test_planes_are_fitted_as_defined(rng: np.random.Generator) -> None:
     values, information, frames, _ = step_edge(rng)
     offsets, windows = rng.uniform(-2.0, 2.0, (*values.shape[:2], 2)), rng.uniform(10.0, 30.0, values.shape[:2])
-    extent = {"offsets": offsets, "windows": windows, "step": 4.0}
     ours, theirs = (
-        fit(values, information, frames, **extent, reach=REACH, rounds=ROUNDS, turn=TURN)
+        fit(
+            values,
+            information,
+            frames,
+            offsets=offsets,
+            windows=windows,
+            step=STEP,
+            reach=REACH,
+            rounds=ROUNDS,
+            turn=TURN,
+        )
         for fit in (fitted_planes, reference.fitted_planes)
     )
     for one, two in zip(ours, theirs, strict=True):
