@@ -219,6 +219,10 @@ HAND_EYE_FILE = file(
         ),
         "median_apart_deg?": described(NUMBER, "median rotation between image and robot poses, deg"),
         "left_out_deg?": described(table(NUMBER), "images left out as outliers, and the angle by which they disagree"),
+        "contradicting?": described(
+            table(obj({"deg": NUMBER, "mm": NUMBER})),
+            "images left out because all others contradict their robot pose, and what is wrong with it",
+        ),
     },
 )
 
