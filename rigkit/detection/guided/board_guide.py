@@ -149,19 +149,14 @@ class Guide:
         sound = state.known & (state.sigma_px < MAX_RESIDUAL_RATIO * state.typical_sigma)
         if sound.any():
             # Residuals due to the lens model, or to a board that is not flat, vary slowly over the board.
-            rest = fit_cells(self.residuals(state, sound), cells, degree=1, leave_out=True)
+            every = self._projected(self.camera, self.cam_from_board, sound)[0].pixels
+            left = np.full(state.pixels.shape, np.nan)
+            left[sound] = state.pixels[sound] - every
+            rest = fit_cells(left, cells, degree=1, leave_out=True)
             near = ((rest.support >= MIN_PREDICTORS) & (rest.gain < 1.0))[:, None]
             gain = np.where(near[:, 0], np.hypot(1.0, rest.gain), 1.0)
             shape = replace(shape, pixels=shape.pixels + np.where(near, rest.pixels, 0.0), gain=gain)
         return shape, valid
-
-    def residuals(self, state: BoardState, cells: BoolArray) -> FloatArray:
-        """Return the distances (R, C, 2) of the corners at `cells` (R, C) from where the camera sees the flat board,
-        px, NaN elsewhere; without a camera all are NaN."""
-        left = np.full(state.pixels.shape, np.nan)
-        if self.camera is not None and self.cam_from_board is not None:
-            left[cells] = state.pixels[cells] - self._projected(self.camera, self.cam_from_board, cells)[0].pixels
-        return left
 
     def _projected(self, camera: Camera, cam_from_board: Rigid3, cells: BoolArray) -> tuple[LocalFit, BoolArray]:
         row, column = np.nonzero(cells)

@@ -31,10 +31,11 @@ from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
-from rigkit.detection.subpixel.scatter import scatter_factor
+from rigkit.detection.subpixel.scatter import UNEXPLAINED_SCATTER
 from rigkit.detection.subpixel.subpixel import FIRST_BLUR
 from rigkit.detection.subpixel.uncertain_corners import IN_PLACE_CELLS, UNCERTAIN_FACTOR, uncertain_outliers
 from rigkit.detection.subpixel.whole_board import placed_together
+from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 WIDE_BLUR_CELLS = 0.05
 """Initial s of the first fit of a missing corner, in sides of the cell: about the error of predictions."""
@@ -137,8 +138,9 @@ def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Ca
     row, column = np.nonzero(state.known)
     if len(row) < MIN_GUIDE_CORNERS:
         return found
+    # The factor of correlated noise is applied only if it reduces sigmas; larger ones follow from the scatter.
     alike = state if state.jointly else first
-    state = replace(state, sigma_px=_detector_factor(found, alike) * state.sigma_px)
+    state = replace(state, sigma_px=min(1.0, _detector_factor(found, alike)) * state.sigma_px)
     sigma = _scatter_factor(guide, state) * state.sigma_px[row, column]
     return replace(found, grid=np.stack([column, row], axis=-1), pixels=state.pixels[row, column], sigma_px=sigma)
 
@@ -200,15 +202,14 @@ def _detector_factor(found: BoardDetection, state: BoardState) -> float:
 
 
 def _scatter_factor(guide: Guide, state: BoardState) -> float:
-    """Return the `scatter_factor` of the corners without what the camera predicts, at least 1.
-
-    Errors of the lens model, and of a print, are smooth along rows and columns. Counted as scatter they made sigmas two
-    to five times as large as without a camera (REAL, sharp), where the corners are the same.
-    """
-    left = guide.residuals(state, state.known)
-    row, column = np.indices(state.known.shape)
-    side = known_median(np.linalg.norm(np.diff(state.pixels, axis=1), axis=2))
-    return scatter_factor(side * np.stack([column, row], axis=-1) + left, state.sigma_px)
+    """Return the ratio of the corners' scatter about their predictions to their sigmas; 1 if not significant."""
+    cells = state.known
+    shape, seen = guide.at(state, cells)
+    if not seen.any():
+        return 1.0
+    off = np.linalg.norm(state.pixels[cells] - shape.pixels, axis=1)
+    ratio = float(np.median((off / (state.sigma_px[cells] * shape.gain))[seen])) / MEDIAN_OF_RAYLEIGH
+    return ratio if ratio > UNEXPLAINED_SCATTER else 1.0
 
 
 def _fit_of_detected(image: GreyImage, found: BoardDetection, board: Board) -> BoardState | None:

@@ -30,8 +30,9 @@ right side it is 0.5 and more (motion of 15 px), beyond the border 0."""
 
 CLEARLY_MORE_CERTAIN = 2.0
 """Smallest ratio of the sigmas of a board fitted in the image, with a camera's help, to those in a resampled part for
-the latter to count: both are of the same pixels, the camera adds knowledge of the lines, and sigmas of blurred corners
-are true to a factor of about 1.5. On 89 REAL boards made worse it is the same from 1.5 to 3."""
+the latter to count: both are of the same pixels, the camera adds knowledge of the lines, and its sigmas include errors
+of the lens model and the print. Of REAL boards made worse (camodocal, blur 4 px) corners are off by 0.139 px instead of
+0.183; others change by less than a tenth."""
 
 
 class ChessboardFinder(Finder):

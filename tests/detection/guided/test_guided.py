@@ -167,29 +167,6 @@ class Cut:
         return np.where(valid[..., None], pixels, np.nan), valid
 
 
-class Wavy:
-    """A camera whose model is off by up to a pixel, along the image with a period of 12 squares of 30 px."""
-
-    def __init__(self, camera: Camera) -> None:
-        self.camera = camera
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self.camera, name)
-
-    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        pixels, valid = self.camera.project(points)
-        return pixels + np.sin(2.0 * np.pi * pixels / 360.0), valid
-
-
-def test_errors_of_the_lens_model_are_no_scatter(rng: np.random.Generator) -> None:
-    scene = one_board(rng, board=BOARD, square_px=30.0, max_tilt_deg=20.0)
-    image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
-    (found,) = detect_boards(image, [BOARD])
-    (again,) = complete_boards(image, [found], [BOARD], Wavy(scene.camera))  # type: ignore[arg-type]
-    assert again.complete and not np.array_equal(again.pixels, found.pixels)
-    assert np.median(again.sigma_px) < 1.2 * np.median(found.sigma_px)
-
-
 def test_corners_at_the_end_of_the_lens_model_stay_as_they_are(rng: np.random.Generator) -> None:
     scene = one_board(rng, lens="fisheye", board=BOARD)
     image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
