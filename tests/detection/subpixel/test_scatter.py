@@ -18,6 +18,14 @@ def corners(columns: int, rows: int, bend: float = 0.0) -> np.ndarray:
     return np.stack([u, v], axis=-1) / np.sqrt(1.0 + bend * squared)[..., None]
 
 
+def final_factor(pixels: np.ndarray, sigma_px: float) -> float:
+    """Return the factor of the sigmas of corners (R, C, 2), by both tests of scatter in turn."""
+    rows, columns = pixels.shape[:2]
+    sigmas = np.full((rows, columns), sigma_px)
+    factor = float(scatter_factors(pixels, sigmas, [(slice(0, rows), slice(0, columns))])[0])
+    return factor * small_scatter(pixels, factor * sigmas)
+
+
 @pytest.mark.parametrize(("times", "low", "high"), [(1.0, 1.0, 1.3), (4.0, 3.0, 5.0)])
 def test_scatter_raises_sigmas(times: float, low: float, high: float) -> None:
     rng = np.random.default_rng(4)
@@ -47,15 +55,13 @@ def test_lens_distortion_does_not_raise_sigmas() -> None:
 def test_a_small_board_that_faces_a_fisheye(times: float, low: float, high: float) -> None:
     """Its bend is odd, so that quartic surfaces fit no better than cubic ones, and as smooth as scatter of order 5."""
     rng = np.random.default_rng(3)
-    sigma_px, whole = np.full((5, 7), 0.004), [(slice(0, 5), slice(0, 7))]
-    factors = []
+    sigma_px, factors = 0.004, []
     for _ in range(10):
         u, v = (0.17 * (part + rng.uniform(-0.5, 0.5)) for part in np.meshgrid(np.arange(7) - 3.0, np.arange(5) - 2.0))
         tangent = np.hypot(u, v)
         pixels = 600.0 * np.stack([u, v], axis=-1) * (np.arctan(tangent) / tangent)[..., None]
-        pixels += times * 0.004 * rng.standard_normal((5, 7, 2))
-        factor = float(scatter_factors(pixels, sigma_px, whole)[0])
-        factors.append(factor * small_scatter(pixels, factor * sigma_px))
+        pixels += times * sigma_px * rng.standard_normal((5, 7, 2))
+        factors.append(final_factor(pixels, sigma_px))
     assert low <= np.median(factors) <= high
 
 
@@ -63,16 +69,14 @@ def test_a_small_board_that_faces_a_fisheye(times: float, low: float, high: floa
 def test_a_small_board_near_a_fisheye(times: float, low: float, high: float) -> None:
     """Tilted, and 3 squares away: its bend seemed to be scatter, many times the sigmas."""
     rng = np.random.default_rng(7)
-    sigma_px, whole = np.full((5, 7), 0.006), [(slice(0, 5), slice(0, 7))]
-    factors = []
+    sigma_px, factors = 0.006, []
     for _ in range(10):
         u, v = (part + rng.uniform(-0.5, 0.5) for part in np.meshgrid(np.arange(7) - 3.0, np.arange(5) - 2.0))
         depth = 3.0 + 0.07 * u * rng.uniform(-1.0, 1.0) + 0.3 * v
         beside = np.hypot(u, v)
         pixels = 240.0 * np.stack([u, v], axis=-1) * (np.arctan2(beside, depth) / beside)[..., None]
-        pixels += times * 0.006 * rng.standard_normal((5, 7, 2))
-        factor = float(scatter_factors(pixels, sigma_px, whole)[0])
-        factors.append(factor * small_scatter(pixels, factor * sigma_px))
+        pixels += times * sigma_px * rng.standard_normal((5, 7, 2))
+        factors.append(final_factor(pixels, sigma_px))
     assert low <= np.median(factors) <= high
 
 
